@@ -1,0 +1,167 @@
+"""Rotations, poses and the pan-tilt chain, in NumPy for batches and in gtsam.Pose3 for one.
+
+Conventions (docs/conventions.md): `a_T_b` takes coordinates in b to coordinates in a; tangents are
+in GTSAM's order, rotation before translation, in the body frame; pan is positive anticlockwise
+seen from above, tilt is positive upwards.
+"""
+
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pancam_graph.errors import GeometryError
+
+__all__ = [
+    "HEAD_R_FORWARD_CAMERA",
+    "Z_DOWN_R_Z_UP",
+    "BoolArray",
+    "FloatArray",
+    "IntArray",
+    "compose",
+    "d_pan_tilt_rotation",
+    "pan_tilt_from_rotation",
+    "pan_tilt_rotation",
+    "pose_arrays",
+    "pose_from_wxyz",
+    "rotation_from_wxyz",
+    "rx",
+    "ry",
+    "rz",
+    "skew",
+    "so3_right_jacobian_inverse",
+    "wrap_angle",
+    "wxyz_from_rotation",
+]
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+HEAD_R_FORWARD_CAMERA: FloatArray = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""Rotation of a camera (x right, y down, z forward) that looks along the head's x axis."""
+
+Z_DOWN_R_Z_UP: FloatArray = np.diag([1.0, -1.0, -1.0])
+"""Turns the z-down frames of planetary data systems to our z-up ones, and back: its own inverse."""
+
+
+def rx(angle_rad: float) -> FloatArray:
+    """Rotation about x."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+
+
+def ry(angle_rad: float) -> FloatArray:
+    """Rotation about y; a tilt upwards by t is `ry(-t)`."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+
+def rz(angle_rad: float) -> FloatArray:
+    """Rotation about z; pan."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def skew(v: FloatArray) -> FloatArray:
+    """Cross-product matrices: (..., 3) to (..., 3, 3) with `skew(a) @ b == cross(a, b)`."""
+    out = np.zeros((*v.shape, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return out
+
+
+def so3_right_jacobian_inverse(w: FloatArray) -> FloatArray:
+    """Inverse right Jacobian of SO(3) at the rotation vector w, (3,) to (3, 3).
+
+    `Log(R Exp(d)) = Log(R) + Jr^-1(Log R) d` to first order. Defined for |w| < pi; at pi the
+    logarithm itself jumps. Source: Chirikjian, Stochastic Models, Information Theory, and Lie Groups
+    2, section 10.8.6.
+    """
+    theta2 = float(w @ w)
+    k = skew(w)
+    if theta2 < 1e-8:
+        c = 1 / 12 + theta2 / 720
+    else:
+        theta = np.sqrt(theta2)
+        c = 1 / theta2 - (1 + np.cos(theta)) / (2 * theta * np.sin(theta))
+    return np.asarray(np.eye(3) + 0.5 * k + c * k @ k)
+
+
+def wrap_angle(angle_rad: ArrayLike) -> FloatArray:
+    """Angles to [-pi, pi)."""
+    return np.asarray((np.asarray(angle_rad, dtype=float) + np.pi) % (2 * np.pi) - np.pi)
+
+
+def rotation_from_wxyz(wxyz: Sequence[float] | FloatArray) -> FloatArray:
+    """Rotation matrix of a quaternion (w, x, y, z), which need not be of unit length.
+
+    Raises GeometryError for a quaternion of norm 0 or with a component that is not finite.
+    """
+    q = np.asarray(wxyz, dtype=float)
+    norm = float(np.linalg.norm(q))
+    if q.shape != (4,) or not np.isfinite(norm) or norm < 1e-12:
+        raise GeometryError(f"a quaternion needs 4 finite numbers of norm above 0; got {q.tolist()}")
+    w, x, y, z = (float(c) for c in q / norm)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def wxyz_from_rotation(rotation: FloatArray) -> FloatArray:
+    """Unit quaternion (w, x, y, z) with w >= 0 of a rotation matrix."""
+    q = gtsam.Rot3(rotation).toQuaternion()
+    wxyz = np.array([q.w(), q.x(), q.y(), q.z()])
+    return wxyz / np.linalg.norm(wxyz) * (1.0 if wxyz[0] >= 0 else -1.0)
+
+
+def pose_from_wxyz(wxyz: Sequence[float], translation_m: Sequence[float]) -> gtsam.Pose3:
+    """Pose from a quaternion (w, x, y, z) and a translation.
+
+    Raises GeometryError as `rotation_from_wxyz` does.
+    """
+    return gtsam.Pose3(gtsam.Rot3(rotation_from_wxyz(wxyz)), np.asarray(translation_m, dtype=float))
+
+
+def pose_arrays(poses: Sequence[gtsam.Pose3]) -> tuple[FloatArray, FloatArray]:
+    """Rotations (n, 3, 3) and translations (n, 3) of n poses."""
+    rotations = np.array([p.rotation().matrix() for p in poses]).reshape(-1, 3, 3)
+    return rotations, np.array([p.translation() for p in poses]).reshape(-1, 3)
+
+
+def compose(
+    a_R_b: FloatArray, a_t_b: FloatArray, b_R_c: FloatArray, b_t_c: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Compose batches of poses (..., 3, 3), (..., 3), broadcast: `a_T_b * b_T_c`."""
+    return a_R_b @ b_R_c, (a_R_b @ b_t_c[..., None])[..., 0] + a_t_b
+
+
+def pan_tilt_rotation(pan_rad: ArrayLike, tilt_rad: ArrayLike) -> FloatArray:
+    """Rotation of the head, `Rz(pan) Ry(-tilt)`, for scalars or arrays: (...,) to (..., 3, 3)."""
+    pan, tilt = np.broadcast_arrays(np.asarray(pan_rad, dtype=float), np.asarray(tilt_rad, dtype=float))
+    cp, sp, ct, st = np.cos(pan), np.sin(pan), np.cos(tilt), np.sin(tilt)
+    zero = np.zeros_like(pan)
+    rows = [[cp * ct, -sp, -cp * st], [sp * ct, cp, -sp * st], [st, zero, ct]]
+    return np.stack([np.stack(r, -1) for r in rows], -2)
+
+
+def d_pan_tilt_rotation(tilt_rad: float) -> FloatArray:
+    """Derivative of the head's rotation by pan and tilt, as body-frame rotation vectors, (3, 2).
+
+    `Rz(pan + dp) Ry(-(tilt + dt)) = Rz(pan) Ry(-tilt) Exp(J [dp, dt])` to first order.
+    """
+    return np.array([[np.sin(tilt_rad), 0.0], [0.0, -1.0], [np.cos(tilt_rad), 0.0]])
+
+
+def pan_tilt_from_rotation(mast_R_head: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Pan and tilt (...,) of the head's x axis, (..., 3, 3); a twist about it is left out.
+
+    Looking straight up or down, pan is undefined and 0 is returned for it.
+    """
+    x = mast_R_head[..., :, 0]
+    return np.arctan2(x[..., 1], x[..., 0]), np.arctan2(x[..., 2], np.hypot(x[..., 0], x[..., 1]))

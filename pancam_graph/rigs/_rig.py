@@ -1,0 +1,119 @@
+"""A mast rig: the pan-tilt chain and the eyes on it (docs/conventions.md, "The mast")."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import gtsam
+import numpy as np
+
+from pancam_graph.cameras import CAHV, Camera, Pinhole
+from pancam_graph.errors import InputError
+from pancam_graph.geometry import FloatArray, IntArray, compose, pan_tilt_rotation, pose_arrays
+
+__all__ = ["Eye", "PointingSigma", "Rig"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Eye:
+    """One camera on the head."""
+
+    name: str
+    """Unique within the rig."""
+    camera: Camera
+    """The camera model in the camera frame: centre at the origin, z forward."""
+    head_T_camera: gtsam.Pose3
+    """How the eye sits on the head (x forward, y left, z up), which turns with pan and tilt."""
+
+    @staticmethod
+    def from_head_model(name: str, model: CAHV) -> "Eye":
+        """An eye from a CAHV-family model whose vectors are in the head frame."""
+        camera, head_T_camera = model.split()
+        return Eye(name=name, camera=camera, head_T_camera=head_T_camera)
+
+    def head_model(self) -> CAHV:
+        """The CAHV-family model with its vectors in the head frame; inverse of `from_head_model`.
+
+        Raises TypeError for a pinhole or Brown camera, which has no such vectors.
+        """
+        if not isinstance(self.camera, CAHV):
+            raise TypeError(f"eye {self.name}: a {type(self.camera).__name__} has no CAHV vectors")
+        return self.camera.transformed(self.head_T_camera)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointingSigma:
+    """How well telemetry knows where the mast points, one standard deviation."""
+
+    pan_rad: float
+    tilt_rad: float
+    twist_rad: float = 1.05e-3
+    """About the line of sight; no encoder measures it. Default: 0.06 degrees (VICAR PigPoint*.cc)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rig:
+    """A pan-tilt mast with one or more eyes.
+
+    `mast_T_camera = Rz(pan) . pan_T_tilt . Ry(-tilt) . head_T_camera` (DESIGN: section 3). At constant
+    tilt an eye's centre runs on a circle about the pan axis: thesis eq. 4.8.
+    """
+
+    name: str
+    pan_T_tilt: gtsam.Pose3
+    """Where the tilt axis (y) sits on the pan stage."""
+    eyes: tuple[Eye, ...]
+    pointing_sigma: PointingSigma = field(
+        default_factory=lambda: PointingSigma(pan_rad=1.34e-3, tilt_rad=1.34e-3)
+    )
+    """Telemetry's accuracy, used where a traverse does not say; default: MER, 0.077 degrees."""
+    mast_height_m: float = 1.5
+    """Height of the mast frame above the ground, for simulations and drawings only."""
+    source: str = ""
+    """Where the numbers come from."""
+
+    def __post_init__(self) -> None:
+        """Check that there are eyes, with different names."""
+        if not self.eyes:
+            raise InputError(f"rig {self.name}: expected at least one camera, found none")
+        names = [e.name for e in self.eyes]
+        for name in names:
+            if names.count(name) > 1:
+                raise InputError(f"rig {self.name}: camera name {name!r} is used {names.count(name)} times")
+
+    def eye_index(self, name: str) -> int:
+        """Index of an eye by name. Raises InputError for an unknown one."""
+        for i, eye in enumerate(self.eyes):
+            if eye.name == name:
+                return i
+        raise InputError(f"camera {name!r}: the rig {self.name} has {', '.join(e.name for e in self.eyes)}")
+
+    @cached_property
+    def _mounts(self) -> tuple[FloatArray, FloatArray]:
+        return pose_arrays([e.head_T_camera for e in self.eyes])
+
+    @cached_property
+    def pinholes(self) -> tuple[Pinhole, ...]:
+        """The distortion-free pinhole of each eye."""
+        return tuple(e.camera.pinhole for e in self.eyes)
+
+    def mast_T_head(self, pan_rad: FloatArray, tilt_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Head poses in the mast frame for n pointings: rotations (n, 3, 3), translations (n, 3)."""
+        pan_R, zero = pan_tilt_rotation(pan_rad, np.zeros_like(pan_rad)), np.zeros((len(pan_rad), 3))
+        axis_R, axis_t = self.pan_T_tilt.rotation().matrix(), self.pan_T_tilt.translation()
+        tilt_R = pan_tilt_rotation(np.zeros_like(tilt_rad), tilt_rad)
+        return compose(*compose(pan_R, zero, axis_R, axis_t), tilt_R, zero)
+
+    def mast_T_camera(self, pan_tilt_rad: FloatArray, eye: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Camera poses in the mast frame for n images: pan and tilt (n, 2), eye index (n,)."""
+        mounts_R, mounts_t = self._mounts
+        head = self.mast_T_head(pan_tilt_rad[:, 0], pan_tilt_rad[:, 1])
+        return compose(*head, mounts_R[eye], mounts_t[eye])
+
+    def circle(self, eye: int, tilt_rad: float) -> tuple[float, float, float]:
+        """Circle of an eye's centre at one tilt, in the mast frame: radius, phase, height (thesis eq. 4.8).
+
+        The centre is at `[radius cos(pan + phase), radius sin(pan + phase), height]`; metres, radians.
+        """
+        _, t = self.mast_T_camera(np.array([[0.0, tilt_rad]]), np.array([eye]))
+        x, y, z = (float(c) for c in t[0])
+        return float(np.hypot(x, y)), float(np.arctan2(y, x)), z
