@@ -1,1 +1,1 @@
-"""x."""
+"""Custom GTSAM factors: pure residuals with analytic Jacobians, and thin makers."""

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from pancam_graph.errors import GeometryError
 
@@ -115,9 +116,8 @@ def rotation_from_wxyz(wxyz: Sequence[float] | FloatArray) -> FloatArray:
 
 def wxyz_from_rotation(rotation: FloatArray) -> FloatArray:
     """Unit quaternion (w, x, y, z) with w >= 0 of a rotation matrix."""
-    q = gtsam.Rot3(rotation).toQuaternion()
-    wxyz = np.array([q.w(), q.x(), q.y(), q.z()])
-    return wxyz / np.linalg.norm(wxyz) * (1.0 if wxyz[0] >= 0 else -1.0)
+    xyzw = Rotation.from_matrix(rotation).as_quat(canonical=True)
+    return np.roll(xyzw, 1)
 
 
 def pose_from_wxyz(wxyz: Sequence[float], translation_m: Sequence[float]) -> gtsam.Pose3:

@@ -13,12 +13,13 @@ from scipy.linalg import rq
 from pancam_graph.cameras._base import Camera, Rays, require_finite
 from pancam_graph.cameras._pinhole import Pinhole
 from pancam_graph.errors import CameraError
-from pancam_graph.geometry import BoolArray, FloatArray, skew
+from pancam_graph.geometry import BoolArray, FloatArray
 
 __all__ = ["CAHV", "CAHVOR", "CAHVORE"]
 
 _NEWTON_STEPS = 100
 _MIN_DEPTH = 1e-9
+_MIN_RANGE_M = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -308,7 +309,8 @@ class CAHVORE(CAHVOR):
         slope = -sin * length - cos * (z - s) + sin * d_s
         distance = np.maximum(np.hypot(length, z), 1e-300)
         converged = (np.abs(value) < 1e-12 * (1 + distance)) & (theta >= -1e-12) & (theta < np.pi)
-        converged &= sin * length + cos * (z - s) > _MIN_DEPTH  # in front of the pupil, not at it
+        # The pupil's shift grows without bound to the side; points nearer to C than it are outside the model.
+        converged &= sin * length + cos * z > np.abs(s) + _MIN_RANGE_M
         slope = np.where(np.abs(slope) < 1e-300, 1.0, slope)
         x, d_x, inside = self._radius_of(theta)
         r0, r1, r2 = self.R

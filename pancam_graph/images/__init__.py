@@ -1,0 +1,1 @@
+"""From image files to observations: reading, features, matching, tracks."""

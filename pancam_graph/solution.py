@@ -1,0 +1,116 @@
+"""What an adjustment returns."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+
+from pancam_graph.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.traverse import Traverse
+
+__all__ = ["Seconds", "Solution", "State", "rms_px"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class State:
+    """Values of everything that is estimated, in the order of the traverse's entries."""
+
+    world_T_mast: tuple[gtsam.Pose3, ...]
+    """Mast pose of each stop."""
+    pan_tilt_rad: FloatArray
+    """(frames, 2) pan and tilt of each frame."""
+    world_R_camera: FloatArray
+    """(images, 3, 3) orientation of each image's camera."""
+    world_t_camera: FloatArray
+    """(images, 3) centre of each image's camera, metres."""
+    landmarks_m: FloatArray
+    """(landmarks, 3) terrain points; a row of NaN where there is no usable point."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Seconds:
+    """Wall-clock time of each part."""
+
+    read: float = 0.0
+    initialise: float = 0.0
+    solve: float = 0.0
+    report: float = 0.0
+
+
+def rms_px(residuals_px: FloatArray) -> float:
+    """Root mean square length of residual vectors (n, 2), pixels per observation; 0 for none.
+
+    The length of the vector counts, not each coordinate: sqrt(sum |r|^2 / n).
+    """
+    return float(np.sqrt(np.mean(np.sum(residuals_px**2, axis=1)))) if len(residuals_px) else 0.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Solution:
+    """The adjusted traverse, with what it was before, how sure it is, and what went wrong."""
+
+    traverse: Traverse
+    """The input, observations included."""
+    model: str
+    landmarks: str
+    converged: bool
+    stop_reason: str
+    """Why the iterations ended, in words."""
+    iterations: int
+    cost_history: tuple[float, ...]
+    """Cost after each iteration of the final least-squares stage, its start first."""
+    cost_initial: float
+    """Half the sum of squares of whitened residuals at the start, priors included."""
+    cost_final: float
+    """The same at the end, over the same observations."""
+    initial: State
+    final: State
+    landmark_track: IntArray
+    """(landmarks,) track number of each landmark row."""
+    used: BoolArray
+    """(observations,) whether each observation took part in the final least-squares stage."""
+    reason: tuple[str, ...]
+    """(observations,) why one was left out: "outlier", "single" (a track seen once), "behind"; "" if used."""
+    residual_initial_px: FloatArray
+    """(observations, 2) projected minus measured at the start, raw image pixels; NaN where undefined."""
+    residual_final_px: FloatArray
+    """(observations, 2) the same at the end; for outliers too, where their landmark exists."""
+    sigma_px: FloatArray
+    """(observations,) standard deviation each was weighted with in the end."""
+    stop_covariance: FloatArray
+    """(stops, 6, 6) rotation first, body frame, landmarks marginalised; formal. 0 for a held stop."""
+    angle_sigma_rad: FloatArray
+    """(frames, 2) formal standard deviation of pan and tilt, landmarks marginalised."""
+    warnings: tuple[str, ...] = ()
+    seconds: Seconds = field(default_factory=Seconds)
+
+    @property
+    def rms_initial_px(self) -> float:
+        """RMS residual length of the used observations at the start, raw image pixels."""
+        return rms_px(self.residual_initial_px[self.used])
+
+    @property
+    def rms_final_px(self) -> float:
+        """RMS residual length of the used observations at the end, raw image pixels."""
+        return rms_px(self.residual_final_px[self.used])
+
+    @property
+    def correction_rad(self) -> FloatArray:
+        """(frames, 2) how far pan and tilt moved from the telemetry."""
+        return self.final.pan_tilt_rad - self.traverse.pan_tilt_rad
+
+    def with_seconds(self, **seconds: float) -> "Solution":
+        """The same solution with some wall-clock times filled in."""
+        return replace(self, seconds=replace(self.seconds, **seconds))
+
+    def save(self, out: Path | str, *, report: bool = True) -> "Solution":
+        """Write solution.json, points.ply, residuals.csv and report.html into the folder `out`.
+
+        Everything is written beside and renamed when complete; an older folder of results is replaced
+        only then. Returns this solution with the report's time filled in. Raises InputError where `out` is
+        something else than a folder of results.
+        """
+        from pancam_graph.io import save_solution  # noqa: PLC0415  io imports this module
+
+        return save_solution(self, Path(out), report=report)
