@@ -1,1 +1,14 @@
-"""Custom GTSAM factors: pure residuals with analytic Jacobians, and thin makers."""
+"""Custom GTSAM factors: pure residuals with analytic Jacobians, and thin makers.
+
+One module a factor: `mast` (pan-tilt chain, 6 rows), `circle` (thesis eq. 4.8, 3 rows). Whatever GTSAM
+has itself (priors, projections) is taken from there.
+"""
+
+from pancam_graph.factors._slots import Fixed as Fixed
+from pancam_graph.factors._slots import Key as Key
+from pancam_graph.factors._slots import Slot as Slot
+from pancam_graph.factors.circle import CircleOffset as CircleOffset
+from pancam_graph.factors.circle import circle_factor as circle_factor
+from pancam_graph.factors.circle import circle_residual as circle_residual
+from pancam_graph.factors.mast import mast_factor as mast_factor
+from pancam_graph.factors.mast import mast_residual as mast_residual

@@ -1,0 +1,162 @@
+"""Custom factors: values against independent formulas, Jacobians against differences."""
+
+from collections.abc import Callable
+
+import gtsam
+import numpy as np
+import pytest
+
+from pancam_graph.factors import (
+    CircleOffset,
+    Fixed,
+    Key,
+    circle_factor,
+    circle_residual,
+    mast_factor,
+)
+from pancam_graph.geometry import FloatArray, pose_arrays
+from pancam_graph.rigs import Eye, Rig, exomars_pancam
+
+UNIT3, UNIT6 = gtsam.noiseModel.Unit.Create(3), gtsam.noiseModel.Unit.Create(6)
+X, M, A, E, R = (gtsam.symbol(c, 0) for c in "XMAER")
+PAN_T_TILT = gtsam.Pose3(gtsam.Rot3.Rodrigues(0.02, -0.01, 0.03), np.array([0.03, -0.02, 0.05]))
+
+
+def random_pose(rng: np.random.Generator, angle: float, length: float) -> gtsam.Pose3:
+    return gtsam.Pose3(gtsam.Rot3.Expmap(rng.normal(0, angle, 3)), rng.normal(0, length, 3))
+
+
+def mast_values(rng: np.random.Generator, angle: float, length: float) -> gtsam.Values:
+    """A mast anywhere, and a camera off the chain by a pose of the given size."""
+    values = gtsam.Values()
+    mast, mount = random_pose(rng, 1.0, 50.0), random_pose(rng, 1.0, 0.3)
+    pan, tilt = rng.uniform(-np.pi, np.pi), rng.uniform(-1.5, 1.5)
+    camera = mast * chain(pan, tilt) * mount * random_pose(rng, angle, length)
+    for key, value in ((X, camera), (M, mast), (A, np.array([pan, tilt])), (E, mount)):
+        values.insert(key, value)
+    return values
+
+
+def chain(pan: float, tilt: float) -> gtsam.Pose3:
+    zero = np.zeros(3)
+    return gtsam.Pose3(gtsam.Rot3.Rz(pan), zero) * PAN_T_TILT * gtsam.Pose3(gtsam.Rot3.Ry(-tilt), zero)
+
+
+def check_jacobians(factor: gtsam.CustomFactor, values: gtsam.Values, *, tolerance: float = 2e-7) -> None:
+    """Analytic Jacobians against central differences of the factor's own error."""
+    gaussian = factor.linearize(values)
+    jacobian = gaussian.jacobian()[0]
+    column = 0
+    for key in factor.keys():  # noqa: SIM118  a gtsam factor, not a dictionary
+        delta = gtsam.VectorValues()
+        dim = 1 if key == R else 2 if key == A else 6
+        for i in range(dim):
+            errors = []
+            for h in (1e-6, -1e-6):
+                delta = gtsam.VectorValues()
+                delta.insert(key, np.eye(dim)[i] * h)
+                errors.append(factor.unwhitenedError(values.retract(delta)))
+            numeric = (errors[0] - errors[1]) / 2e-6
+            assert jacobian[:, column] == pytest.approx(numeric, abs=tolerance * max(1, np.abs(numeric).max()))
+            column += 1
+
+
+STATES: list[tuple[str, float, float]] = [
+    ("random", 0.5, 1.0),
+    ("near identity", 1e-7, 1e-7),
+    ("on the chain", 0.0, 0.0),
+    ("far", 1.0, 1e3),
+]
+
+
+@pytest.mark.parametrize(("name", "angle", "length"), STATES, ids=[s[0] for s in STATES])
+def test_mast_jacobians(name: str, angle: float, length: float) -> None:
+    rng = np.random.default_rng(len(name))
+    for _ in range(5):
+        values = mast_values(rng, angle, length)
+        check_jacobians(mast_factor(UNIT6, Key(X), Key(M), Key(A), Key(E), PAN_T_TILT), values, tolerance=1e-6)
+
+
+def test_mast_residual_is_zero_on_the_chain_and_the_offset_beside_it() -> None:
+    rng = np.random.default_rng(0)
+    values = mast_values(rng, 0.0, 0.0)
+    factor = mast_factor(UNIT6, Key(X), Key(M), Key(A), Key(E), PAN_T_TILT)
+    assert factor.unwhitenedError(values) == pytest.approx(np.zeros(6), abs=1e-12)
+    offset = gtsam.Pose3(gtsam.Rot3.Expmap(np.array([0.1, -0.2, 0.05])), np.array([1.0, 2.0, 3.0]))
+    values.update(X, values.atPose3(X) * offset)
+    assert factor.unwhitenedError(values) == pytest.approx([0.1, -0.2, 0.05, 1, 2, 3], abs=1e-12)
+
+
+def test_mast_factor_agrees_with_the_native_between_factor() -> None:
+    """With angles and mount fixed, the tie is a between factor; small residuals agree to second order."""
+    rng = np.random.default_rng(3)
+    values = mast_values(rng, 1e-5, 1e-5)
+    pan_tilt, mount = values.atVector(A), values.atPose3(E)
+    ours = mast_factor(UNIT6, Key(X), Key(M), Fixed(pan_tilt), Fixed(mount), PAN_T_TILT)
+    native = gtsam.BetweenFactorPose3(M, X, chain(*pan_tilt) * mount, UNIT6)
+    assert list(ours.keys()) == [X, M]
+    assert ours.error(values) == pytest.approx(native.error(values), rel=1e-4)
+
+
+def test_rig_chain_agrees_with_the_factor() -> None:
+    rng = np.random.default_rng(5)
+    base = exomars_pancam()
+    eyes = tuple(
+        Eye(name=e.name, camera=e.camera, head_T_camera=e.head_T_camera * random_pose(rng, 0.1, 0.1))
+        for e in base.eyes
+    )
+    rig = Rig(name="bent", pan_T_tilt=PAN_T_TILT, eyes=eyes)
+    pan_tilt = rng.uniform(-1.5, 1.5, (6, 2))
+    eye = np.array([0, 1, 2, 0, 1, 2])
+    rotations, centres = rig.mast_T_camera(pan_tilt, eye)
+    for i in range(6):
+        values = gtsam.Values()
+        values.insert(X, gtsam.Pose3(gtsam.Rot3(rotations[i]), centres[i]))
+        factor = mast_factor(
+            UNIT6, Key(X), Fixed(gtsam.Pose3()), Fixed(pan_tilt[i]), Fixed(eyes[eye[i]].head_T_camera), PAN_T_TILT
+        )
+        assert factor.unwhitenedError(values) == pytest.approx(np.zeros(6), abs=1e-12)
+        # and the eye's circle passes through its centre (thesis eq. 4.8)
+        radius, phase, height = rig.circle(int(eye[i]), float(pan_tilt[i, 1]))
+        residual, _ = circle_residual(
+            (rotations[i], centres[i]),
+            (np.eye(3), np.zeros(3)),
+            radius,
+            float(pan_tilt[i, 0]),
+            CircleOffset(height_m=height, phase_rad=phase),
+        )
+        assert residual == pytest.approx(np.zeros(3), abs=1e-12)
+
+
+@pytest.mark.parametrize(("name", "angle", "length"), STATES, ids=[s[0] for s in STATES])
+def test_circle_jacobians(name: str, angle: float, length: float) -> None:
+    rng = np.random.default_rng(len(name))
+    offset = CircleOffset(height_m=0.06, phase_rad=0.4, radius_m=0.002)
+    for _ in range(5):
+        values = mast_values(rng, angle, length)
+        values.insert(R, 0.15)
+        check_jacobians(circle_factor(UNIT3, Key(X), Key(M), Key(R), Key(A), offset), values, tolerance=1e-6)
+
+
+def test_circle_factor_matches_the_thesis_formula() -> None:
+    """Thesis eq. 4.8 written out, on a circle in general position."""
+    rng = np.random.default_rng(1)
+    circle, camera = random_pose(rng, 1, 5), random_pose(rng, 1, 5)
+    rho, phi = 0.3, 1.1
+    rotation, centre = pose_arrays([circle])
+    on_circle: FloatArray = rotation[0] @ np.array([rho * np.cos(phi), rho * np.sin(phi), 0]) + centre[0]
+    residual, _ = circle_residual(
+        (camera.rotation().matrix(), camera.translation()), (rotation[0], centre[0]), rho, phi, CircleOffset()
+    )
+    assert rotation[0] @ residual == pytest.approx(camera.translation() - on_circle, abs=1e-12)
+
+
+def test_an_exception_in_a_factor_reaches_the_caller() -> None:
+    values = gtsam.Values()
+    values.insert(X, gtsam.Pose3())
+    factor = mast_factor(UNIT6, Key(X), Fixed(gtsam.Pose3()), Fixed(None), Fixed(gtsam.Pose3()), PAN_T_TILT)
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(factor)
+    call: Callable[[gtsam.Values], float] = graph.error
+    with pytest.raises(TypeError, match="subscriptable"):
+        call(values)
