@@ -1,0 +1,120 @@
+"""Image files as 2-D grey arrays: PDS .IMG through its label, anything else through OpenCV."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pancam_graph.errors import ImageError, InputError
+from pancam_graph.io.pds_label import ImageLayout, read_label
+
+__all__ = ["GreyImage", "read_image"]
+
+GreyImage = NDArray[np.uint8] | NDArray[np.uint16]
+
+_GREY_WEIGHTS = np.array([0.299, 0.587, 0.114])
+"""Red, green, blue to luma, ITU-R BT.601; what OpenCV uses for its own formats."""
+
+
+def read_image(path: Path) -> GreyImage:
+    """Read an image as (rows, columns), 8 or 16 bits, grey.
+
+    A file that ends in .img or .IMG is read through its PDS3 label (attached, or a .LBL beside it):
+    integers of 8 or 16 bits in either byte order; negative samples become 0. Anything else is left to
+    OpenCV (PNG, TIFF, JPEG, PGM and more), without turning or stretching. Colour becomes luma; an
+    alpha channel is left out. Pixel [0, 0] is the top left one.
+
+    Raises ImageError for a file that is missing, unreadable, truncated, or not of 8 or 16 bits.
+    """
+    if not path.is_file():
+        raise ImageError(f"{path}: expected an image file, found {'a folder' if path.is_dir() else 'none'}")
+    if path.suffix.lower() == ".img":
+        return _read_pds(path)
+    return _read_with_opencv(path)
+
+
+def _read_pds(path: Path) -> GreyImage:
+    try:
+        layout = read_label(path).image_layout()
+    except ImageError:
+        raise
+    except InputError as error:
+        raise ImageError(str(error)) from error
+    layout.require_complete()
+    samples = _samples(layout)
+    if samples.shape[0] == 1:
+        return _unsigned(samples[0])
+    if samples.shape[0] < 3:
+        raise ImageError(f"{path}: BANDS: expected 1, or 3 for colour, found {samples.shape[0]}")
+    grey = np.tensordot(_GREY_WEIGHTS, np.maximum(samples[:3], 0).astype(float), axes=1)
+    return _unsigned(np.rint(grey).astype(samples.dtype))
+
+
+def _samples(layout: ImageLayout) -> NDArray[Any]:
+    """All samples as (bands, rows, columns)."""
+    size = layout.end_bytes - layout.offset_bytes
+    raw = np.fromfile(layout.file, dtype=np.uint8, count=size, offset=layout.offset_bytes)
+    lines = raw.reshape(-1, layout.line_bytes)
+    stop = layout.line_bytes - layout.line_suffix_bytes
+    values: NDArray[Any] = np.ascontiguousarray(lines[:, layout.line_prefix_bytes : stop]).view(layout.dtype)
+    height, width, bands = layout.height_px, layout.width_px, layout.bands
+    if layout.storage == "SAMPLE_INTERLEAVED":
+        return np.asarray(values.reshape(height, width, bands).transpose(2, 0, 1))
+    if layout.storage == "LINE_INTERLEAVED":
+        return np.asarray(values.reshape(height, bands, width).transpose(1, 0, 2))
+    return values.reshape(bands, height, width)
+
+
+def _unsigned(samples: NDArray[Any]) -> GreyImage:
+    positive: NDArray[Any] = np.maximum(samples, 0)
+    return positive.astype(np.uint8) if samples.dtype.itemsize == 1 else positive.astype(np.uint16)
+
+
+def _read_with_opencv(path: Path) -> GreyImage:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ImageError(f"{path}: expected an image file, could not read it: {error.strerror}") from error
+    _require_whole(path, data)
+    image = _decode(data)
+    if image is None:
+        raise ImageError(
+            f"{path}: expected an image that OpenCV reads (PNG, TIFF, JPEG, PGM), found {len(data)} bytes "
+            "that are none"
+        )
+    if image.dtype not in {np.dtype(np.uint8), np.dtype(np.uint16)}:
+        raise ImageError(f"{path}: expected samples of 8 or 16 bits, found {image.dtype}")
+    if image.ndim == 3:
+        channels = image.shape[2]
+        if channels >= 3:
+            image = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_BGR2GRAY)
+        else:
+            image = np.ascontiguousarray(image[:, :, 0])
+    return _unsigned(image)
+
+
+def _decode(data: bytes) -> NDArray[Any] | None:
+    """The image, or None for bytes that OpenCV cannot read."""
+    if not data:
+        return None
+    # OpenCV writes lines of its own about broken files; the caller's one sentence replaces them.
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        # From memory: OpenCV cannot open every path that the system can.
+        return cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        return None
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+
+
+def _require_whole(path: Path, data: bytes) -> None:
+    # OpenCV decodes what there is of a truncated PNG or JPEG and fills the rest.
+    for start, end, kind in ((b"\x89PNG", b"IEND", "PNG"), (b"\xff\xd8\xff", b"\xff\xd9", "JPEG")):
+        if data.startswith(start) and end not in data[-65536:]:
+            raise ImageError(
+                f"{path}: expected a whole {kind}, found {len(data)} bytes without its end: truncated"
+            )
