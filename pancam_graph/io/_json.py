@@ -1,0 +1,173 @@
+"""Strict JSON: one sentence for whatever is wrong with a file, naming the entry."""
+
+import json
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+import pydantic
+
+from pancam_graph.errors import InputError, PancamGraphError
+
+__all__ = ["entry_name", "prefixed", "read_bytes", "read_json", "short", "validated"]
+
+_MAX_QUOTED = 60
+_EXPECTED = {
+    "finite_number": "a finite number",
+    "float_type": "a number",
+    "int_type": "an integer",
+    "list_type": "a list",
+    "model_type": "an object",
+    "string_type": "a string",
+    "string_unicode": "a string of valid Unicode",
+}
+"""What pydantic's error types mean to somebody who wrote JSON."""
+
+_Model = TypeVar("_Model", bound=pydantic.BaseModel)
+
+
+def short(value: object) -> str:
+    """A JSON value as an error message quotes it: in JSON's own words, on one line, not too long."""
+    if isinstance(value, dict):
+        return "an object" if value else "an empty object"
+    if isinstance(value, list):
+        return f"a list of {len(value)}"
+    if isinstance(value, int) and abs(value) >= 10**_MAX_QUOTED:
+        return "an integer of too many digits"
+    text = json.dumps(value)
+    return text if len(text) <= _MAX_QUOTED else f"{text[:_MAX_QUOTED]}..."
+
+
+def entry_name(location: Sequence[int | str]) -> str:
+    """Path of an entry as an error message names it: `frames[3].pan_rad`.
+
+    Pieces in angle brackets are the tags by which a schema tells the members of a union apart: left out.
+    """
+    name = ""
+    for piece in location:
+        if isinstance(piece, int):
+            name += f"[{piece}]"
+        elif not (piece.startswith("<") and piece.endswith(">")):
+            name += f".{piece}" if name else piece
+    return name
+
+
+@contextmanager
+def prefixed(where: object) -> Iterator[None]:
+    """Put `where` (a file, an entry) before the sentence of any error of ours that leaves the block.
+
+    What leaves is an InputError, or the subclass of it that was raised; on one line.
+    """
+    try:
+        yield
+    except PancamGraphError as error:
+        kind = type(error) if isinstance(error, InputError) else InputError
+        raise kind(" ".join(f"{where}: {error}".splitlines())) from error
+
+
+def read_bytes(path: Path) -> bytes:
+    """Content of a file. Raises InputError saying why it cannot be read."""
+    try:
+        if path.is_dir():
+            raise InputError(f"{path}: expected a file, found a folder")
+        return path.read_bytes()
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: expected a file, found nothing there") from error
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{path}: expected a readable file, found: {reason}") from error
+
+
+def _doubled_key(value: object, doubled: dict[int, str], location: tuple[int | str, ...] = ()) -> str | None:
+    """Path of the first object of which a key stands twice; `doubled` maps its identity to that key."""
+    if isinstance(value, dict):
+        if id(value) in doubled:
+            return entry_name((*location, doubled[id(value)]))
+        children: list[tuple[int | str, object]] = list(value.items())
+    else:
+        children = list(enumerate(value)) if isinstance(value, list) else []
+    for key, child in children:
+        found = _doubled_key(child, doubled, (*location, key))
+        if found is not None:
+            return found
+    return None
+
+
+def read_json(path: Path, format_name: str, version: int) -> dict[str, Any]:
+    """The object in a JSON file of one of our formats.
+
+    NaN and infinite numbers pass: the schema refuses them, and knows which entry they are.
+
+    Raises InputError for a file that cannot be read or is not JSON, for anything else than an object, for a
+    key that stands twice, and for another format or version.
+    """
+    doubled: dict[int, str] = {}
+    kept: list[
+        dict[str, Any]
+    ] = []  # keeps every object with a doubled key alive, so that its id stays its own
+
+    def pairs(items: list[tuple[str, Any]]) -> dict[str, Any]:
+        value = dict(items)
+        if len(value) < len(items):
+            keys = Counter(key for key, _ in items)
+            doubled[id(value)] = keys.most_common(1)[0][0]
+            kept.append(value)
+        return value
+
+    content = read_bytes(path)
+    if not content.strip():
+        raise InputError(f"{path}: expected a JSON object, found an empty file")
+    try:
+        data = json.loads(content.decode("utf-8-sig"), object_pairs_hook=pairs)
+        entry = _doubled_key(data, doubled) if doubled else None
+    except json.JSONDecodeError as error:
+        where = f"line {error.lineno}, column {error.colno}"
+        raise InputError(f"{path}: {where}: expected JSON, found an error: {error.msg}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: expected JSON in UTF-8, found other bytes at {error.start}") from error
+    except RecursionError as error:
+        raise InputError(f"{path}: expected JSON, found brackets nested too deeply") from error
+    except ValueError as error:  # an integer of thousands of digits
+        raise InputError(f"{path}: expected JSON, found an error: {error}") from error
+    if not isinstance(data, dict):
+        raise InputError(f"{path}: expected a JSON object, found {short(data)}")
+    if entry is not None:
+        raise InputError(f"{path}: {entry}: expected each key once in an object, found it twice")
+    for key, expected in (("format", format_name), ("version", version)):
+        if key not in data:
+            raise InputError(f"{path}: {key}: expected {short(expected)}, found no such key")
+        if data[key] != expected or type(data[key]) is not type(expected):
+            raise InputError(f"{path}: {key}: expected {short(expected)}, found {short(data[key])}")
+    return data
+
+
+def validated(model: type[_Model], data: dict[str, Any], path: Path) -> _Model:
+    """The data as a model. Raises InputError about the first thing that does not fit the schema."""
+    try:
+        return model.model_validate(data)
+    except pydantic.ValidationError as error:
+        first, *others = error.errors(include_url=False)
+        more = f" (and {len(others)} more such error{'s' if len(others) > 1 else ''})" if others else ""
+        with prefixed(path):
+            raise InputError(f"{_sentence(first)}{more}") from error
+
+
+def _sentence(error: Any) -> str:
+    where, kind, context = entry_name(error["loc"]), error["type"], error.get("ctx", {})
+    if kind == "missing":
+        return f"{where}: expected this key, found an object without it"
+    if kind == "extra_forbidden":
+        return f"{where}: expected no other keys than the format's, found this one"
+    if kind in {"too_short", "too_long"}:
+        limit = context["min_length" if kind == "too_short" else "max_length"]
+        bound = "at least" if kind == "too_short" else "at most"
+        return f"{where}: expected {bound} {limit} entries, found {context['actual_length']}"
+    if kind in {"union_tag_invalid", "union_tag_not_found"} and isinstance(error["input"], dict):
+        tags = context["expected_tags"].translate(str.maketrans("", "", "'<>"))
+        return f"{where}.model: expected one of {tags}; found {short(error['input'].get('model'))}"
+    if kind == "literal_error":
+        return f"{where}: expected {context['expected']}, found {short(error['input'])}"
+    expected = "an object" if kind.startswith("union_tag") else _EXPECTED.get(kind, error["msg"])
+    return f"{where}: expected {expected}, found {short(error['input'])}"

@@ -1,0 +1,199 @@
+"""A traverse as a folder: `traverse.json`, its observations and its image files."""
+
+import json
+import secrets
+import shutil
+from pathlib import Path, PurePosixPath, PureWindowsPath
+
+from pancam_graph.errors import ImageError, InputError
+from pancam_graph.io._json import prefixed, read_json, short, validated
+from pancam_graph.io._schema import (
+    TRAVERSE_FORMAT,
+    VERSION,
+    FrameEntry,
+    ImageEntry,
+    PoseEntry,
+    StopEntry,
+    TraverseFile,
+    rig_entry,
+)
+from pancam_graph.io.image_files import read_image
+from pancam_graph.io.observations import observations_npz, read_observations
+from pancam_graph.traverse import Frame, Image, Stop, Traverse
+
+__all__ = ["read_traverse", "write_traverse"]
+
+_TRAVERSE_JSON = "traverse.json"
+_OBSERVATIONS = "observations.npz"
+
+
+def read_traverse(folder: Path | str) -> Traverse:
+    """Read a traverse folder: `traverse.json`, the observations and image files that it names.
+
+    Every image file is decoded once, to know that it is there, whole, and of its camera's size; nothing is
+    kept of it. `observations` is None where the file says null: they are then to be found in the images.
+
+    Raises InputError (ImageError for an image) with one sentence naming file, entry, what was expected and
+    what was found.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        found = "a file" if folder.exists() else "nothing there"
+        raise InputError(f"{folder}: expected a traverse folder with {_TRAVERSE_JSON}, found {found}")
+    path = folder / _TRAVERSE_JSON
+    entries = validated(TraverseFile, read_json(path, TRAVERSE_FORMAT, VERSION), path)
+    with prefixed(path):
+        traverse = _traverse(entries, folder)
+        files = [
+            None if i.file is None else _inside(folder, i.file, f"images[{row}].file")
+            for row, i in enumerate(entries.images)
+        ]
+        if entries.observations is None and not any(files):
+            raise InputError(
+                "observations: expected a file, or image files to find them in; found null and no image file"
+            )
+        source = None
+        if entries.observations is not None:
+            source = _inside(folder, entries.observations, "observations")
+    if source is not None:
+        observations = read_observations(source)
+        try:
+            traverse = traverse.with_observations(observations)
+        except InputError as error:
+            raise InputError(f"{source}: {str(error).removeprefix('observations: ')}") from error
+    for row, file in enumerate(files):
+        if file is not None:
+            _require_image(file, traverse, row)
+    return traverse
+
+
+def write_traverse(traverse: Traverse, folder: Path | str, *, overwrite: bool = False) -> None:
+    """Write a traverse folder that `read_traverse` reads back, poses and pixels to double precision.
+
+    The rig is written with its own numbers. Image files of a traverse that was read from another folder are
+    copied along. That observations were found in images (`Observations.origin`) is not in the format.
+
+    Raises InputError where `folder` has a `traverse.json` already and `overwrite` is not set, for an image
+    file outside its folder, and for files that cannot be written.
+    """
+    folder = Path(folder)
+    path = folder / _TRAVERSE_JSON
+    if path.exists() and not overwrite:
+        raise InputError(f"{path}: expected a folder without a traverse, found one; overwrite is off")
+    copies = _copies(traverse, folder)
+    observations = traverse.observations
+    text = json.dumps(_entries(traverse).model_dump(), indent=1, allow_nan=False, ensure_ascii=False)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for source, target in copies:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(source, target)
+        if observations is not None:
+            _replace_file(folder / _OBSERVATIONS, observations_npz(observations))
+        _replace_file(path, f"{text}\n".encode())  # last: a folder with it is complete
+    except OSError as error:
+        raise InputError(f"{folder}: expected a folder to write to, found: {error}") from error
+
+
+def _traverse(entries: TraverseFile, folder: Path) -> Traverse:
+    stops = tuple(
+        Stop(
+            id=s.id,
+            world_T_mast=s.world_T_mast.pose(f"stops[{i}].world_T_mast"),
+            sigma_rotation_rad=s.sigma_rotation_rad,
+            sigma_translation_m=s.sigma_translation_m,
+        )
+        for i, s in enumerate(entries.stops)
+    )
+    return Traverse(
+        name=entries.name if entries.name is not None else folder.resolve().name,
+        rig=entries.rig.rig(),
+        stops=stops,
+        frames=tuple(Frame(**f.model_dump()) for f in entries.frames),
+        images=tuple(Image(**i.model_dump()) for i in entries.images),
+        folder=folder,
+    )
+
+
+def _entries(traverse: Traverse) -> TraverseFile:
+    stops = [
+        StopEntry(
+            id=s.id,
+            world_T_mast=PoseEntry.of(s.world_T_mast),
+            sigma_rotation_rad=float(s.sigma_rotation_rad),
+            sigma_translation_m=float(s.sigma_translation_m),
+        )
+        for s in traverse.stops
+    ]
+    frames = [
+        FrameEntry(
+            id=f.id,
+            stop=f.stop,
+            pan_rad=float(f.pan_rad),
+            tilt_rad=float(f.tilt_rad),
+            sigma_pan_rad=float(f.sigma_pan_rad),
+            sigma_tilt_rad=float(f.sigma_tilt_rad),
+        )
+        for f in traverse.frames
+    ]
+    return TraverseFile(
+        name=traverse.name,
+        rig=rig_entry(traverse.rig),
+        stops=stops,
+        frames=frames,
+        images=[ImageEntry(id=i.id, frame=i.frame, camera=i.camera, file=i.file) for i in traverse.images],
+        observations=None if traverse.observations is None else _OBSERVATIONS,
+    )
+
+
+def _inside(folder: Path, name: str, entry: str) -> Path:
+    """Path of a file that an entry names. Raises InputError unless it lies in the folder, links followed."""
+    expected = f"{entry}: expected a path inside the traverse folder"
+    for kind in (PurePosixPath, PureWindowsPath):
+        pure = kind(name)
+        if pure.is_absolute() or pure.drive or ".." in pure.parts:
+            raise InputError(f"{expected}, found {short(name)}")
+    try:
+        inside = (folder / name).resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError, ValueError) as error:  # a ring of links, a NUL in the name
+        raise InputError(f"{expected}, found {short(name)} ({error})") from error
+    if not inside:
+        raise InputError(f"{expected}, found {short(name)}, a link that leads out of it")
+    return folder / name
+
+
+def _require_image(file: Path, traverse: Traverse, row: int) -> None:
+    entry = f"images[{row}] ({traverse.images[row].id})"
+    try:
+        height, width = read_image(file).shape
+    except ImageError as error:
+        raise ImageError(f"{traverse.folder}/{_TRAVERSE_JSON}: {entry}: {error}") from error
+    eye = traverse.rig.eyes[traverse.image_eye[row]]
+    if (width, height) != (eye.camera.width_px, eye.camera.height_px):
+        raise ImageError(
+            f"{file}: {entry}: expected {eye.camera.width_px} x {eye.camera.height_px} pixels as of camera "
+            f"{eye.name}, found {width} x {height}"
+        )
+
+
+def _copies(traverse: Traverse, folder: Path) -> list[tuple[Path, Path]]:
+    if traverse.folder is None or traverse.folder.resolve() == folder.resolve():
+        return []
+    files = [
+        (_inside(traverse.folder, i.file, f"images[{row}].file"), folder / i.file)
+        for row, i in enumerate(traverse.images)
+        if i.file is not None
+    ]
+    for source, _ in files:
+        if not source.is_file():
+            raise ImageError(f"{source}: expected an image file to copy along, found none")
+    return files
+
+
+def _replace_file(path: Path, content: bytes) -> None:
+    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
+    try:
+        partial.write_bytes(content)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
