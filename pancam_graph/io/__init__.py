@@ -1,5 +1,10 @@
 """Readers and writers, one file format a module."""
 
 from pancam_graph.io.image_files import read_image as read_image
+from pancam_graph.io.inputs import read_input as read_input
+from pancam_graph.io.results import check_out as check_out
+from pancam_graph.io.results import save_solution as save_solution
+from pancam_graph.io.solution_json import SolutionFile as SolutionFile
+from pancam_graph.io.solution_json import read_solution_json as read_solution_json
 from pancam_graph.io.traverse_json import read_traverse as read_traverse
 from pancam_graph.io.traverse_json import write_traverse as write_traverse

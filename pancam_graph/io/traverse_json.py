@@ -1,11 +1,11 @@
 """A traverse as a folder: `traverse.json`, its observations and its image files."""
 
 import json
-import secrets
 import shutil
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from pancam_graph.errors import ImageError, InputError
+from pancam_graph.io._atomic import whole_file
 from pancam_graph.io._json import prefixed, read_json, short, validated
 from pancam_graph.io._schema import (
     TRAVERSE_FORMAT,
@@ -89,8 +89,8 @@ def write_traverse(traverse: Traverse, folder: Path | str, *, overwrite: bool = 
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source, target)
         if observations is not None:
-            _replace_file(folder / _OBSERVATIONS, observations_npz(observations))
-        _replace_file(path, f"{text}\n".encode())  # last: a folder with it is complete
+            whole_file(folder / _OBSERVATIONS, observations_npz(observations))
+        whole_file(path, f"{text}\n".encode())  # last: a folder with it is complete
     except OSError as error:
         raise InputError(f"{folder}: expected a folder to write to, found: {error}") from error
 
@@ -188,12 +188,3 @@ def _copies(traverse: Traverse, folder: Path) -> list[tuple[Path, Path]]:
         if not source.is_file():
             raise ImageError(f"{source}: expected an image file to copy along, found none")
     return files
-
-
-def _replace_file(path: Path, content: bytes) -> None:
-    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
-    try:
-        partial.write_bytes(content)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)

@@ -1,0 +1,47 @@
+"""Files and folders that appear whole or not at all."""
+
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+__all__ = ["whole_file", "whole_folder"]
+
+
+def whole_file(path: Path, content: bytes) -> None:
+    """Write a file beside its place and rename it there: a reader sees the old content or the new."""
+    partial = _sibling(path, "partial")
+    try:
+        partial.write_bytes(content)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """A new folder beside `path` to write into, renamed to `path` when the block ends.
+
+    What was at `path` is moved aside just before and deleted just after. If the block raises, or the renaming
+    fails, the new folder is deleted and what was at `path` is there as before. Missing parents are made.
+    """
+    path = path.resolve()  # through links: what they lead to is replaced, not the link
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial, older = _sibling(path, "partial"), _sibling(path, "older")
+    partial.mkdir()
+    try:
+        yield partial
+        if path.exists():
+            path.rename(older)
+        partial.rename(path)
+    except BaseException:  # an interrupt from the keyboard too
+        if older.exists() and not path.exists():
+            older.rename(path)
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+    shutil.rmtree(older, ignore_errors=True)
+
+
+def _sibling(path: Path, kind: str) -> Path:
+    return path.with_name(f".{path.name}.{secrets.token_hex(4)}.{kind}")

@@ -1,0 +1,94 @@
+"""The folder of results: solution.json, points.ply, residuals.csv, report.html; whole or not at all."""
+
+import os
+import time
+from pathlib import Path
+
+from pancam_graph.errors import InputError
+from pancam_graph.io._atomic import whole_folder
+from pancam_graph.io._json import read_json
+from pancam_graph.io._schema import SOLUTION_FORMAT, VERSION
+from pancam_graph.io.ply import points_ply
+from pancam_graph.io.residuals_csv import residuals_csv
+from pancam_graph.io.solution_json import solution_json
+from pancam_graph.solution import Solution
+
+__all__ = ["RESULT_FILES", "check_out", "save_solution"]
+
+RESULT_FILES = ("solution.json", "points.ply", "residuals.csv", "report.html")
+"""What a folder of results consists of; the report may be missing."""
+
+
+def check_out(out: Path | str) -> None:
+    """Make sure that results can go to `out`, without writing anything; for before a long solve.
+
+    Raises InputError unless `out` is new, an empty folder, or a folder with nothing but older results, and
+    its place can be written to.
+    """
+    out = Path(out)
+    expected = f"{out}: expected a new folder or one of older results"
+    try:
+        if out.is_symlink() and not out.exists():
+            raise InputError(f"{expected}, found a link that leads nowhere")
+        target = out.resolve()
+        if not out.exists():
+            parent = next(p for p in target.parents if p.exists())
+        elif not out.is_dir():
+            raise InputError(f"{expected}, found a file")
+        else:
+            _require_results(target, expected)
+            if target == Path.cwd():
+                raise InputError(f"{expected}, found the folder that this program works in")
+            if target.is_mount():
+                raise InputError(
+                    f"{expected}, found a mount point, which cannot be renamed: use a folder in it"
+                )
+            parent = target.parent
+    except (OSError, RuntimeError, ValueError) as error:  # a name too long, a ring of links, a NUL
+        raise InputError(f"{expected}, found a path that cannot be used ({error})") from error
+    if not parent.is_dir():
+        raise InputError(f"{expected}, found a file in its place: {parent}")
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise InputError(f"{expected}, found no permission to write in {parent}")
+
+
+def save_solution(solution: Solution, out: Path | str, *, report: bool = True) -> Solution:
+    """Write the results of a solution into the folder `out`; see `RESULT_FILES`.
+
+    Everything is written into a folder beside and renamed when complete: an older folder of results stays
+    whole until then, and is there as before if anything fails. Returns the solution with the time that
+    writing took as its `seconds.report`. Raises InputError as `check_out` does, and where writing fails.
+    """
+    out = Path(out)
+    check_out(out)
+    started = time.perf_counter()
+    try:
+        with whole_folder(out) as folder:
+            (folder / "points.ply").write_bytes(points_ply(solution))
+            (folder / "residuals.csv").write_bytes(residuals_csv(solution))
+            if report:
+                from pancam_graph.report import write_report  # noqa: PLC0415  Plotly is only for reports
+
+                write_report(solution, folder / "report.html")
+            # Last: it says how long the others took.
+            timed = solution.with_seconds(report=time.perf_counter() - started)
+            (folder / "solution.json").write_bytes(solution_json(timed))
+    except OSError as error:
+        raise InputError(f"{out}: expected a place where results can be written, found: {error}") from error
+    return timed
+
+
+def _require_results(folder: Path, expected: str) -> None:
+    """Raise InputError unless a folder is empty or holds nothing but results."""
+    found = sorted(p.name for p in folder.iterdir())
+    strangers = [n for n in found if n not in RESULT_FILES or not (folder / n).is_file()]
+    if strangers:
+        more = f" and {len(strangers) - 1} more" if len(strangers) > 1 else ""
+        raise InputError(f"{expected}, found other things in it: {strangers[0]}{more}")
+    if found and "solution.json" not in found:
+        raise InputError(f"{expected}, found {found[0]} but no solution.json")
+    if found:
+        try:
+            read_json(folder / "solution.json", SOLUTION_FORMAT, VERSION)
+        except InputError as error:
+            raise InputError(f"{expected}, found a solution.json that is none of ours: {error}") from error

@@ -1,0 +1,197 @@
+"""The numbers of a solution: `solution.json`."""
+
+import json
+import math
+from pathlib import Path
+from typing import Annotated, Literal
+
+import gtsam
+import numpy as np
+from pydantic import Field
+
+from pancam_graph.geometry import FloatArray, IntArray
+from pancam_graph.io._json import read_json, validated
+from pancam_graph.io._schema import SOLUTION_FORMAT, VERSION, CameraEntry, Entry, PoseEntry, camera_entry
+from pancam_graph.solution import Solution
+
+__all__ = ["SolutionFile", "read_solution_json", "solution_file", "solution_json"]
+
+Vector6 = Annotated[list[float], Field(min_length=6, max_length=6)]
+
+
+class SecondsEntry(Entry):
+    """Wall-clock time of each part."""
+
+    read: float
+    initialise: float
+    solve: float
+    report: float
+
+
+class BeforeAfterEntry(Entry):
+    """A number at the start and at the end; null where it is not defined."""
+
+    initial: float | None
+    final: float | None
+
+
+class CountsEntry(Entry):
+    """How many observations took part, and how many did not."""
+
+    used: int
+    rejected: int
+
+
+class SolvedStopEntry(Entry):
+    """Mast pose of a stop; null where it is not finite."""
+
+    id: str
+    world_T_mast: PoseEntry | None
+    covariance: Annotated[list[Vector6], Field(min_length=6, max_length=6)] | None
+    """6 x 6, rotation first, body frame; 0 for a held stop, null where unknown."""
+
+
+class SolvedFrameEntry(Entry):
+    """Angles of a frame with their formal standard deviations; null where not finite."""
+
+    id: str
+    pan_rad: float | None
+    tilt_rad: float | None
+    sigma_pan_rad: float | None
+    sigma_tilt_rad: float | None
+
+
+class SolvedImageEntry(Entry):
+    """Camera pose of an image; count and RMS residual length of its used observations."""
+
+    id: str
+    world_T_camera: PoseEntry | None
+    rms_px: float | None
+    """Null without used observations."""
+    observations: int
+
+
+class SolutionFile(Entry):
+    """`solution.json`."""
+
+    format: Literal["pancam-graph/solution"] = "pancam-graph/solution"
+    version: Literal[1] = 1
+    model: str
+    landmarks: str
+    converged: bool
+    stop_reason: str
+    iterations: int
+    seconds: SecondsEntry
+    cost: BeforeAfterEntry
+    """Half the sum of squares, priors included."""
+    rms_px: BeforeAfterEntry
+    observations: CountsEntry
+    stops: list[SolvedStopEntry]
+    frames: list[SolvedFrameEntry]
+    images: list[SolvedImageEntry]
+    cameras: list[CameraEntry]
+    """As the cameras of a rig in `traverse.json`."""
+    warnings: list[str]
+
+
+def read_solution_json(path: Path | str) -> SolutionFile:
+    """Read a `solution.json`. Raises InputError naming file, entry, expected and found."""
+    path = Path(path)
+    return validated(SolutionFile, read_json(path, SOLUTION_FORMAT, VERSION), path)
+
+
+def solution_json(solution: Solution) -> bytes:
+    """A solution as the content of `solution.json`; null in place of what is not finite."""
+    data = solution_file(solution).model_dump()
+    return f"{json.dumps(data, indent=1, allow_nan=False, ensure_ascii=False)}\n".encode()
+
+
+def solution_file(solution: Solution) -> SolutionFile:
+    """A solution as the model of its file."""
+    traverse, final = solution.traverse, solution.final
+    stops = [
+        SolvedStopEntry(id=stop.id, world_T_mast=_pose(pose), covariance=_covariance(covariance))
+        for stop, pose, covariance in zip(
+            traverse.stops, final.world_T_mast, solution.stop_covariance, strict=True
+        )
+    ]
+    frames = [
+        SolvedFrameEntry(
+            id=frame.id,
+            pan_rad=_number(angles[0]),
+            tilt_rad=_number(angles[1]),
+            sigma_pan_rad=_number(sigmas[0]),
+            sigma_tilt_rad=_number(sigmas[1]),
+        )
+        for frame, angles, sigmas in zip(
+            traverse.frames, final.pan_tilt_rad, solution.angle_sigma_rad, strict=True
+        )
+    ]
+    seconds = solution.seconds
+    n_used = int(np.count_nonzero(solution.used))
+    return SolutionFile(
+        model=solution.model,
+        landmarks=solution.landmarks,
+        converged=bool(solution.converged),
+        stop_reason=solution.stop_reason,
+        iterations=int(solution.iterations),
+        seconds=SecondsEntry(
+            read=float(seconds.read),
+            initialise=float(seconds.initialise),
+            solve=float(seconds.solve),
+            report=float(seconds.report),
+        ),
+        cost=BeforeAfterEntry(initial=_number(solution.cost_initial), final=_number(solution.cost_final)),
+        rms_px=BeforeAfterEntry(
+            initial=_number(solution.rms_initial_px) if n_used else None,
+            final=_number(solution.rms_final_px) if n_used else None,
+        ),
+        observations=CountsEntry(used=n_used, rejected=len(solution.used) - n_used),
+        stops=stops,
+        frames=frames,
+        images=_images(solution),
+        cameras=[camera_entry(e) for e in traverse.rig.eyes],
+        # What the reader noticed comes first, once, whether or not the solver passed it on.
+        warnings=list(dict.fromkeys([*traverse.warnings, *solution.warnings])),
+    )
+
+
+def _images(solution: Solution) -> list[SolvedImageEntry]:
+    traverse, final = solution.traverse, solution.final
+    n = len(traverse.images)
+    count: IntArray = np.zeros(n, dtype=np.int64)
+    squared: FloatArray = np.zeros(n)
+    if traverse.observations is not None:
+        image = traverse.observations.image[solution.used]
+        length2 = np.sum(solution.residual_final_px[solution.used] ** 2, axis=1)
+        count = np.bincount(image, minlength=n)
+        squared = np.asarray(np.bincount(image, weights=length2, minlength=n), dtype=float)
+    return [
+        SolvedImageEntry(
+            id=entry.id,
+            world_T_camera=_pose_of(rotation, translation),
+            rms_px=_number(np.sqrt(total / views)) if views else None,
+            observations=int(views),
+        )
+        for entry, rotation, translation, views, total in zip(
+            traverse.images, final.world_R_camera, final.world_t_camera, count, squared, strict=True
+        )
+    ]
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _pose(pose: gtsam.Pose3) -> PoseEntry | None:
+    return PoseEntry.of(pose) if np.isfinite(pose.matrix()).all() else None
+
+
+def _pose_of(rotation: FloatArray, translation: FloatArray) -> PoseEntry | None:
+    if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
+        return None
+    return PoseEntry.of(gtsam.Pose3(gtsam.Rot3(rotation), translation))
+
+
+def _covariance(covariance: FloatArray) -> list[list[float]] | None:
+    return covariance.tolist() if np.isfinite(covariance).all() else None

@@ -1,0 +1,275 @@
+"""The folder of results: its four files, and that it is whole or not there."""
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import io_samples
+import numpy as np
+import pytest
+
+import pancam_graph.report
+from pancam_graph.errors import InputError
+from pancam_graph.io import check_out, read_solution_json, save_solution
+from pancam_graph.solution import Solution
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+@pytest.fixture(autouse=True)
+def small_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    def write_report(solution: Solution, path: Path) -> None:
+        path.write_text(f"<html>{solution.model}</html>")
+
+    monkeypatch.setattr(pancam_graph.report, "write_report", write_report, raising=False)
+
+
+def read_ply(path: Path) -> tuple[list[str], np.ndarray[Any, Any]]:
+    header, body = path.read_bytes().split(b"end_header\n", 1)
+    types = {"double": "<f8", "float": "<f4", "int": "<i4"}
+    lines = header.decode("ascii").splitlines()
+    properties = [line.split()[1:] for line in lines if line.startswith("property")]
+    return lines, np.frombuffer(body, dtype=[(name, types[kind]) for kind, name in properties])
+
+
+def test_solution_json_has_the_keys_of_the_contract(tmp_path: Path) -> None:
+    save_solution(io_samples.solution(), tmp_path / "out")
+    data = json.loads((tmp_path / "out" / "solution.json").read_text())
+    assert list(data) == [
+        "format",
+        "version",
+        "model",
+        "landmarks",
+        "converged",
+        "stop_reason",
+        "iterations",
+        "seconds",
+        "cost",
+        "rms_px",
+        "observations",
+        "stops",
+        "frames",
+        "images",
+        "cameras",
+        "warnings",
+    ]
+    assert (data["format"], data["version"]) == ("pancam-graph/solution", 1)
+    assert set(data["seconds"]) == {"read", "initialise", "solve", "report"}
+    assert data["cost"] == {"initial": 200.0, "final": 50.0}
+    assert data["rms_px"] == {"initial": pytest.approx(1.0), "final": pytest.approx(0.5)}
+    assert set(data["stops"][0]) == {"id", "world_T_mast", "covariance"}
+    assert set(data["stops"][0]["world_T_mast"]) == {"rotation_wxyz", "translation_m"}
+    assert np.array(data["stops"][1]["covariance"]).tolist() == np.diag(np.arange(1.0, 7.0)).tolist()
+    assert set(data["frames"][0]) == {"id", "pan_rad", "tilt_rad", "sigma_pan_rad", "sigma_tilt_rad"}
+    assert data["frames"][0]["pan_rad"] == pytest.approx(0.1001)
+    assert set(data["images"][0]) == {"id", "world_T_camera", "rms_px", "observations"}
+    assert data["warnings"] == ["a track is seen once"]
+
+
+def test_solution_json_counts_the_used_observations(tmp_path: Path) -> None:
+    solution = io_samples.solution()
+    save_solution(solution, tmp_path / "out")
+    found = read_solution_json(tmp_path / "out" / "solution.json")
+    assert found.observations.used + found.observations.rejected == len(solution.used)
+    assert found.observations.used == sum(i.observations for i in found.images)
+    assert (found.images[0].rms_px, found.images[0].observations) == (None, 0)
+    assert (found.images[1].rms_px, found.images[1].observations) == (pytest.approx(0.5), 1)
+
+
+def test_cameras_are_those_of_a_traverse(tmp_path: Path) -> None:
+    solution = io_samples.solution()
+    save_solution(solution, tmp_path / "out")
+    cameras = read_solution_json(tmp_path / "out" / "solution.json").cameras
+    assert [c.name for c in cameras] == [e.name for e in solution.traverse.rig.eyes]
+    for entry, eye in zip(cameras, solution.traverse.rig.eyes, strict=True):
+        assert type(entry.eye("camera").camera) is type(eye.camera)
+
+
+def test_what_is_not_finite_becomes_null(tmp_path: Path) -> None:
+    solution = io_samples.solution(cost_final=np.inf, used=np.zeros(60, dtype=bool))
+    state = replace(solution.final, world_t_camera=np.full((20, 3), np.nan))
+    covariance = np.full((2, 6, 6), np.nan)
+    sigma = np.full((4, 2), np.inf)
+    bad = replace(solution, final=state, stop_covariance=covariance, angle_sigma_rad=sigma)
+    save_solution(bad, tmp_path / "out")
+    text = (tmp_path / "out" / "solution.json").read_text()
+    assert "NaN" not in text
+    assert "Infinity" not in text
+    found = read_solution_json(tmp_path / "out" / "solution.json")
+    assert (found.cost.final, found.rms_px.final) == (None, None)
+    assert found.images[0].world_T_camera is None
+    assert found.stops[0].covariance is None
+    assert found.frames[0].sigma_pan_rad is None
+
+
+def test_warnings_of_reader_and_solver_stand_once(tmp_path: Path) -> None:
+    given = replace(io_samples.traverse(), warnings=("from the label", "both"))
+    save_solution(io_samples.solution(traverse=given, warnings=("both", "solver")), tmp_path / "out")
+    assert read_solution_json(tmp_path / "out" / "solution.json").warnings == [
+        "from the label",
+        "both",
+        "solver",
+    ]
+
+
+def test_points_ply(tmp_path: Path) -> None:
+    save_solution(io_samples.solution(), tmp_path / "out")
+    header, points = read_ply(tmp_path / "out" / "points.ply")
+    assert header[:2] == ["ply", "format binary_little_endian 1.0"]
+    assert "element vertex 2" in header
+    assert points.dtype.names == ("x", "y", "z", "track", "residual_px", "observations")
+    assert points["track"].tolist() == [7, 0]
+    assert points["x"].tolist() == [1.0, 5.0]
+    np.testing.assert_allclose(points["residual_px"], 0.5, rtol=1e-6)
+    assert points["observations"].tolist() == [18, 19]  # of 20 images, less the outliers
+
+
+def test_points_ply_with_large_track_numbers_and_without_points(tmp_path: Path) -> None:
+    save_solution(io_samples.solution(landmark_track=np.array([2**40, 2, 0])), tmp_path / "out")
+    _, points = read_ply(tmp_path / "out" / "points.ply")
+    assert points["track"].tolist() == [2.0**40, 0.0]
+    assert np.isnan(points["residual_px"][0])
+    nothing = replace(io_samples.solution().final, landmarks_m=np.zeros((0, 3)))
+    save_solution(
+        io_samples.solution(final=nothing, landmark_track=np.zeros(0, dtype=np.int64)), tmp_path / "out"
+    )
+    assert len(read_ply(tmp_path / "out" / "points.ply")[1]) == 0
+
+
+def test_residuals_csv(tmp_path: Path) -> None:
+    solution = io_samples.solution()
+    save_solution(solution, tmp_path / "out")
+    with (tmp_path / "out" / "residuals.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    observations = solution.traverse.observations
+    assert observations is not None
+    assert len(rows) == len(observations)
+    assert rows[4] == {
+        "image": "s0f0_brown",
+        "track": "2",
+        "u_px": f"{observations.uv_px[4, 0]:.10g}",
+        "v_px": f"{observations.uv_px[4, 1]:.10g}",
+        "sigma_px": "0.3",
+        "initial_du_px": "",
+        "initial_dv_px": "",
+        "final_du_px": "",
+        "final_dv_px": "",
+        "used": "0",
+        "reason": "single",
+    }
+    assert [rows[3][k] for k in ("final_du_px", "final_dv_px", "used", "reason")] == ["0.3", "-0.4", "1", ""]
+
+
+def test_the_time_of_writing_is_in_the_file_and_in_what_returns(tmp_path: Path) -> None:
+    timed = io_samples.solution().with_seconds(read=1.5).save(tmp_path / "a" / "b" / "out")
+    found = read_solution_json(tmp_path / "a" / "b" / "out" / "solution.json")
+    assert found.seconds.read == 1.5
+    assert found.seconds.report == timed.seconds.report > 0
+
+
+def test_an_older_folder_of_results_is_replaced_whole(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()  # an empty folder is as good as none
+    save_solution(io_samples.solution(), out)
+    assert set(contents(out)) == {"solution.json", "points.ply", "residuals.csv", "report.html"}
+    save_solution(io_samples.solution(model="circle"), out, report=False)
+    assert set(contents(out)) == {"solution.json", "points.ply", "residuals.csv"}
+    assert read_solution_json(out / "solution.json").model == "circle"
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_link_keeps_pointing_at_the_results(tmp_path: Path) -> None:
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "out").symlink_to("disk", target_is_directory=True)
+    save_solution(io_samples.solution(), tmp_path / "out")
+    assert (tmp_path / "out").is_symlink()
+    assert "solution.json" in contents(tmp_path / "disk")
+
+
+@pytest.mark.parametrize("older", [True, False])
+@pytest.mark.parametrize("error", [RuntimeError("no report"), KeyboardInterrupt()])
+def test_an_older_folder_stays_whole_if_the_report_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, older: bool, error: BaseException
+) -> None:
+    out = tmp_path / "out"
+    if older:
+        save_solution(io_samples.solution(), out)
+    before = contents(tmp_path)
+
+    def fail(solution: Solution, path: Path) -> None:
+        path.write_text("half a rep")
+        raise error
+
+    monkeypatch.setattr(pancam_graph.report, "write_report", fail)
+    with pytest.raises(type(error)):
+        save_solution(io_samples.solution(model="circle"), out)
+    assert contents(tmp_path) == before
+    assert len(list(tmp_path.iterdir())) == int(older)
+
+
+def test_an_older_folder_stays_whole_if_the_renaming_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    save_solution(io_samples.solution(), out)
+    before = contents(tmp_path)
+    rename = Path.rename
+
+    def fail_for_the_new(self: Path, target: Path) -> Path:
+        if self.name.endswith("partial"):
+            raise OSError(28, "No space left on device")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", fail_for_the_new)
+    with pytest.raises(InputError, match=r"out: expected a place where .* No space left on device"):
+        save_solution(io_samples.solution(model="circle"), out)
+    assert contents(tmp_path) == before
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_out_that_is_not_ours_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(out: Path, found: str) -> None:
+        before = contents(tmp_path)
+        for attempt in (check_out, lambda o: save_solution(io_samples.solution(), o)):
+            with pytest.raises(InputError) as caught:
+                attempt(out)
+            text = str(caught.value)
+            assert text.startswith(f"{out}: expected a new folder or one of older results, found ")
+            assert found in text
+            assert "\n" not in text
+        assert contents(tmp_path) == before
+
+    out = tmp_path / "out"
+    out.write_text("")
+    refuse(out, "a file")
+    refuse(out / "below", "a file in its place")
+    out.unlink()
+    out.mkdir()
+    (out / "thesis.tex").write_text("")
+    (out / "thoughts.txt").write_text("")
+    refuse(out, "other things in it: thesis.tex and 1 more")
+    (out / "thesis.tex").unlink()
+    (out / "thoughts.txt").rename(out / "points.ply")
+    refuse(out, "points.ply but no solution.json")
+    (out / "solution.json").write_text('{"format": "other"}')
+    refuse(out, "none of ours")
+    (out / "solution.json").unlink()
+    (out / "solution.json").mkdir()
+    refuse(out, "other things in it: solution.json")
+    (tmp_path / "link").symlink_to("nothing")
+    refuse(tmp_path / "link", "a link that leads nowhere")
+    refuse(tmp_path / ("long" * 100), "a path that cannot be used")
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    refuse(Path(), "the folder that this program works in")
+    monkeypatch.setattr("os.access", lambda *_: False)
+    refuse(tmp_path / "new", "no permission to write")
+
+
+def test_check_out_writes_nothing(tmp_path: Path) -> None:
+    check_out(tmp_path / "a" / "b")
+    assert not list(tmp_path.iterdir())
