@@ -1,5 +1,9 @@
 """Mast rigs: the pan-tilt chain, its eyes, and the templates that ship."""
 
+from pancam_graph.rigs._masts import MARS2020_MAST as MARS2020_MAST
+from pancam_graph.rigs._masts import MER_MAST as MER_MAST
+from pancam_graph.rigs._masts import MSL_MAST as MSL_MAST
+from pancam_graph.rigs._masts import MastKinematics as MastKinematics
 from pancam_graph.rigs._rig import Eye as Eye
 from pancam_graph.rigs._rig import PointingSigma as PointingSigma
 from pancam_graph.rigs._rig import Rig as Rig

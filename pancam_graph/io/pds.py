@@ -1,0 +1,538 @@
+"""Rover images with PDS3 labels to a traverse: Mars Exploration Rovers, Curiosity, Perseverance.
+
+What becomes what (docs/conventions.md for the frames):
+- world: the site frame of the labels turned to z up, so x is north, y west;
+- a stop: one site and drive of ROVER_MOTION_COUNTER. The first (lowest counter) defines the world and is
+  held; later ones have the sigma of rover localisation, `LOCALISATION_SIGMA`;
+- a frame: images of one stop with the same mast counter (PMA, RSM) whose measured angles agree to
+  `SAME_POINTING_RAD`, each eye once;
+- an eye: images of one INSTRUMENT_ID with the same size, model type and intrinsics. An image of another
+  size, subframe or zoom is another eye, since its camera model is another: `navcam-left-2`;
+- the rig: the mast's axes of `pancam_graph.rigs`, with mounts averaged over the labels' cameras;
+- pan and tilt: of the chain's head frame, so that the chain reproduces the label's camera. They are the
+  measured angles where those do (MER: through the label's mast quaternion; Curiosity: through the joints'
+  zero points), else angles and axes are fitted to the labels' cameras.
+Labels are turned from z-down to z-up here and nowhere else. Label pixels count from 0 at the centre of
+the first one, as ours do.
+"""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+
+from pancam_graph.cameras import CAHV, CAHVOR, CAHVORE
+from pancam_graph.errors import CameraError, GeometryError, InputError
+from pancam_graph.geometry import (
+    Z_DOWN_R_Z_UP,
+    FloatArray,
+    IntArray,
+    pose_arrays,
+    pose_from_wxyz,
+    rotation_from_wxyz,
+    wrap_angle,
+)
+from pancam_graph.io._mast_fit import LabelCameras, MastFit, fit_angles, fit_mast, label_misfit
+from pancam_graph.io.pds_label import LabelGroup, PdsLabel, read_label
+from pancam_graph.rigs import MARS2020_MAST, MER_MAST, MSL_MAST, Eye, MastKinematics, Rig
+from pancam_graph.traverse import Frame, Image, Stop, Traverse
+
+__all__ = ["LOCALISATION_SIGMA", "SAME_POINTING_RAD", "LocalisationSigma", "read_pds"]
+
+_log = logging.getLogger(__name__)
+
+SAME_POINTING_RAD = 1e-4
+"""Measured angles that differ by less belong to one pointing of the head."""
+
+_LABEL_TOLERANCE = 1e-4
+"""Metres and radians to which the rig must reproduce each label's camera."""
+_SAME_FOCAL = 2e-4
+_SAME_PRINCIPAL_POINT_PX = 1.0
+_SAME_POSE = 1e-3
+"""Metres and radians by which rover poses within a stop may differ unnoticed."""
+
+_ROVER_FRAMES = {"ROVER_FRAME", "ROVER_NAV_FRAME"}
+_CAMERA_GROUPS = ("GEOMETRIC_CAMERA_MODEL", "GEOMETRIC_CAMERA_MODEL_PARMS")
+_ROVER_GROUPS = ("ROVER_COORDINATE_SYSTEM", "ROVER_COORDINATE_SYSTEM_PARMS", "ROVER_COORD_SYSTEM_PARMS")
+_RSM_GROUPS = ("RSM_ARTICULATION_STATE", "RSM_ARTICULATION_STATE_PARMS")
+_MAST_CAMERAS = ("PANCAM", "NAVCAM", "NAV_", "MAST_", "MCZ_", "ZCAM", "CHEMCAM", "SUPERCAM", "SCAM")
+_HOSTS = {"MER": MER_MAST, "MSL": MSL_MAST, "M20": MARS2020_MAST, "MARS": MARS2020_MAST}
+_Z_UP_T_Z_DOWN = gtsam.Pose3(gtsam.Rot3(Z_DOWN_R_Z_UP), np.zeros(3))
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalisationSigma:
+    """How well a later stop is known relative to the first, one standard deviation."""
+
+    rotation_rad: float = 0.01
+    """Of each rotation component."""
+    translation_m: float = 0.1
+    """Of each translation component, at no distance."""
+    translation_per_m: float = 0.05
+    """More of it for each metre from the first stop: wheel odometry on loose ground."""
+
+
+LOCALISATION_SIGMA = LocalisationSigma()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _LabelledImage:
+    """What a label says, z up, before images are sorted into stops, frames and eyes."""
+
+    label: PdsLabel
+    host: str
+    instrument: str
+    stop: tuple[int, int]
+    """Site and drive."""
+    mast_counter: int | None
+    pan_tilt_rad: tuple[float, float]
+    world_T_rover: gtsam.Pose3
+    model: CAHV
+    """In the rover frame."""
+
+
+def read_pds(folder: Path | str) -> Traverse:
+    """Read all *.IMG files of a folder, with PDS3 labels attached or in a .LBL beside each.
+
+    The traverse has no observations yet: they are to be found in its images. Its warnings say where the
+    rig misses a label's camera by more than 0.1 mm or 0.1 mrad, and where labels of one stop disagree.
+
+    Raises InputError naming file and entry for a folder without .IMG files, a label that is missing, no
+    label, or lacks an entry (camera model, rover pose, mast angles), a camera that is not on the mast,
+    images of two rovers or two site frames, and (as ImageError) a file shorter than its label says.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: expected a folder of rover images, found {_kind(folder)}")
+    files = sorted(f for f in folder.iterdir() if f.suffix.lower() == ".img" and f.is_file())
+    if not files:
+        raise InputError(f"{folder}: expected images with PDS labels (*.IMG), found none")
+    images = [_read_image_label(file) for file in files]
+    kinematics = _common_mast(images)
+    warnings: list[str] = []
+    eye_of, eye_names = _sort_eyes(images)
+    stop_ids, stops = _sort_stops(images, kinematics, warnings)
+    frame_of, frames_first = _sort_frames(images, eye_of)
+    fit, eyes = _fit_rig(images, kinematics, frame_of, eye_of, eye_names, len(frames_first), warnings)
+    # The chain's own mast frame replaces the design's where the axes were fitted.
+    stops = tuple(
+        replace(s, world_T_mast=images[i].world_T_rover * fit.rover_T_mast)
+        for s, i in zip(stops, stop_ids.values(), strict=True)
+    )
+    sigma = kinematics.pointing_sigma
+    frame_ids = _frame_ids(images, frames_first)
+    frames = tuple(
+        Frame(
+            id=name,
+            stop=_stop_id(images[i].stop),
+            pan_rad=float(wrap_angle(fit.pan_tilt_rad[row, 0])),
+            tilt_rad=float(fit.pan_tilt_rad[row, 1]),
+            sigma_pan_rad=sigma.pan_rad,
+            sigma_tilt_rad=sigma.tilt_rad,
+        )
+        for row, (name, i) in enumerate(zip(frame_ids, frames_first, strict=True))
+    )
+    order = sorted(range(len(frames)), key=lambda r: (images[frames_first[r]].stop, r))
+    rig = Rig(
+        name=f"{kinematics.name}-pds",
+        pan_T_tilt=fit.pan_T_tilt,
+        eyes=eyes,
+        pointing_sigma=sigma,
+        mast_height_m=kinematics.mast_height_m,
+        source=f"PDS labels of {folder.resolve().name}; {kinematics.source}",
+    )
+    return Traverse(
+        name=folder.resolve().name,
+        rig=rig,
+        stops=stops,
+        frames=tuple(frames[r] for r in order),
+        images=tuple(
+            Image(
+                id=image.label.file.stem,
+                frame=frame_ids[frame_of[i]],
+                camera=eye_names[eye_of[i]],
+                file=image.label.file.name,
+            )
+            for i, image in enumerate(images)
+        ),
+        folder=folder,
+        warnings=tuple(warnings),
+    )
+
+
+def _kind(path: Path) -> str:
+    return "a file" if path.exists() else "none"
+
+
+def _read_image_label(file: Path) -> _LabelledImage:
+    label = read_label(file)
+    host = label.top.text("INSTRUMENT_HOST_ID").upper()
+    instrument = label.top.text("INSTRUMENT_ID").upper()
+    if not host.startswith(tuple(_HOSTS)):
+        raise InputError(
+            f"{label.label_file}: INSTRUMENT_HOST_ID: expected MER1, MER2, MSL or M20, found {host!r}"
+        )
+    if not instrument.startswith(_MAST_CAMERAS):
+        raise InputError(
+            f"{label.label_file}: INSTRUMENT_ID: expected a camera on the mast (PANCAM, NAVCAM, MAST, MCZ), "
+            f"found {instrument!r}"
+        )
+    camera = label.group(*_CAMERA_GROUPS)
+    layout = label.image_layout()
+    layout.require_complete()
+    try:
+        site_T_rover = _pose(label.group(*_ROVER_GROUPS), {"SITE_FRAME"})
+        model = _camera_model(camera, layout.width_px, layout.height_px)
+        frame = _reference_frame(camera, _ROVER_FRAMES | {"SITE_FRAME"})
+        if frame == "SITE_FRAME":
+            model = model.transformed(site_T_rover.inverse())
+        angles = _mast_angles(label, _mast_of(host))
+    except (CameraError, GeometryError) as error:
+        raise InputError(f"{label.label_file}: {error}") from error
+    counter = label.counter()
+    for name in ("SITE", "DRIVE"):
+        if name not in counter:
+            raise InputError(
+                f"{label.label_file}: ROVER_MOTION_COUNTER_NAME: expected SITE and DRIVE, "
+                f"found {', '.join(counter)}"
+            )
+    return _LabelledImage(
+        label=label,
+        host=host,
+        instrument=instrument,
+        stop=(counter["SITE"], counter["DRIVE"]),
+        mast_counter=counter.get("PMA", counter.get("RSM")),
+        pan_tilt_rad=angles,
+        world_T_rover=_Z_UP_T_Z_DOWN * site_T_rover * _Z_UP_T_Z_DOWN,
+        model=model.transformed(_Z_UP_T_Z_DOWN),
+    )
+
+
+def _mast_of(host: str) -> MastKinematics:
+    return next(mast for prefix, mast in _HOSTS.items() if host.startswith(prefix))
+
+
+def _reference_frame(group: LabelGroup, expected: set[str]) -> str:
+    frame = group.text("REFERENCE_COORD_SYSTEM_NAME").upper()
+    if frame not in expected:
+        raise InputError(
+            f"{group.where}: REFERENCE_COORD_SYSTEM_NAME: expected {' or '.join(sorted(expected))}, "
+            f"found {frame!r}"
+        )
+    return frame
+
+
+def _pose(group: LabelGroup, reference: set[str]) -> gtsam.Pose3:
+    """`reference_T_frame` of a coordinate system group, z down."""
+    _reference_frame(group, reference)
+    offset = group.numbers("ORIGIN_OFFSET_VECTOR", 3)
+    wxyz = group.numbers("ORIGIN_ROTATION_QUATERNION", 4)
+    try:
+        return pose_from_wxyz(wxyz.tolist(), offset.tolist())
+    except GeometryError as error:
+        raise InputError(f"{group.where}: ORIGIN_ROTATION_QUATERNION: {error}") from error
+
+
+def _camera_model(group: LabelGroup, width_px: int, height_px: int) -> CAHV:
+    """The label's camera in the label's frame. Linearised products are CAHV and need nothing special."""
+    kind = group.text("MODEL_TYPE").upper()
+    letters = {"CAHV": "CAHV", "CAHVOR": "CAHVOR", "CAHVORE": "CAHVORETP"}
+    if kind not in letters:
+        raise InputError(f"{group.where}: MODEL_TYPE: expected CAHV, CAHVOR or CAHVORE, found {kind!r}")
+    order = [name.upper() for name in group.names("MODEL_COMPONENT_ID")]
+    vectors: dict[str, FloatArray] = {}
+    for letter in letters[kind]:
+        if letter not in order:
+            raise InputError(
+                f"{group.where}: MODEL_COMPONENT_ID: expected {', '.join(letters[kind])}, "
+                f"found {', '.join(order)}"
+            )
+        entry = f"MODEL_COMPONENT_{order.index(letter) + 1}"
+        vectors[letter] = group.numbers(entry, 1 if letter in "TP" else 3)
+    c, a, h, v = (vectors[letter] for letter in "CAHV")
+    if kind == "CAHV":
+        return CAHV(width_px=width_px, height_px=height_px, C=c, A=a, H=h, V=v)
+    o, r = vectors["O"], vectors["R"]
+    if kind == "CAHVOR":
+        return CAHVOR(width_px=width_px, height_px=height_px, C=c, A=a, H=h, V=v, O=o, R=r)
+    # T: 1 perspective, 2 fish-eye, 3 general with the linearity in P.
+    linearity = {1: 1.0, 2: 0.0, 3: float(vectors["P"][0])}.get(int(vectors["T"][0]))
+    if linearity is None:
+        raise InputError(
+            f"{group.where}: MODEL_COMPONENT_{order.index('T') + 1}: expected a CAHVORE type of 1, 2 or 3, "
+            f"found {vectors['T'][0]:g}"
+        )
+    return CAHVORE(
+        width_px=width_px,
+        height_px=height_px,
+        C=c,
+        A=a,
+        H=h,
+        V=v,
+        O=o,
+        R=r,
+        E=vectors["E"],
+        linearity=linearity,
+    )
+
+
+def _mast_angles(label: PdsLabel, mast: MastKinematics) -> tuple[float, float]:
+    """Measured pan and tilt of the chain."""
+    if mast is MER_MAST:
+        # INSTRUMENT_ELEVATION changes its sign between rovers and the encoders have offsets; the
+        # quaternion is what the camera model was made with.
+        group = label.group("PMA_COORDINATE_SYSTEM", "PMA_COORDINATE_SYSTEM_PARMS")
+        _reference_frame(group, _ROVER_FRAMES)
+        rotation = rotation_from_wxyz(group.numbers("ORIGIN_ROTATION_QUATERNION", 4))
+        azimuth = float(np.arctan2(rotation[1, 0], rotation[0, 0]))
+        return mast.pan_tilt_rad(azimuth, float(np.arcsin(np.clip(-rotation[2, 0], -1, 1))))
+    group = label.group(*_RSM_GROUPS)
+    angles = group.angles_rad()
+    found: list[float] = []
+    for names in (mast.azimuth_names, mast.elevation_names):
+        name = next((n for n in names if n in angles), None)
+        if name is None:
+            raise InputError(
+                f"{group.where}: ARTICULATION_DEVICE_ANGLE_NAME: expected {' or '.join(names)} with a value, "
+                f"found {', '.join(angles) or 'none'}"
+            )
+        found.append(angles[name])
+    return mast.pan_tilt_rad(*found)
+
+
+def _common_mast(images: Sequence[_LabelledImage]) -> MastKinematics:
+    """The mast of all images. Raises InputError if they are of two rovers or in two site frames."""
+    first = images[0]
+    for image in images:
+        if image.host != first.host:
+            raise InputError(
+                f"{image.label.label_file}: INSTRUMENT_HOST_ID: expected {first.host} as in "
+                f"{first.label.label_file.name}, found {image.host}: images of two rovers"
+            )
+        if image.stop[0] != first.stop[0]:
+            raise InputError(
+                f"{image.label.label_file}: ROVER_MOTION_COUNTER: expected site {first.stop[0]} as in "
+                f"{first.label.label_file.name}, found {image.stop[0]}: poses in two site frames"
+            )
+    mast = _mast_of(first.host)
+    if mast is MER_MAST:
+        group = first.label.group("PMA_COORDINATE_SYSTEM", "PMA_COORDINATE_SYSTEM_PARMS")
+        x, y, z = (float(c) for c in group.numbers("ORIGIN_OFFSET_VECTOR", 3))
+        mast = replace(mast, azimuth_point_m=(x, y, z), elevation_point_m=(x, y, z))
+    return mast
+
+
+def _sort_eyes(images: Sequence[_LabelledImage]) -> tuple[IntArray, list[str]]:
+    """Eye of each image (n,), and the eyes' names."""
+    firsts: list[_LabelledImage] = []
+    eye_of: list[int] = []
+    for image in images:
+        row = next((k for k, first in enumerate(firsts) if _same_eye(first, image)), len(firsts))
+        if row == len(firsts):
+            firsts.append(image)
+        eye_of.append(row)
+    names: list[str] = []
+    for first in firsts:
+        base = first.instrument.lower().replace("_", "-")
+        count = sum(name == base or name.startswith(f"{base}-") for name in names)
+        names.append(base if count == 0 else f"{base}-{count + 1}")
+    return np.array(eye_of, dtype=np.int64), names
+
+
+def _same_eye(first: _LabelledImage, image: _LabelledImage) -> bool:
+    a, b = first.model, image.model
+    if first.instrument != image.instrument or type(a) is not type(b):
+        return False
+    if (a.width_px, a.height_px) != (b.width_px, b.height_px):
+        return False
+    focal = max(abs(a.fx_px / b.fx_px - 1), abs(a.fy_px / b.fy_px - 1))
+    centre = max(abs(a.cx_px - b.cx_px), abs(a.cy_px - b.cy_px))
+    return focal < _SAME_FOCAL and centre < _SAME_PRINCIPAL_POINT_PX
+
+
+def _stop_id(stop: tuple[int, int]) -> str:
+    return f"site{stop[0]}-drive{stop[1]}"
+
+
+def _sort_stops(
+    images: Sequence[_LabelledImage], mast: MastKinematics, warnings: list[str]
+) -> tuple[dict[tuple[int, int], int], tuple[Stop, ...]]:
+    """First image of each stop, in the order of the motion counter, and the stops."""
+    first_of: dict[tuple[int, int], int] = {}
+    for i, image in enumerate(images):
+        first_of.setdefault(image.stop, i)
+    first_of = dict(sorted(first_of.items()))
+    rover_T_mast, _ = mast.chain()
+    for stop, i in first_of.items():
+        poses = [image.world_T_rover for image in images if image.stop == stop]
+        apart = [np.abs(images[i].world_T_rover.logmap(pose)) for pose in poses]
+        turn, shift = np.max(apart, axis=0)[:3].max(), np.max(apart, axis=0)[3:].max()
+        if max(turn, shift) > _SAME_POSE:
+            warnings.append(
+                f"stop {_stop_id(stop)}: its labels' rover poses differ by up to {shift * 1e3:.1f} mm and "
+                f"{turn * 1e3:.1f} mrad; that of {images[i].label.file.name} is used"
+            )
+    origin = images[next(iter(first_of.values()))].world_T_rover.translation()
+    stops: list[Stop] = []
+    for stop, i in first_of.items():
+        distance = float(np.linalg.norm(images[i].world_T_rover.translation() - origin))
+        held = not stops
+        sigma = LOCALISATION_SIGMA
+        stops.append(
+            Stop(
+                id=_stop_id(stop),
+                world_T_mast=images[i].world_T_rover * rover_T_mast,
+                sigma_rotation_rad=0.0 if held else sigma.rotation_rad,
+                sigma_translation_m=(
+                    0.0 if held else sigma.translation_m + sigma.translation_per_m * distance
+                ),
+            )
+        )
+    return first_of, tuple(stops)
+
+
+def _sort_frames(images: Sequence[_LabelledImage], eye_of: IntArray) -> tuple[IntArray, list[int]]:
+    """Frame of each image (n,), and each frame's first image."""
+    firsts: list[int] = []
+    eyes_in: list[set[int]] = []
+    frame_of: list[int] = []
+    for i, image in enumerate(images):
+        row = len(firsts)
+        for k, j in enumerate(firsts):
+            other = images[j]
+            same_place = (image.stop, image.mast_counter) == (other.stop, other.mast_counter)
+            apart = wrap_angle(np.subtract(image.pan_tilt_rad, other.pan_tilt_rad))
+            if same_place and np.abs(apart).max() < SAME_POINTING_RAD and int(eye_of[i]) not in eyes_in[k]:
+                row = k
+                break
+        if row == len(firsts):
+            firsts.append(i)
+            eyes_in.append(set())
+        eyes_in[row].add(int(eye_of[i]))
+        frame_of.append(row)
+    return np.array(frame_of, dtype=np.int64), firsts
+
+
+def _frame_ids(images: Sequence[_LabelledImage], firsts: Sequence[int]) -> list[str]:
+    """Site, drive and mast counter; a number more where that is not unique."""
+    ids: list[str] = []
+    for row, i in enumerate(firsts):
+        site, drive = images[i].stop
+        counter = images[i].mast_counter
+        base = f"{site}-{drive}-{row if counter is None else counter}"
+        count = sum(name == base or name.startswith(f"{base}.") for name in ids)
+        ids.append(base if count == 0 else f"{base}.{count + 1}")
+    return ids
+
+
+def _fit_rig(
+    images: Sequence[_LabelledImage],
+    mast: MastKinematics,
+    frame_of: IntArray,
+    eye_of: IntArray,
+    eye_names: Sequence[str],
+    n_frames: int,
+    warnings: list[str],
+) -> tuple[MastFit, tuple[Eye, ...]]:
+    """The chain that reproduces the labels' cameras, and its eyes."""
+    rotation, centre = pose_arrays([image.model.split()[1] for image in images])
+    labels = LabelCameras(rotation=rotation, centre_m=centre, frame=frame_of, eye=eye_of)
+    measured = np.zeros((n_frames, 2))
+    for frame, image in reversed(list(zip(frame_of, images, strict=True))):
+        measured[frame] = image.pan_tilt_rad
+    rover_T_mast, pan_T_tilt = mast.chain()
+    fit = MastFit(
+        rover_T_mast=rover_T_mast,
+        pan_T_tilt=pan_T_tilt,
+        mount_R=np.broadcast_to(np.eye(3), (len(eye_names), 3, 3)),
+        mount_t=np.zeros((len(eye_names), 3)),
+        pan_tilt_rad=measured,
+    )
+    fit, eyes = _mount_eyes(fit, images, labels, eye_names)
+    if _worst(label_misfit(fit, labels)).max() > _LABEL_TOLERANCE:
+        fit, eyes = _mount_eyes(fit_mast(fit, labels), images, labels, eye_names)
+        # Averaging the mounts' vectors moves them within the labels' digits; the angles follow.
+        fit = fit_angles(fit, labels)
+        change = wrap_angle(fit.pan_tilt_rad - measured)
+        _log.info(
+            "mast axes and angles fitted to the labels' cameras; angles moved by up to %.2f mrad",
+            1e3 * np.abs(change).max(),
+        )
+        _warn_of_angles(change, mast, images, frame_of, warnings)
+    misfit = _worst(label_misfit(fit, labels))
+    bad = misfit.max(axis=1) > _LABEL_TOLERANCE
+    if bad.any():
+        worst = int(misfit.max(axis=1).argmax())
+        warnings.append(
+            f"the mast model misses the label's camera in {int(bad.sum())} of {len(images)} images by more "
+            f"than 0.1 mm or 0.1 mrad; worst {misfit[worst, 1] * 1e3:.2f} mm and "
+            f"{misfit[worst, 0] * 1e3:.2f} mrad in {images[worst].label.file.name}"
+        )
+    return fit, eyes
+
+
+def _worst(misfit: FloatArray) -> FloatArray:
+    """(n, 2): angle in radians and distance in metres."""
+    return np.column_stack([np.linalg.norm(misfit[:, :3], axis=1), np.linalg.norm(misfit[:, 3:], axis=1)])
+
+
+def _warn_of_angles(
+    change: FloatArray,
+    mast: MastKinematics,
+    images: Sequence[_LabelledImage],
+    frame_of: IntArray,
+    warnings: list[str],
+) -> None:
+    # A joint's zero point may differ from the design by the same amount in all frames; a frame that
+    # moves alone was labelled with another pointing than was measured.
+    alone = np.abs(change - np.median(change, axis=0))
+    sigma = np.array([mast.pointing_sigma.pan_rad, mast.pointing_sigma.tilt_rad])
+    frames = np.flatnonzero((alone > 3 * sigma).any(axis=1))
+    if len(frames):
+        worst = int(alone.max(axis=1).argmax())
+        name = images[int(np.flatnonzero(frame_of == worst)[0])].label.file.name
+        warnings.append(
+            f"{len(frames)} of {len(change)} pointings: the label's camera is turned from the measured "
+            f"angles by more than 3 sigma, at most {alone[worst].max() * 1e3:.1f} mrad in {name}; the camera's "
+            "pointing is used"
+        )
+
+
+def _mount_eyes(
+    fit: MastFit, images: Sequence[_LabelledImage], labels: LabelCameras, eye_names: Sequence[str]
+) -> tuple[MastFit, tuple[Eye, ...]]:
+    """Eyes whose vectors are the mean of their images' in the head frame, and the chain with them."""
+    unmounted = replace(
+        fit,
+        mount_R=np.broadcast_to(np.eye(3), fit.mount_R.shape),
+        mount_t=np.zeros_like(fit.mount_t),
+    )
+    heads_R, heads_t = unmounted.rover_T_camera(labels.frame, labels.eye)
+    eyes: list[Eye] = []
+    for row, name in enumerate(eye_names):
+        models = [
+            image.model.transformed(gtsam.Pose3(gtsam.Rot3(head_R), head_t).inverse())
+            for image, head_R, head_t, eye in zip(images, heads_R, heads_t, labels.eye, strict=True)
+            if eye == row
+        ]
+        eyes.append(Eye.from_head_model(name, _mean_model(models)))
+    mount_R, mount_t = pose_arrays([eye.head_T_camera for eye in eyes])
+    return replace(fit, mount_R=mount_R, mount_t=mount_t), tuple(eyes)
+
+
+def _mean_model(models: Sequence[CAHV]) -> CAHV:
+    """Mean of models of one kind, vector by vector; labels of one camera differ in their last digits."""
+
+    def mean(name: str) -> FloatArray:
+        return np.asarray(np.mean([getattr(model, name) for model in models], axis=0))
+
+    first = models[0]
+    out: CAHV = replace(first, C=mean("C"), A=mean("A"), H=mean("H"), V=mean("V"))
+    if isinstance(out, CAHVOR):
+        out = replace(out, O=mean("O"), R=mean("R"))
+    if isinstance(out, CAHVORE):
+        out = replace(out, E=mean("E"), linearity=float(mean("linearity")))
+    return out
