@@ -54,7 +54,7 @@ class CAHV(Camera):
         for name, vector in (("H", self.H), ("V", self.V)):
             if np.linalg.norm(np.cross(self.A, vector)) < 1e-6:
                 raise CameraError(
-                    f"focal length: |A x {name}| must be above 0, found {name} = {vector.tolist()}"
+                    f"focal length: expected |A x {name}| above 0, found {name} = {vector.tolist()}"
                 )
         if self.A @ np.cross(self.H, self.V) <= 0:
             raise CameraError(

@@ -20,6 +20,7 @@ _EXPECTED = {
     "int_type": "an integer",
     "list_type": "a list",
     "model_type": "an object",
+    "string_too_short": "a string that is not empty",
     "string_type": "a string",
     "string_unicode": "a string of valid Unicode",
 }
@@ -70,11 +71,10 @@ def prefixed(where: object) -> Iterator[None]:
 def read_bytes(path: Path) -> bytes:
     """Content of a file. Raises InputError saying why it cannot be read."""
     try:
-        if path.is_dir():
-            raise InputError(f"{path}: expected a file, found a folder")
+        if not path.is_file():  # reading from a pipe would wait for ever
+            found = "something else" if path.exists() else "nothing there"
+            raise InputError(f"{path}: expected a file, found {'a folder' if path.is_dir() else found}")
         return path.read_bytes()
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: expected a file, found nothing there") from error
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise InputError(f"{path}: expected a readable file, found: {reason}") from error

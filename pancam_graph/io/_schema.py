@@ -10,7 +10,7 @@ import gtsam
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
 
 from pancam_graph.cameras import CAHV, CAHVOR, CAHVORE, Brown, Camera, Pinhole
-from pancam_graph.errors import InputError
+from pancam_graph.errors import GeometryError, InputError
 from pancam_graph.geometry import pose_from_wxyz, wxyz_from_rotation
 from pancam_graph.io._json import prefixed
 from pancam_graph.rigs import Eye, Rig, rig_template
@@ -35,6 +35,9 @@ TRAVERSE_FORMAT = "pancam-graph/traverse"
 SOLUTION_FORMAT = "pancam-graph/solution"
 VERSION = 1
 
+Text = Annotated[str, Field(min_length=0)]
+"""Any string that can be written in UTF-8: a constraint makes pydantic look for halves of characters."""
+NonEmpty = Annotated[str, Field(min_length=1)]
 Vector3 = Annotated[list[float], Field(min_length=3, max_length=3)]
 
 
@@ -60,14 +63,18 @@ class PoseEntry(Entry):
 
     def pose(self, where: str) -> gtsam.Pose3:
         """The pose. Raises InputError naming `where` for a quaternion of norm 0."""
-        with prefixed(f"{where}.rotation_wxyz"):
+        try:
             return pose_from_wxyz(self.rotation_wxyz, self.translation_m)
+        except GeometryError as error:
+            raise InputError(
+                f"{where}.rotation_wxyz: expected numbers of finite norm above 0, found {self.rotation_wxyz}"
+            ) from error
 
 
 class PinholeEntry(Entry):
     """A pinhole camera and how it sits on the head."""
 
-    name: str
+    name: NonEmpty
     width_px: int
     height_px: int
     model: Literal["pinhole"]
@@ -107,7 +114,7 @@ class BrownEntry(PinholeEntry):
 class CAHVEntry(Entry):
     """A CAHV camera, its vectors in the head frame."""
 
-    name: str
+    name: NonEmpty
     width_px: int
     height_px: int
     model: Literal["cahv"]
@@ -173,7 +180,7 @@ CameraEntry = Annotated[
 class TemplateRigEntry(Entry):
     """A rig that ships with the package."""
 
-    template: str
+    template: NonEmpty
 
     def rig(self) -> Rig:
         """The rig. Raises InputError for an unknown template."""
@@ -184,7 +191,7 @@ class TemplateRigEntry(Entry):
 class OwnRigEntry(Entry):
     """A rig of the user's own."""
 
-    name: str = "own rig"
+    name: Text = "own rig"
     pan_T_tilt: PoseEntry
     cameras: list[CameraEntry]
 
@@ -203,7 +210,7 @@ def _rig_tag(value: Any) -> str:
 class StopEntry(Entry):
     """One place of the mast."""
 
-    id: str
+    id: NonEmpty
     world_T_mast: PoseEntry
     sigma_rotation_rad: float
     sigma_translation_m: float
@@ -212,8 +219,8 @@ class StopEntry(Entry):
 class FrameEntry(Entry):
     """One pointing of the head."""
 
-    id: str
-    stop: str
+    id: NonEmpty
+    stop: NonEmpty
     pan_rad: float
     tilt_rad: float
     sigma_pan_rad: float
@@ -223,10 +230,10 @@ class FrameEntry(Entry):
 class ImageEntry(Entry):
     """One eye's picture of a frame."""
 
-    id: str
-    frame: str
-    camera: str
-    file: str | None = None
+    id: NonEmpty
+    frame: NonEmpty
+    camera: NonEmpty
+    file: NonEmpty | None = None
 
 
 class TraverseFile(Entry):
@@ -234,7 +241,7 @@ class TraverseFile(Entry):
 
     format: Literal["pancam-graph/traverse"] = "pancam-graph/traverse"
     version: Literal[1] = 1
-    name: str | None = None
+    name: Text | None = None
     rig: Annotated[
         Annotated[TemplateRigEntry, Tag("<template>")] | Annotated[OwnRigEntry, Tag("<own>")],
         Discriminator(_rig_tag),
@@ -242,7 +249,7 @@ class TraverseFile(Entry):
     stops: list[StopEntry]
     frames: list[FrameEntry]
     images: list[ImageEntry]
-    observations: str | None
+    observations: NonEmpty | None
 
 
 def camera_entry(eye: Eye) -> CameraEntry:

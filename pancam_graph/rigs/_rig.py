@@ -78,7 +78,8 @@ class Rig:
         names = [e.name for e in self.eyes]
         for name in names:
             if names.count(name) > 1:
-                raise InputError(f"rig {self.name}: camera name {name!r} is used {names.count(name)} times")
+                found = f"{name!r} {names.count(name)} times"
+                raise InputError(f"rig {self.name}: expected different camera names, found {found}")
 
     def eye_index(self, name: str) -> int:
         """Index of an eye by name. Raises InputError for an unknown one."""
