@@ -215,3 +215,15 @@ def test_writing_where_a_file_is(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="expected a folder to write to"):
         write_traverse(io_samples.traverse(), tmp_path / "file")
+
+
+@pytest.mark.parametrize("name", ["1N49.IMG", "1n49.img", "1N49.LBL"])
+def test_rover_images_go_to_the_pds_reader(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    expected = io_samples.traverse()
+    monkeypatch.setattr("pancam_graph.io.inputs.read_pds", lambda folder: {tmp_path: expected}[folder])
+    (tmp_path / name).write_bytes(b"")
+    assert read_input(tmp_path) is expected
+    write_traverse(expected, tmp_path)  # a traverse beside the images says what to make of them
+    assert read_input(tmp_path) is not expected

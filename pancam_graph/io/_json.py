@@ -34,7 +34,7 @@ def short(value: object) -> str:
     if isinstance(value, dict):
         return "an object" if value else "an empty object"
     if isinstance(value, list):
-        return f"a list of {len(value)}"
+        return f"a list of {len(value)}" if value else "an empty list"
     if isinstance(value, int) and abs(value) >= 10**_MAX_QUOTED:
         return "an integer of too many digits"
     text = json.dumps(value)
@@ -129,8 +129,8 @@ def read_json(path: Path, format_name: str, version: int) -> dict[str, Any]:
         raise InputError(f"{path}: expected JSON in UTF-8, found other bytes at {error.start}") from error
     except RecursionError as error:
         raise InputError(f"{path}: expected JSON, found brackets nested too deeply") from error
-    except ValueError as error:  # an integer of thousands of digits
-        raise InputError(f"{path}: expected JSON, found an error: {error}") from error
+    except ValueError as error:  # Python's limit on the length of integers
+        raise InputError(f"{path}: expected JSON, found an integer of too many digits") from error
     if not isinstance(data, dict):
         raise InputError(f"{path}: expected a JSON object, found {short(data)}")
     if entry is not None:
@@ -159,11 +159,10 @@ def _sentence(error: Any) -> str:
     if kind == "missing":
         return f"{where}: expected this key, found an object without it"
     if kind == "extra_forbidden":
-        return f"{where}: expected no other keys than the format's, found this one"
+        return f"{where}: expected only keys of the format, found the unknown key {short(error['loc'][-1])}"
     if kind in {"too_short", "too_long"}:
-        limit = context["min_length" if kind == "too_short" else "max_length"]
-        bound = "at least" if kind == "too_short" else "at most"
-        return f"{where}: expected {bound} {limit} entries, found {context['actual_length']}"
+        length = context["min_length" if kind == "too_short" else "max_length"]  # the same in every schema
+        return f"{where}: expected {length} numbers, found {context['actual_length']}"
     if kind in {"union_tag_invalid", "union_tag_not_found"} and isinstance(error["input"], dict):
         tags = context["expected_tags"].translate(str.maketrans("", "", "'<>"))
         return f"{where}.model: expected one of {tags}; found {short(error['input'].get('model'))}"

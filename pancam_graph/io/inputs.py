@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from pancam_graph.errors import InputError
+from pancam_graph.io.pds import read_pds
 from pancam_graph.io.traverse_json import read_traverse
 from pancam_graph.traverse import Traverse
 
@@ -29,8 +30,6 @@ def read_input(path: Path | str) -> Traverse:
     if "traverse.json" in names:
         return read_traverse(path)
     if any(Path(n).suffix.lower() in _PDS_SUFFIXES for n in names):
-        from pancam_graph.io.pds import read_pds  # noqa: PLC0415
-
         return read_pds(path)
     found = f"{names[0]} and {len(names) - 1} more" if len(names) > 1 else "".join(names) or "an empty folder"
     raise InputError(f"{expected}, found {found}")

@@ -67,6 +67,10 @@ def _read_npz(path: Path) -> Observations:
         track = _integers("track", _array(archive, "track"))
         uv_px = _numbers("uv_px", _array(archive, "uv_px"))
         sigma_px = _numbers("sigma_px", _array(archive, "sigma_px"))
+        columns = {"image": image, "track": track, "uv_px": uv_px, "sigma_px": sigma_px}
+        if len({len(c) for c in columns.values()}) > 1:
+            found = ", ".join(f"{name} {c.shape}" for name, c in columns.items())
+            raise InputError(f"columns: expected one length, found the shapes {found}")
     return Observations(image=image, track=track, uv_px=uv_px, sigma_px=sigma_px)
 
 
