@@ -13,9 +13,11 @@ _WAVELENGTHS_M = (4.0, 400.0)
 _ROCK_CELL_M = 1.0
 _ROCK_RADIUS_M = (0.08, 0.45)
 _ROCK_ASPECT = 0.7  # height of a rock over its radius
+_ROCK_HEIGHT_M = _ROCK_ASPECT * _ROCK_RADIUS_M[1]  # of the highest
 _NEAREST_M = 0.3
 _STRIDE = 1.04  # ratio of successive distances along a ray
-_BISECTIONS = 40
+_FARTHEST = 2.5  # where a ray is given up, over the distance of the ridge
+_BISECTIONS = 16
 _RIDGE_SIZE = 0.06  # height of the ridge over its distance: 3.4 degrees
 _RIDGE_WIDTH = 0.25  # half width of the ridge over its distance
 
@@ -96,7 +98,9 @@ class Terrain:
         out = np.zeros(len(xy_m))
         d = xy_m - self.ridge_centre_m
         distance = np.hypot(d[:, 0], d[:, 1])
-        far = np.flatnonzero(distance > 0.1 * self.ridge_distance_m)  # below a millimetre nearer by
+        far = np.flatnonzero(distance > 0.05 * self.ridge_distance_m)  # nearer by, a millionth of its height
+        if len(far) == 0:
+            return out
         azimuth = np.arctan2(d[far, 1], d[far, 0])
         p = self.ridge_phase_rad
         crest = self.ridge_distance_m * (
@@ -116,23 +120,25 @@ class Terrain:
         be passed by.
         """
         n = len(origin_m)
-        highest = (
-            float(self.wave_height_m.sum()) + _ROCK_RADIUS_M[1] + 2.5 * _RIDGE_SIZE * self.ridge_distance_m
-        )
-        before, after = np.zeros(n), np.zeros(n)
+        highest = float(self.wave_height_m.sum()) + _ROCK_HEIGHT_M + 2.5 * _RIDGE_SIZE * self.ridge_distance_m
+        before, after = np.zeros(n), np.full(n, _NEAREST_M)
         hit = np.zeros(n, dtype=bool)
         active = np.arange(n)
-        t = _NEAREST_M
-        while len(active) and t < 4 * self.ridge_distance_m:
-            at = origin_m[active] + t * direction[active]
-            below = at[:, 2] < self.height_m(at[:, :2])
-            found = active[below]
-            hit[found] = before[found] > 0
-            after[found] = t
-            before[active[~below]] = t
+        while len(active):
+            at = origin_m[active] + after[active, None] * direction[active]
+            over_ground = at[:, 2] - self.ground_m(at[:, :2]) - self._ridge_m(at[:, :2])
+            clearance = over_ground.copy()
+            near = np.flatnonzero((over_ground > 0) & (over_ground < _ROCK_HEIGHT_M))
+            clearance[near] -= self._rock_m(at[near, :2])
+            below = clearance < 0
+            hit[active[below]] = before[active[below]] > 0
             lost = (at[:, 2] > highest) & (direction[active, 2] > 0)
-            active = active[~below & ~lost]
-            t *= _STRIDE
+            onward = ~below & ~lost & (after[active] < _FARTHEST * self.ridge_distance_m)
+            active = active[onward]
+            before[active] = after[active]
+            # Well above ground, no slope up to 1 can be reached within half the height over its rocks.
+            free = 0.5 * (over_ground[onward] - _ROCK_HEIGHT_M)
+            after[active] += np.maximum((_STRIDE - 1) * after[active], free)
         rows = np.flatnonzero(hit)
         low, high = before[rows], after[rows]
         for _ in range(_BISECTIONS):

@@ -1,0 +1,60 @@
+#!/usr/bin/env python3
+"""Simulate a rover traverse with known truth and write it as a traverse folder.
+
+OUT gets traverse.json and observations.npz, which scripts/optimize_traverse.py reads, and truth.npz, which
+no solver reads: world_T_mast (stops,4,4), pan_tilt_rad (frames,2), landmarks_m (tracks,3), and per
+observation uv_px without noise and outlier. Metres, radians, z up. Same options, same numbers.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from pancam_graph.errors import InputError
+from pancam_graph.io import write_traverse
+from pancam_graph.rigs import TEMPLATES, rig_template
+from pancam_graph.simulate import SimulationOptions, simulate
+
+
+def _degrees(text: str) -> float:
+    return float(np.deg2rad(float(text)))
+
+
+def main() -> None:
+    """Run the program; exits with 2 for input that cannot be used."""
+    d, raw = SimulationOptions(), argparse.RawDescriptionHelpFormatter
+    p = argparse.ArgumentParser(description=__doc__, usage="%(prog)s OUT [options]", formatter_class=raw)
+    add = p.add_argument
+    add("out", metavar="OUT", type=Path, help="folder to write; must be new or empty")
+    add("--rig", choices=TEMPLATES, default="mer-navcam", help="cameras (%(default)s)")
+    add("--seed", type=int, default=0, help="another seed, another traverse (%(default)s)")
+    add("--stops", type=int, default=d.stops, help="places of the mast (%(default)s)")
+    add("--spacing-m", type=float, default=d.spacing_m, help="from stop to stop (%(default)s)")
+    add("--pans", type=int, help="frames per row (so many that the widest eye's overlap by 28 %%)")
+    add("--sweep-deg", dest="sweep_rad", type=_degrees, default=d.sweep_rad, help="range of pan (360)")
+    add("--tilts-deg", dest="tilts_rad", type=_degrees, nargs="+", help="of each row, up positive (two rows)")
+    add("--points-per-image", type=int, default=d.points_per_image, help="density (%(default)s)")
+    add("--noise-px", type=float, default=d.noise_px, help="sigma per coordinate (%(default)s)")
+    add("--outliers", type=float, default=d.outliers, help="share of random pixels (%(default)s)")
+    add("--pointing-scale", type=float, default=1.0, help="errors of pan and tilt, times the rig's (1)")
+    add("--sigma-stop-m", type=float, default=d.sigma_stop_m, help="odometry's, per axis (%(default)s)")
+    add("--sigma-stop-deg", dest="sigma_stop_rad", type=_degrees, default=d.sigma_stop_rad, help="(0.57)")
+    a = vars(p.parse_args())
+    out, rig, seed = (a.pop(k) for k in ("out", "rig", "seed"))
+    try:
+        if out.exists() and not (out.is_dir() and not any(out.iterdir())):
+            p.exit(2, f"{p.prog}: {out}: expected a new or empty folder, found files\n")
+        options = SimulationOptions(**{**a, "tilts_rad": a["tilts_rad"] and tuple(a["tilts_rad"])})
+        s = simulate(rig_template(rig), options, seed=seed)
+        write_traverse(s.traverse, out)
+        arrays = {k: getattr(s.truth, k) for k in ("pan_tilt_rad", "landmarks_m", "uv_px", "outlier")}
+        np.savez(out / "truth.npz", world_T_mast=[m.matrix() for m in s.truth.world_T_mast], **arrays)
+    except (InputError, OSError) as error:
+        p.exit(2, f"{p.prog}: {error}\n")
+    counts = f"{len(s.traverse.stops)} stops, {len(s.traverse.images)} images"
+    print(f"{out}: {counts}, {len(s.truth.landmarks_m)} tracks, {len(s.truth.uv_px)} observations")
+
+
+if __name__ == "__main__":
+    main()
