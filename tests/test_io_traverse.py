@@ -227,3 +227,11 @@ def test_rover_images_go_to_the_pds_reader(
     assert read_input(tmp_path) is expected
     write_traverse(expected, tmp_path)  # a traverse beside the images says what to make of them
     assert read_input(tmp_path) is not expected
+
+
+def test_names_that_the_format_does_not_take(tmp_path: Path) -> None:
+    sample = io_samples.traverse()
+    odd = replace(sample, images=(replace(sample.images[0], id="a\nb"), *sample.images[1:]))
+    with pytest.raises(InputError, match=r'traverse\.json: id: expected a string of one line.*"a\\nb"'):
+        write_traverse(odd, tmp_path / "new")
+    assert not (tmp_path / "new").exists()

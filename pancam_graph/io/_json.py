@@ -11,7 +11,7 @@ import pydantic
 
 from pancam_graph.errors import InputError, PancamGraphError
 
-__all__ = ["entry_name", "prefixed", "read_bytes", "read_json", "short", "validated"]
+__all__ = ["entry_name", "prefixed", "read_bytes", "read_json", "refused_by_schema", "short", "validated"]
 
 _MAX_QUOTED = 60
 _EXPECTED = {
@@ -20,7 +20,7 @@ _EXPECTED = {
     "int_type": "an integer",
     "list_type": "a list",
     "model_type": "an object",
-    "string_too_short": "a string that is not empty",
+    "string_pattern_mismatch": "a string of one line that is not empty",
     "string_type": "a string",
     "string_unicode": "a string of valid Unicode",
 }
@@ -145,8 +145,15 @@ def read_json(path: Path, format_name: str, version: int) -> dict[str, Any]:
 
 def validated(model: type[_Model], data: dict[str, Any], path: Path) -> _Model:
     """The data as a model. Raises InputError about the first thing that does not fit the schema."""
-    try:
+    with refused_by_schema(path):
         return model.model_validate(data)
+
+
+@contextmanager
+def refused_by_schema(path: Path) -> Iterator[None]:
+    """Turn what a schema says about an entry into our sentence about `path`, on reading and on writing."""
+    try:
+        yield
     except pydantic.ValidationError as error:
         first, *others = error.errors(include_url=False)
         more = f" (and {len(others)} more such error{'s' if len(others) > 1 else ''})" if others else ""

@@ -37,7 +37,8 @@ VERSION = 1
 
 Text = Annotated[str, Field(min_length=0)]
 """Any string that can be written in UTF-8: a constraint makes pydantic look for halves of characters."""
-NonEmpty = Annotated[str, Field(min_length=1)]
+Label = Annotated[str, Field(pattern=r"^[^\p{Cc}\p{Zl}\p{Zp}]+$")]
+"""An id, a name or a path: not empty, and without control characters, which would break lines and tables."""
 Vector3 = Annotated[list[float], Field(min_length=3, max_length=3)]
 
 
@@ -74,7 +75,7 @@ class PoseEntry(Entry):
 class PinholeEntry(Entry):
     """A pinhole camera and how it sits on the head."""
 
-    name: NonEmpty
+    name: Label
     width_px: int
     height_px: int
     model: Literal["pinhole"]
@@ -114,7 +115,7 @@ class BrownEntry(PinholeEntry):
 class CAHVEntry(Entry):
     """A CAHV camera, its vectors in the head frame."""
 
-    name: NonEmpty
+    name: Label
     width_px: int
     height_px: int
     model: Literal["cahv"]
@@ -180,7 +181,7 @@ CameraEntry = Annotated[
 class TemplateRigEntry(Entry):
     """A rig that ships with the package."""
 
-    template: NonEmpty
+    template: Label
 
     def rig(self) -> Rig:
         """The rig. Raises InputError for an unknown template."""
@@ -210,7 +211,7 @@ def _rig_tag(value: Any) -> str:
 class StopEntry(Entry):
     """One place of the mast."""
 
-    id: NonEmpty
+    id: Label
     world_T_mast: PoseEntry
     sigma_rotation_rad: float
     sigma_translation_m: float
@@ -219,8 +220,8 @@ class StopEntry(Entry):
 class FrameEntry(Entry):
     """One pointing of the head."""
 
-    id: NonEmpty
-    stop: NonEmpty
+    id: Label
+    stop: Label
     pan_rad: float
     tilt_rad: float
     sigma_pan_rad: float
@@ -230,10 +231,10 @@ class FrameEntry(Entry):
 class ImageEntry(Entry):
     """One eye's picture of a frame."""
 
-    id: NonEmpty
-    frame: NonEmpty
-    camera: NonEmpty
-    file: NonEmpty | None = None
+    id: Label
+    frame: Label
+    camera: Label
+    file: Label | None = None
 
 
 class TraverseFile(Entry):
@@ -249,7 +250,7 @@ class TraverseFile(Entry):
     stops: list[StopEntry]
     frames: list[FrameEntry]
     images: list[ImageEntry]
-    observations: NonEmpty | None
+    observations: Label | None
 
 
 def camera_entry(eye: Eye) -> CameraEntry:

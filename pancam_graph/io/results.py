@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pancam_graph.errors import InputError
 from pancam_graph.io._atomic import whole_folder
-from pancam_graph.io._json import read_json
+from pancam_graph.io._json import read_json, refused_by_schema
 from pancam_graph.io._schema import SOLUTION_FORMAT, VERSION
 from pancam_graph.io.ply import points_ply
 from pancam_graph.io.residuals_csv import residuals_csv
@@ -63,7 +63,7 @@ def save_solution(solution: Solution, out: Path | str, *, report: bool = True) -
     check_out(out)
     started = time.perf_counter()
     try:
-        with whole_folder(out) as folder:
+        with whole_folder(out) as folder, refused_by_schema(out):
             (folder / "points.ply").write_bytes(points_ply(solution))
             (folder / "residuals.csv").write_bytes(residuals_csv(solution))
             if report:

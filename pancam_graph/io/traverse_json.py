@@ -4,9 +4,11 @@ import json
 import shutil
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
+import numpy as np
+
 from pancam_graph.errors import ImageError, InputError
 from pancam_graph.io._atomic import whole_file
-from pancam_graph.io._json import prefixed, read_json, short, validated
+from pancam_graph.io._json import prefixed, read_json, refused_by_schema, short, validated
 from pancam_graph.io._schema import (
     TRAVERSE_FORMAT,
     VERSION,
@@ -42,7 +44,8 @@ def read_traverse(folder: Path | str) -> Traverse:
         raise InputError(f"{folder}: expected a traverse folder with {_TRAVERSE_JSON}, found {found}")
     path = folder / _TRAVERSE_JSON
     entries = validated(TraverseFile, read_json(path, TRAVERSE_FORMAT, VERSION), path)
-    with prefixed(path):
+    # Absurdly large numbers overflow; the constructors refuse what that leaves, in one line and not two.
+    with prefixed(path), np.errstate(all="ignore"):
         traverse = _traverse(entries, folder)
         files = [
             None if i.file is None else _inside(folder, i.file, f"images[{row}].file")
@@ -74,7 +77,7 @@ def write_traverse(traverse: Traverse, folder: Path | str, *, overwrite: bool = 
     copied along. That observations were found in images (`Observations.origin`) is not in the format.
 
     Raises InputError where `folder` has a `traverse.json` already and `overwrite` is not set, for an image
-    file outside its folder, and for files that cannot be written.
+    file outside its folder, for names that the format does not take, and for files that cannot be written.
     """
     folder = Path(folder)
     path = folder / _TRAVERSE_JSON
@@ -82,7 +85,9 @@ def write_traverse(traverse: Traverse, folder: Path | str, *, overwrite: bool = 
         raise InputError(f"{path}: expected a folder without a traverse, found one; overwrite is off")
     copies = _copies(traverse, folder)
     observations = traverse.observations
-    text = json.dumps(_entries(traverse).model_dump(), indent=1, allow_nan=False, ensure_ascii=False)
+    with refused_by_schema(path):
+        entries = _entries(traverse)
+    text = json.dumps(entries.model_dump(), indent=1, allow_nan=False, ensure_ascii=False)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for source, target in copies:
