@@ -9,3 +9,4 @@ from pancam_graph.cameras._matrix import decompose_projection as decompose_proje
 from pancam_graph.cameras._matrix import projection_matrix as projection_matrix
 from pancam_graph.cameras._pinhole import Brown as Brown
 from pancam_graph.cameras._pinhole import Pinhole as Pinhole
+from pancam_graph.cameras._carry import carry_to_pinhole as carry_to_pinhole

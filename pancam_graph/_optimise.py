@@ -1,0 +1,114 @@
+"""GTSAM's Levenberg-Marquardt, iteration by iteration, with a reason for stopping."""
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import gtsam
+
+from pancam_graph.errors import SolveError
+
+__all__ = ["Iteration", "Outcome", "StopRule", "linear_step", "optimise"]
+
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Iteration:
+    """What a progress display may show."""
+
+    stage: str
+    """"screening" while outliers are sought, "approach" from afar, "solve" for the final least squares."""
+    number: int
+    cost: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class StopRule:
+    """When to stop (thesis 3.8)."""
+
+    max_iterations: int
+    relative_decrease: float
+    """An iteration that lowers the cost by less than this share of it is the last."""
+    absolute_cost: float = 0.0
+    """A cost below this is as good as none."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Outcome:
+    """Where the iterations ended."""
+
+    values: gtsam.Values
+    converged: bool
+    reason: str
+    costs: tuple[float, ...]
+    """After each iteration, the start first."""
+
+
+def optimise(
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    rule: StopRule,
+    *,
+    by_qr: bool = False,
+    on_iteration: Callable[[Iteration], None] | None = None,
+) -> Outcome:
+    """Minimise the graph's error from the given values.
+
+    Raises SolveError where the linear system cannot be factorised however much it is damped; an exception
+    from inside a custom factor reaches the caller as it is.
+    """
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setlambdaUpperBound(1e10)
+    parameters.setLinearSolverType(_solver(by_qr))
+    try:
+        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
+        costs = [optimizer.error()]
+        converged, reason = False, f"iteration limit of {rule.max_iterations}"
+        for number in range(1, rule.max_iterations + 1):
+            if costs[-1] <= rule.absolute_cost:
+                converged, reason = True, "residuals vanish"
+                break
+            optimizer.iterate()
+            costs.append(optimizer.error())
+            _LOG.debug("iteration %d: cost %.9g, lambda %.1e", number, costs[-1], optimizer.lambda_())
+            if on_iteration is not None:
+                on_iteration(Iteration(stage="solve", number=number, cost=costs[-1]))
+            decrease = costs[-2] - costs[-1]
+            if optimizer.lambda_() >= parameters.getlambdaUpperBound():
+                converged, reason = True, "no step lowers the cost"
+                break
+            if decrease <= rule.relative_decrease * costs[-2]:
+                converged, reason = True, f"relative decrease below {rule.relative_decrease:g}"
+                break
+    except RuntimeError as error:
+        raise _explained(error) from error
+    return Outcome(values=optimizer.values(), converged=converged, reason=reason, costs=tuple(costs))
+
+
+def linear_step(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, *, by_qr: bool = False
+) -> gtsam.VectorValues:
+    """The Gauss-Newton step of the graph at the values. Raises SolveError where it is not determined."""
+    parameters = gtsam.GaussNewtonParams()
+    parameters.setLinearSolverType(_solver(by_qr))
+    try:
+        optimizer = gtsam.GaussNewtonOptimizer(graph, values, parameters)
+        optimizer.iterate()
+    except RuntimeError as error:
+        raise _explained(error) from error
+    return values.localCoordinates(optimizer.values())
+
+
+def _solver(by_qr: bool) -> str:
+    # GTSAM's Cholesky refuses a variable whose directions differ by more than 4096 in standard deviation,
+    # as the range of a far landmark does; QR is three times slower and minds less.
+    return "MULTIFRONTAL_QR" if by_qr else "MULTIFRONTAL_CHOLESKY"
+
+
+def _explained(error: RuntimeError) -> Exception:
+    """GTSAM's word that a system is indeterminate, as our own; any other exception as it is."""
+    text = str(error).strip().replace("\n", " ")
+    if "ndeterminate" not in text:
+        return error
+    return SolveError(f"nothing holds a direction of the solution: {text.split('.')[0]}")

@@ -1,0 +1,41 @@
+"""Carry measured pixels of a distorted camera to the pinhole of the same camera.
+
+A solver whose projection is linear then sees the distorted camera exactly: the carried pixel lies
+on the same line of sight, and the whitening turns residuals back to pixels of the image as it was taken.
+"""
+
+import numpy as np
+
+from pancam_graph.cameras._base import Camera
+from pancam_graph.geometry import BoolArray, FloatArray
+
+__all__ = ["carry_to_pinhole"]
+
+
+def carry_to_pinhole(
+    camera: Camera, uv_px: FloatArray, range_m: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Pixels (n, 2) as the camera's pinhole would have measured them, and how residuals turn back.
+
+    `range_m` (n,) is the distance of what each pixel sees; it matters only where the entrance pupil
+    moves (CAHVORE), and there a rough value is enough unless the point is within a metre.
+
+    Returns the pinhole's pixels (n, 2), matrices (n, 2, 2) that take small residuals of the pinhole to
+    residuals of the image, and validity (n,): False outside either model's domain.
+    """
+    pinhole = camera.pinhole
+    if camera == pinhole:
+        n = len(uv_px)
+        return uv_px, np.broadcast_to(np.eye(2), (n, 2, 2)).copy(), np.ones(n, dtype=bool)
+    rays = camera.unproject(uv_px)
+    points = rays.origin_m + range_m[:, None] * rays.direction
+    carried, d_pinhole, in_front = pinhole.project_with_jacobian(points)
+    _, d_camera, seen = camera.project_with_jacobian(points)
+    # Both derivatives vanish along the line of sight, so any right inverse of one serves the other.
+    gram = d_camera @ d_camera.transpose(0, 2, 1)
+    valid = rays.valid & in_front & seen & (np.abs(np.linalg.det(gram)) > 0)
+    gram = np.where(valid[:, None, None], gram, np.eye(2))
+    forward = d_pinhole @ d_camera.transpose(0, 2, 1) @ np.linalg.inv(gram)
+    valid &= np.linalg.det(forward) > 1e-9
+    forward = np.where(valid[:, None, None], forward, np.eye(2))
+    return np.where(valid[:, None], carried, uv_px), np.linalg.inv(forward), valid

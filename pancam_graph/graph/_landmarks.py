@@ -1,0 +1,94 @@
+"""Landmarks as variables of the graph, with GTSAM's own projection factors.
+
+Another way to treat landmarks has the same two methods: it adds its factors, and reads its landmarks
+back from the values that the optimiser found.
+"""
+
+import gtsam
+import numpy as np
+
+from pancam_graph.geometry import BoolArray, FloatArray
+from pancam_graph.graph._template import FactorTemplate
+from pancam_graph.landmarks import Measurements
+from pancam_graph.losses import SQUARED, Loss
+
+__all__ = ["ExplicitLandmarks"]
+
+_PROXIMAL_RANGES = 10.0
+
+
+class ExplicitLandmarks:
+    """One Point3 variable `L` per landmark, one native factor per observation.
+
+    GTSAM's projections know no distortion: measurements are those of the pinhole of the same camera, and
+    the noise model turns residuals back to raw pixels. A landmark that moves behind a camera costs a large
+    constant there, so the optimiser rejects the step.
+    """
+
+    def __init__(self, template: FactorTemplate, measurements: Measurements) -> None:
+        self.template = template
+        self.measurements = measurements
+        self._calibration = [gtsam.Cal3_S2(*_five_numbers(p)) for p in template.traverse.rig.pinholes]
+
+    @staticmethod
+    def key(landmark: int) -> int:
+        """Key of a landmark."""
+        return int(gtsam.symbol("L", landmark))
+
+    def factors(self, accepted: BoolArray, loss: Loss = SQUARED) -> gtsam.NonlinearFactorGraph:
+        """A native factor for each accepted observation."""
+        graph = gtsam.NonlinearFactorGraph()
+        m, eye = self.measurements, self.template.traverse.image_eye
+        isotropic: dict[float, gtsam.noiseModel.Base] = {}  # one model serves all pinholes of one sigma
+        for i in np.flatnonzero(accepted):
+            w = m.whitening[i]
+            if w[0, 1] == w[1, 0] == 0 and w[0, 0] == w[1, 1]:
+                noise = isotropic.get(w[0, 0])
+                if noise is None:
+                    noise = loss.noise_model(gtsam.noiseModel.Isotropic.Sigma(2, 1 / w[0, 0]))
+                    isotropic[w[0, 0]] = noise
+            else:
+                noise = loss.noise_model(gtsam.noiseModel.Gaussian.SqrtInformation(w))
+            image = int(m.image[i])
+            graph.push_back(
+                gtsam.GenericProjectionFactorCal3_S2(
+                    m.uv_px[i],
+                    noise,
+                    self.template.camera_key(image),
+                    self.key(int(m.landmark[i])),
+                    self._calibration[eye[image]],
+                    False,  # noqa: FBT003  no exception from inside the optimiser
+                    False,  # noqa: FBT003  no message either
+                )
+            )
+        return graph
+
+    def proximal_factors(self, points_m: FloatArray, range_m: FloatArray, weak: BoolArray) -> gtsam.NonlinearFactorGraph:
+        """The stated weak prior of landmarks whose depth their rays leave undetermined.
+
+        Centred on where they start, with a sigma of ten times their distance. It is moved along from round
+        to round, so that it keeps the system regular and biases nothing.
+        """
+        graph = gtsam.NonlinearFactorGraph()
+        for j in np.flatnonzero(weak):
+            noise = gtsam.noiseModel.Isotropic.Sigma(3, _PROXIMAL_RANGES * float(range_m[j]))
+            graph.push_back(gtsam.PriorFactorPoint3(self.key(j), points_m[j], noise))
+        return graph
+
+    def with_landmarks(self, cameras: gtsam.Values, points_m: FloatArray, present: BoolArray) -> gtsam.Values:
+        """The cameras' values together with those of the landmarks that take part."""
+        values = gtsam.Values(cameras)
+        for j in np.flatnonzero(present):
+            values.insert(self.key(j), points_m[j])
+        return values
+
+    def points_m(self, values: gtsam.Values, present: BoolArray) -> FloatArray:
+        """Landmarks (landmarks, 3) from the values; NaN for those that do not take part."""
+        points = np.full((len(present), 3), np.nan)
+        for j in np.flatnonzero(present):
+            points[j] = values.atPoint3(self.key(j))
+        return points
+
+
+def _five_numbers(pinhole: object) -> tuple[float, ...]:
+    return tuple(getattr(pinhole, n) for n in ("fx_px", "fy_px", "skew_px", "cx_px", "cy_px"))

@@ -1,0 +1,144 @@
+"""Starts: where the stops stand and where the frames point before the first iteration."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from pancam_graph.cameras import decompose_projection
+from pancam_graph.errors import GeometryError, InputError
+from pancam_graph.geometry import FloatArray, pan_tilt_from_rotation, pose_arrays, wrap_angle
+from pancam_graph.initialise._circle import fit_circle
+from pancam_graph.traverse import Traverse
+
+__all__ = ["Start", "start_from_cameras", "start_from_odometry", "start_from_telemetry"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Start:
+    """First values of a solve; priors stay where the traverse has them."""
+
+    world_T_mast: tuple[gtsam.Pose3, ...]
+    """Mast pose of each stop."""
+    pan_tilt_rad: FloatArray
+    """(frames, 2)"""
+    warnings: tuple[str, ...] = ()
+
+
+def start_from_telemetry(traverse: Traverse) -> Start:
+    """The stops and angles that the traverse gives: the default."""
+    return Start(
+        world_T_mast=tuple(s.world_T_mast for s in traverse.stops), pan_tilt_rad=traverse.pan_tilt_rad.copy()
+    )
+
+
+def start_from_odometry(traverse: Traverse, mast_T_next: Sequence[gtsam.Pose3]) -> Start:
+    """Stops chained from the first by the motion between neighbours, `mast_T_next` (stops - 1).
+
+    Raises InputError for a wrong number of motions.
+    """
+    if len(mast_T_next) != len(traverse.stops) - 1:
+        raise InputError(
+            f"odometry: expected {len(traverse.stops) - 1} motions for {len(traverse.stops)} stops, "
+            f"found {len(mast_T_next)}"
+        )
+    poses = [traverse.stops[0].world_T_mast]
+    for motion in mast_T_next:
+        poses.append(poses[-1] * motion)
+    return Start(world_T_mast=tuple(poses), pan_tilt_rad=traverse.pan_tilt_rad.copy())
+
+
+def start_from_cameras(traverse: Traverse, projections: FloatArray) -> Start:
+    """Masts and angles from the projection matrices (images, 3, 4) of all images.
+
+    Each stop's centres, eye by eye, give a circle (thesis 4.6): its normal is the pan axis, its centre
+    lies on it. The rig says how high above the mast's origin; telemetry's pan only where the angle
+    counts from. A stop whose centres determine no circle (fewer than three, collinear), or cover less
+    than a quarter of it, gets its pose from the cameras' rotations and telemetry's angles; a warning says so.
+
+    Raises CameraError for a matrix that is no camera, InputError for a wrong number of matrices.
+    """
+    if projections.shape != (len(traverse.images), 3, 4):
+        raise InputError(
+            f"camera matrices: expected shape {(len(traverse.images), 3, 4)}, found {projections.shape}"
+        )
+    cameras = [decompose_projection(p) for p in projections]
+    world_R_camera = np.array([r.T for _, r, _ in cameras])
+    centres = np.array([c for _, _, c in cameras])
+    masts: list[gtsam.Pose3] = []
+    warnings: list[str] = []
+    for s, stop in enumerate(traverse.stops):
+        rows = np.flatnonzero(traverse.image_stop == s)
+        if len(rows) == 0:
+            masts.append(stop.world_T_mast)
+            continue
+        by_chain = _mast_by_chain(traverse, rows, world_R_camera, centres)
+        try:
+            masts.append(_mast_by_circles(traverse, rows, world_R_camera, centres, by_chain))
+        except GeometryError as error:
+            warnings.append(f"stop {stop.id}: placed by rotations and telemetry's angles: {error}")
+            masts.append(by_chain)
+    angles = traverse.pan_tilt_rad.copy()
+    masts_R, _ = pose_arrays(masts)
+    mounts_R, _ = pose_arrays([e.head_T_camera for e in traverse.rig.eyes])
+    for f in range(len(traverse.frames)):
+        rows = np.flatnonzero(traverse.image_frame == f)
+        if len(rows):
+            first = int(rows[0])
+            eye = int(traverse.image_eye[first])
+            mast_R_head = masts_R[traverse.frame_stop[f]].T @ world_R_camera[first] @ mounts_R[eye].T
+            pan, tilt = pan_tilt_from_rotation(mast_R_head)
+            angles[f] = angles[f] + wrap_angle(np.array([pan, tilt]) - angles[f])
+    return Start(world_T_mast=tuple(masts), pan_tilt_rad=angles, warnings=tuple(warnings))
+
+
+def _mast_by_chain(
+    traverse: Traverse, rows: np.ndarray, world_R_camera: FloatArray, centres: FloatArray
+) -> gtsam.Pose3:
+    """Mean of the mast poses that each camera gives through the rig at telemetry's angles."""
+    chain_R, chain_t = traverse.rig.mast_T_camera(
+        traverse.pan_tilt_rad[traverse.image_frame[rows]], traverse.image_eye[rows]
+    )
+    rotations = world_R_camera[rows] @ chain_R.transpose(0, 2, 1)
+    translations = centres[rows] - (rotations @ chain_t[..., None])[..., 0]
+    u, _, vt = np.linalg.svd(rotations.sum(axis=0))
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return gtsam.Pose3(gtsam.Rot3(rotation), translations.mean(axis=0))
+
+
+def _mast_by_circles(
+    traverse: Traverse, rows: np.ndarray, world_R_camera: FloatArray, centres: FloatArray, near: gtsam.Pose3
+) -> gtsam.Pose3:
+    """Mast pose whose z axis is the normal of the eyes' circles, and whose origin the rig places on it."""
+    up = near.rotation().matrix()[:, 2]
+    normals, origins, weights = [], [], []
+    reasons = []
+    for eye in np.unique(traverse.image_eye[rows]):
+        own = rows[traverse.image_eye[rows] == eye]
+        tilts = traverse.pan_tilt_rad[traverse.image_frame[own], 1]
+        level = tilts[0]
+        own = own[np.abs(tilts - level) < 0.01]  # one circle is one tilt
+        try:
+            fit = fit_circle(centres[own], up)
+        except GeometryError as error:
+            reasons.append(str(error))
+            continue
+        if fit.short_arc:
+            reasons.append(
+                f"circle: the centres cover {np.rad2deg(fit.arc_rad):.0f} degrees only; 90 or more are needed"
+            )
+            continue
+        _, _, height = traverse.rig.circle(int(eye), float(level))
+        normals.append(fit.rotation[:, 2])
+        origins.append(fit.centre_m - height * fit.rotation[:, 2])
+        weights.append(len(own))
+    if not normals:
+        raise GeometryError(reasons[0] if reasons else "circle: no eye has one")
+    z = np.average(normals, axis=0, weights=weights)
+    z /= np.linalg.norm(z)
+    x = near.rotation().matrix()[:, 0]
+    x = x - (x @ z) * z
+    x /= np.linalg.norm(x)
+    rotation = np.column_stack([x, np.cross(z, x), z])
+    return gtsam.Pose3(gtsam.Rot3(rotation), np.average(origins, axis=0, weights=weights))
