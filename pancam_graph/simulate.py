@@ -24,7 +24,7 @@ _HORIZON = 0.2  # how far the upper row looks below the horizon, as a share of t
 _BORDER_PX = 5.0  # nothing is matched nearer to an image's edge than this, or 2 % of a small image
 _MAX_TURN_RAD = np.deg2rad(40.0)  # a point looks too different when seen from farther around
 _MAX_ZOOM = 2.0  # or from so many times the distance
-_ROUNDS = 4  # lines of sight that end in the sky are drawn anew so often
+_ROUNDS = 3  # lines of sight that end in the sky are drawn anew so often
 _NOMINAL_SIGMA_PX = 0.3  # what observations without noise are said to have
 
 
