@@ -17,7 +17,7 @@ _AXIS_SIGMA = np.array([5e-3] * 2 + [5e-3] * 3 + [5e-3] * 2 + [5e-3])
 """Radians and metres by which a mast's axes may differ from its design: weak, only to settle what the
 labels leave open."""
 _ANGLE_SIGMA_RAD = 5e-3
-_FIT_FRAMES = 40
+_FIT_FRAMES = 24
 """Axes need no more; the angles of all frames are fitted afterwards."""
 
 
@@ -121,7 +121,7 @@ def fit_mast(fit: MastFit, labels: LabelCameras) -> MastFit:
         return np.concatenate([labels_part, axes / _AXIS_SIGMA, angles / _ANGLE_SIGMA_RAD])
 
     x0 = np.zeros(8 + 2 * len(chosen) + 6 * len(fit.mount_R))
-    solution = least_squares(residual, x0, method="trf", x_scale=1e-3, xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    solution = least_squares(residual, x0, method="trf", x_scale=1e-3, xtol=1e-10, ftol=1e-10, gtol=1e-10)
     moved = _moved(start, solution.x)
     return fit_angles(replace(moved, pan_tilt_rad=fit.pan_tilt_rad), labels)
 

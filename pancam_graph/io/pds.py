@@ -25,19 +25,11 @@ import gtsam
 import numpy as np
 
 from pancam_graph.cameras import CAHV, CAHVOR, CAHVORE
-from pancam_graph.errors import CameraError, GeometryError, InputError
-from pancam_graph.geometry import (
-    Z_DOWN_R_Z_UP,
-    FloatArray,
-    IntArray,
-    pose_arrays,
-    pose_from_wxyz,
-    rotation_from_wxyz,
-    wrap_angle,
-)
+from pancam_graph.errors import InputError
+from pancam_graph.geometry import FloatArray, IntArray, pose_arrays, wrap_angle
 from pancam_graph.io._mast_fit import LabelCameras, MastFit, fit_angles, fit_mast, label_misfit
-from pancam_graph.io.pds_label import LabelGroup, PdsLabel, read_label
-from pancam_graph.rigs import MARS2020_MAST, MER_MAST, MSL_MAST, Eye, MastKinematics, Rig
+from pancam_graph.io._pds_image import PMA_GROUPS, LabelledImage, read_labelled_image
+from pancam_graph.rigs import MER_MAST, Eye, MastKinematics, Rig
 from pancam_graph.traverse import Frame, Image, Stop, Traverse
 
 __all__ = ["LOCALISATION_SIGMA", "SAME_POINTING_RAD", "LocalisationSigma", "read_pds"]
@@ -54,14 +46,6 @@ _SAME_PRINCIPAL_POINT_PX = 1.0
 _SAME_POSE = 1e-3
 """Metres and radians by which rover poses within a stop may differ unnoticed."""
 
-_ROVER_FRAMES = {"ROVER_FRAME", "ROVER_NAV_FRAME"}
-_CAMERA_GROUPS = ("GEOMETRIC_CAMERA_MODEL", "GEOMETRIC_CAMERA_MODEL_PARMS")
-_ROVER_GROUPS = ("ROVER_COORDINATE_SYSTEM", "ROVER_COORDINATE_SYSTEM_PARMS", "ROVER_COORD_SYSTEM_PARMS")
-_RSM_GROUPS = ("RSM_ARTICULATION_STATE", "RSM_ARTICULATION_STATE_PARMS")
-_MAST_CAMERAS = ("PANCAM", "NAVCAM", "NAV_", "MAST_", "MCZ_", "ZCAM", "CHEMCAM", "SUPERCAM", "SCAM")
-_HOSTS = {"MER": MER_MAST, "MSL": MSL_MAST, "M20": MARS2020_MAST, "MARS": MARS2020_MAST}
-_Z_UP_T_Z_DOWN = gtsam.Pose3(gtsam.Rot3(Z_DOWN_R_Z_UP), np.zeros(3))
-
 
 @dataclass(frozen=True, kw_only=True)
 class LocalisationSigma:
@@ -76,22 +60,6 @@ class LocalisationSigma:
 
 
 LOCALISATION_SIGMA = LocalisationSigma()
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _LabelledImage:
-    """What a label says, z up, before images are sorted into stops, frames and eyes."""
-
-    label: PdsLabel
-    host: str
-    instrument: str
-    stop: tuple[int, int]
-    """Site and drive."""
-    mast_counter: int | None
-    pan_tilt_rad: tuple[float, float]
-    world_T_rover: gtsam.Pose3
-    model: CAHV
-    """In the rover frame."""
 
 
 def read_pds(folder: Path | str) -> Traverse:
@@ -110,7 +78,7 @@ def read_pds(folder: Path | str) -> Traverse:
     files = sorted(f for f in folder.iterdir() if f.suffix.lower() == ".img" and f.is_file())
     if not files:
         raise InputError(f"{folder}: expected images with PDS labels (*.IMG), found none")
-    images = [_read_image_label(file) for file in files]
+    images = [read_labelled_image(file) for file in files]
     kinematics = _common_mast(images)
     warnings: list[str] = []
     eye_of, eye_names = _sort_eyes(images)
@@ -167,143 +135,7 @@ def _kind(path: Path) -> str:
     return "a file" if path.exists() else "none"
 
 
-def _read_image_label(file: Path) -> _LabelledImage:
-    label = read_label(file)
-    host = label.top.text("INSTRUMENT_HOST_ID").upper()
-    instrument = label.top.text("INSTRUMENT_ID").upper()
-    if not host.startswith(tuple(_HOSTS)):
-        raise InputError(
-            f"{label.label_file}: INSTRUMENT_HOST_ID: expected MER1, MER2, MSL or M20, found {host!r}"
-        )
-    if not instrument.startswith(_MAST_CAMERAS):
-        raise InputError(
-            f"{label.label_file}: INSTRUMENT_ID: expected a camera on the mast (PANCAM, NAVCAM, MAST, MCZ), "
-            f"found {instrument!r}"
-        )
-    camera = label.group(*_CAMERA_GROUPS)
-    layout = label.image_layout()
-    layout.require_complete()
-    try:
-        site_T_rover = _pose(label.group(*_ROVER_GROUPS), {"SITE_FRAME"})
-        model = _camera_model(camera, layout.width_px, layout.height_px)
-        frame = _reference_frame(camera, _ROVER_FRAMES | {"SITE_FRAME"})
-        if frame == "SITE_FRAME":
-            model = model.transformed(site_T_rover.inverse())
-        angles = _mast_angles(label, _mast_of(host))
-    except (CameraError, GeometryError) as error:
-        raise InputError(f"{label.label_file}: {error}") from error
-    counter = label.counter()
-    for name in ("SITE", "DRIVE"):
-        if name not in counter:
-            raise InputError(
-                f"{label.label_file}: ROVER_MOTION_COUNTER_NAME: expected SITE and DRIVE, "
-                f"found {', '.join(counter)}"
-            )
-    return _LabelledImage(
-        label=label,
-        host=host,
-        instrument=instrument,
-        stop=(counter["SITE"], counter["DRIVE"]),
-        mast_counter=counter.get("PMA", counter.get("RSM")),
-        pan_tilt_rad=angles,
-        world_T_rover=_Z_UP_T_Z_DOWN * site_T_rover * _Z_UP_T_Z_DOWN,
-        model=model.transformed(_Z_UP_T_Z_DOWN),
-    )
-
-
-def _mast_of(host: str) -> MastKinematics:
-    return next(mast for prefix, mast in _HOSTS.items() if host.startswith(prefix))
-
-
-def _reference_frame(group: LabelGroup, expected: set[str]) -> str:
-    frame = group.text("REFERENCE_COORD_SYSTEM_NAME").upper()
-    if frame not in expected:
-        raise InputError(
-            f"{group.where}: REFERENCE_COORD_SYSTEM_NAME: expected {' or '.join(sorted(expected))}, "
-            f"found {frame!r}"
-        )
-    return frame
-
-
-def _pose(group: LabelGroup, reference: set[str]) -> gtsam.Pose3:
-    """`reference_T_frame` of a coordinate system group, z down."""
-    _reference_frame(group, reference)
-    offset = group.numbers("ORIGIN_OFFSET_VECTOR", 3)
-    wxyz = group.numbers("ORIGIN_ROTATION_QUATERNION", 4)
-    try:
-        return pose_from_wxyz(wxyz.tolist(), offset.tolist())
-    except GeometryError as error:
-        raise InputError(f"{group.where}: ORIGIN_ROTATION_QUATERNION: {error}") from error
-
-
-def _camera_model(group: LabelGroup, width_px: int, height_px: int) -> CAHV:
-    """The label's camera in the label's frame. Linearised products are CAHV and need nothing special."""
-    kind = group.text("MODEL_TYPE").upper()
-    letters = {"CAHV": "CAHV", "CAHVOR": "CAHVOR", "CAHVORE": "CAHVORETP"}
-    if kind not in letters:
-        raise InputError(f"{group.where}: MODEL_TYPE: expected CAHV, CAHVOR or CAHVORE, found {kind!r}")
-    order = [name.upper() for name in group.names("MODEL_COMPONENT_ID")]
-    vectors: dict[str, FloatArray] = {}
-    for letter in letters[kind]:
-        if letter not in order:
-            raise InputError(
-                f"{group.where}: MODEL_COMPONENT_ID: expected {', '.join(letters[kind])}, "
-                f"found {', '.join(order)}"
-            )
-        entry = f"MODEL_COMPONENT_{order.index(letter) + 1}"
-        vectors[letter] = group.numbers(entry, 1 if letter in "TP" else 3)
-    c, a, h, v = (vectors[letter] for letter in "CAHV")
-    if kind == "CAHV":
-        return CAHV(width_px=width_px, height_px=height_px, C=c, A=a, H=h, V=v)
-    o, r = vectors["O"], vectors["R"]
-    if kind == "CAHVOR":
-        return CAHVOR(width_px=width_px, height_px=height_px, C=c, A=a, H=h, V=v, O=o, R=r)
-    # T: 1 perspective, 2 fish-eye, 3 general with the linearity in P.
-    linearity = {1: 1.0, 2: 0.0, 3: float(vectors["P"][0])}.get(int(vectors["T"][0]))
-    if linearity is None:
-        raise InputError(
-            f"{group.where}: MODEL_COMPONENT_{order.index('T') + 1}: expected a CAHVORE type of 1, 2 or 3, "
-            f"found {vectors['T'][0]:g}"
-        )
-    return CAHVORE(
-        width_px=width_px,
-        height_px=height_px,
-        C=c,
-        A=a,
-        H=h,
-        V=v,
-        O=o,
-        R=r,
-        E=vectors["E"],
-        linearity=linearity,
-    )
-
-
-def _mast_angles(label: PdsLabel, mast: MastKinematics) -> tuple[float, float]:
-    """Measured pan and tilt of the chain."""
-    if mast is MER_MAST:
-        # INSTRUMENT_ELEVATION changes its sign between rovers and the encoders have offsets; the
-        # quaternion is what the camera model was made with.
-        group = label.group("PMA_COORDINATE_SYSTEM", "PMA_COORDINATE_SYSTEM_PARMS")
-        _reference_frame(group, _ROVER_FRAMES)
-        rotation = rotation_from_wxyz(group.numbers("ORIGIN_ROTATION_QUATERNION", 4))
-        azimuth = float(np.arctan2(rotation[1, 0], rotation[0, 0]))
-        return mast.pan_tilt_rad(azimuth, float(np.arcsin(np.clip(-rotation[2, 0], -1, 1))))
-    group = label.group(*_RSM_GROUPS)
-    angles = group.angles_rad()
-    found: list[float] = []
-    for names in (mast.azimuth_names, mast.elevation_names):
-        name = next((n for n in names if n in angles), None)
-        if name is None:
-            raise InputError(
-                f"{group.where}: ARTICULATION_DEVICE_ANGLE_NAME: expected {' or '.join(names)} with a value, "
-                f"found {', '.join(angles) or 'none'}"
-            )
-        found.append(angles[name])
-    return mast.pan_tilt_rad(*found)
-
-
-def _common_mast(images: Sequence[_LabelledImage]) -> MastKinematics:
+def _common_mast(images: Sequence[LabelledImage]) -> MastKinematics:
     """The mast of all images. Raises InputError if they are of two rovers or in two site frames."""
     first = images[0]
     for image in images:
@@ -317,17 +149,16 @@ def _common_mast(images: Sequence[_LabelledImage]) -> MastKinematics:
                 f"{image.label.label_file}: ROVER_MOTION_COUNTER: expected site {first.stop[0]} as in "
                 f"{first.label.label_file.name}, found {image.stop[0]}: poses in two site frames"
             )
-    mast = _mast_of(first.host)
+    mast = first.mast
     if mast is MER_MAST:
-        group = first.label.group("PMA_COORDINATE_SYSTEM", "PMA_COORDINATE_SYSTEM_PARMS")
-        x, y, z = (float(c) for c in group.numbers("ORIGIN_OFFSET_VECTOR", 3))
+        x, y, z = (float(c) for c in first.label.group(*PMA_GROUPS).numbers("ORIGIN_OFFSET_VECTOR", 3))
         mast = replace(mast, azimuth_point_m=(x, y, z), elevation_point_m=(x, y, z))
     return mast
 
 
-def _sort_eyes(images: Sequence[_LabelledImage]) -> tuple[IntArray, list[str]]:
+def _sort_eyes(images: Sequence[LabelledImage]) -> tuple[IntArray, list[str]]:
     """Eye of each image (n,), and the eyes' names."""
-    firsts: list[_LabelledImage] = []
+    firsts: list[LabelledImage] = []
     eye_of: list[int] = []
     for image in images:
         row = next((k for k, first in enumerate(firsts) if _same_eye(first, image)), len(firsts))
@@ -342,7 +173,7 @@ def _sort_eyes(images: Sequence[_LabelledImage]) -> tuple[IntArray, list[str]]:
     return np.array(eye_of, dtype=np.int64), names
 
 
-def _same_eye(first: _LabelledImage, image: _LabelledImage) -> bool:
+def _same_eye(first: LabelledImage, image: LabelledImage) -> bool:
     a, b = first.model, image.model
     if first.instrument != image.instrument or type(a) is not type(b):
         return False
@@ -358,7 +189,7 @@ def _stop_id(stop: tuple[int, int]) -> str:
 
 
 def _sort_stops(
-    images: Sequence[_LabelledImage], mast: MastKinematics, warnings: list[str]
+    images: Sequence[LabelledImage], mast: MastKinematics, warnings: list[str]
 ) -> tuple[dict[tuple[int, int], int], tuple[Stop, ...]]:
     """First image of each stop, in the order of the motion counter, and the stops."""
     first_of: dict[tuple[int, int], int] = {}
@@ -368,8 +199,9 @@ def _sort_stops(
     rover_T_mast, _ = mast.chain()
     for stop, i in first_of.items():
         poses = [image.world_T_rover for image in images if image.stop == stop]
-        apart = [np.abs(images[i].world_T_rover.logmap(pose)) for pose in poses]
-        turn, shift = np.max(apart, axis=0)[:3].max(), np.max(apart, axis=0)[3:].max()
+        apart = [images[i].world_T_rover.between(pose) for pose in poses]
+        turn = max(float(np.linalg.norm(gtsam.Rot3.Logmap(pose.rotation()))) for pose in apart)
+        shift = max(float(np.linalg.norm(pose.translation())) for pose in apart)
         if max(turn, shift) > _SAME_POSE:
             warnings.append(
                 f"stop {_stop_id(stop)}: its labels' rover poses differ by up to {shift * 1e3:.1f} mm and "
@@ -394,7 +226,7 @@ def _sort_stops(
     return first_of, tuple(stops)
 
 
-def _sort_frames(images: Sequence[_LabelledImage], eye_of: IntArray) -> tuple[IntArray, list[int]]:
+def _sort_frames(images: Sequence[LabelledImage], eye_of: IntArray) -> tuple[IntArray, list[int]]:
     """Frame of each image (n,), and each frame's first image."""
     firsts: list[int] = []
     eyes_in: list[set[int]] = []
@@ -416,7 +248,7 @@ def _sort_frames(images: Sequence[_LabelledImage], eye_of: IntArray) -> tuple[In
     return np.array(frame_of, dtype=np.int64), firsts
 
 
-def _frame_ids(images: Sequence[_LabelledImage], firsts: Sequence[int]) -> list[str]:
+def _frame_ids(images: Sequence[LabelledImage], firsts: Sequence[int]) -> list[str]:
     """Site, drive and mast counter; a number more where that is not unique."""
     ids: list[str] = []
     for row, i in enumerate(firsts):
@@ -429,7 +261,7 @@ def _frame_ids(images: Sequence[_LabelledImage], firsts: Sequence[int]) -> list[
 
 
 def _fit_rig(
-    images: Sequence[_LabelledImage],
+    images: Sequence[LabelledImage],
     mast: MastKinematics,
     frame_of: IntArray,
     eye_of: IntArray,
@@ -482,7 +314,7 @@ def _worst(misfit: FloatArray) -> FloatArray:
 def _warn_of_angles(
     change: FloatArray,
     mast: MastKinematics,
-    images: Sequence[_LabelledImage],
+    images: Sequence[LabelledImage],
     frame_of: IntArray,
     warnings: list[str],
 ) -> None:
@@ -496,13 +328,13 @@ def _warn_of_angles(
         name = images[int(np.flatnonzero(frame_of == worst)[0])].label.file.name
         warnings.append(
             f"{len(frames)} of {len(change)} pointings: the label's camera is turned from the measured "
-            f"angles by more than 3 sigma, at most {alone[worst].max() * 1e3:.1f} mrad in {name}; the camera's "
-            "pointing is used"
+            f"angles by more than 3 sigma, at most {alone[worst].max() * 1e3:.1f} mrad in {name}; the "
+            "camera's pointing is used"
         )
 
 
 def _mount_eyes(
-    fit: MastFit, images: Sequence[_LabelledImage], labels: LabelCameras, eye_names: Sequence[str]
+    fit: MastFit, images: Sequence[LabelledImage], labels: LabelCameras, eye_names: Sequence[str]
 ) -> tuple[MastFit, tuple[Eye, ...]]:
     """Eyes whose vectors are the mean of their images' in the head frame, and the chain with them."""
     unmounted = replace(

@@ -14,6 +14,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 import pvl
+from pvl.decoder import OmniDecoder
 from pvl.exceptions import LexerError, ParseError, QuantityError
 
 from pancam_graph.errors import ImageError, InputError
@@ -284,16 +285,27 @@ def read_label(file: Path) -> PdsLabel:
             f"{label_file}: expected a label that closes with the line END, found none in {len(head)} bytes"
         )
     text = head[: end.end()].decode("latin-1").rstrip("\x00")
-    # The parser takes 0.4 s for a whole label and 0.1 s for the groups that are used.
+    # The parser would take 0.4 s for a whole label, 0.05 s for the groups that are used and no dates.
     text = _GROUPS.sub(lambda match: match[0] if _WANTED.fullmatch(match["name"]) else "", text)
     try:
-        items = pvl.loads(text)
+        items = pvl.loads(text, decoder=_decoder())
     except (ParseError, LexerError, QuantityError, ValueError) as error:
         first_line = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise InputError(
             f"{label_file}: expected a PDS3 label, found text that is none: {first_line}"
         ) from error
     return PdsLabel(file=file, label_file=label_file, top=LabelGroup(str(label_file), items))
+
+
+def _decoder() -> Any:
+    """A decoder that leaves dates as text: trying all their formats takes most of a label's time."""
+
+    def no_date(value: str) -> NoReturn:
+        raise ValueError(value)
+
+    decoder = OmniDecoder()
+    decoder.decode_datetime = no_date
+    return decoder
 
 
 def _head(file: Path) -> bytes:
