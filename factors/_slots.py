@@ -51,9 +51,7 @@ def custom_factor(
     def evaluate(
         _this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
     ) -> FloatArray:
-        arguments = [
-            read(values, slot.key) if isinstance(slot, Key) else slot.value for slot, read in slots
-        ]
+        arguments = [read(values, slot.key) if isinstance(slot, Key) else slot.value for slot, read in slots]
         error, derivatives = residual(*arguments)
         if jacobians is not None:
             for j, (i, _) in enumerate(variable):

@@ -1,8 +1,28 @@
-"""Bundle adjustment of mast camera panoramas on GTSAM."""
+"""Bundle adjustment of mast camera panoramas on GTSAM.
+
+Read a traverse, find observations in its images where it has none, solve, save::
+
+    traverse = read_input("folder")
+    if traverse.observations is None:
+        traverse = find_observations(traverse)
+    solution = solve(traverse)
+    solution.save("out")
+"""
 
 import logging
 
 from pancam_graph.errors import PancamGraphError as PancamGraphError
+from pancam_graph.images import find_observations as find_observations
+from pancam_graph.io import read_input as read_input
+from pancam_graph.io import read_pds as read_pds
+from pancam_graph.io import read_traverse as read_traverse
+from pancam_graph.io import write_traverse as write_traverse
+from pancam_graph.report import write_report as write_report
+from pancam_graph.simulate import SimulationOptions as SimulationOptions
+from pancam_graph.simulate import simulate as simulate
+from pancam_graph.solution import Solution as Solution
+from pancam_graph.solve import SolveOptions as SolveOptions
+from pancam_graph.solve import solve as solve
 from pancam_graph.traverse import Frame as Frame
 from pancam_graph.traverse import Image as Image
 from pancam_graph.traverse import Observations as Observations

@@ -46,7 +46,8 @@ def connection_warnings(traverse: Traverse, used: BoolArray) -> list[str]:
     groups = sorted((g for g in groups if len(g)), key=lambda g: int(g[0]))
     if len(groups) > 1:
         listed = "; ".join(
-            f"({i}) {_names([traverse.frames[f].id for f in g])}" for i, g in enumerate(groups[:_NAMED], start=1)
+            f"({i}) {_names([traverse.frames[f].id for f in g])}"
+            for i, g in enumerate(groups[:_NAMED], start=1)
         )
         rest = f"; and {len(groups) - _NAMED} more" if len(groups) > _NAMED else ""
         warnings.append(

@@ -15,7 +15,16 @@ from pancam_graph.losses import SQUARED, Loss
 
 _BEHIND_COST = 1e12
 
-__all__ = ["CameraViews", "Landmarks", "Measurements", "evaluate", "point_sigma_m", "refine", "residual_cofactor", "triangulate"]
+__all__ = [
+    "CameraViews",
+    "Landmarks",
+    "Measurements",
+    "evaluate",
+    "point_sigma_m",
+    "refine",
+    "residual_cofactor",
+    "triangulate",
+]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -196,9 +205,9 @@ def refine(
         better = trial_cost < cost
         vector[active[better]] = trial.vector[better]
         damping[active] = np.where(better, damping[active] * 0.1, damping[active] * 100.0).clip(1e-12, 1e9)
-        # What a full step gains no more than rounding, or no damping makes gain, stays.
-        settled = np.where(better, cost - trial_cost <= 1e-13 * cost, damping[active] > 1e6)
-        settled |= length < 1e-12
+        # A landmark stays where a step promises no more than rounding, or where no damping makes one gain.
+        promised = -0.5 * np.einsum("li,li->l", step, g)
+        settled = (promised <= 1e-12 * cost) | (~better & (damping[active] > 1e6))
         keep = np.zeros(len(vector), dtype=bool)
         keep[active[~settled]] = True
         rows, active = np.flatnonzero(keep[measurements.landmark]), np.flatnonzero(keep)
@@ -224,8 +233,7 @@ def residual_cofactor(b: FloatArray, measurements: Measurements, weight: FloatAr
     v = np.add.reduceat(b.transpose(0, 2, 1) @ (weight[:, None, None] * b), measurements.starts)
     values, vectors = np.linalg.eigh(v)
     # Directions that the accepted rays leave free: their observations determine them, whatever they say.
-    floor = 1e-14 * np.maximum(values[:, -1:], 1e-300)
-    inverse = np.where(values > floor, 1 / np.maximum(values, floor), 1 / floor)
+    inverse = 1 / np.maximum(values, 1e-14 * values[:, -1:] + 1e-100)
     half = b @ (vectors * np.sqrt(inverse)[:, None, :])[measurements.landmark]
     leverage = half @ half.transpose(0, 2, 1)
     sign = np.where(weight > 0, -weight, 1.0)
@@ -246,7 +254,9 @@ def point_sigma_m(
     p = np.einsum("nij,nj->ni", to_pixel, points_m[k] - views.world_t_camera[image])
     depth = np.where(np.abs(p[:, 2]) > 1e-12, p[:, 2], 1e-12)
     uv = p[:, :2] / depth[:, None]
-    d_point = measurements.whitening @ (to_pixel[:, :2] - uv[:, :, None] * to_pixel[:, 2:]) / depth[:, None, None]
+    d_point = (
+        measurements.whitening @ (to_pixel[:, :2] - uv[:, :, None] * to_pixel[:, 2:]) / depth[:, None, None]
+    )
     d_point = np.where(accepted[:, None, None], d_point, 0.0)
     information = np.add.reduceat(d_point.transpose(0, 2, 1) @ d_point, measurements.starts)
     smallest = np.linalg.eigvalsh(information)[:, 0]

@@ -55,7 +55,10 @@ class Loss:
         """GTSAM's noise model of this loss over a Gaussian one."""
         if self.name == "none":
             return gaussian
-        estimators = {"huber": gtsam.noiseModel.mEstimator.Huber, "cauchy": gtsam.noiseModel.mEstimator.Cauchy}
+        estimators = {
+            "huber": gtsam.noiseModel.mEstimator.Huber,
+            "cauchy": gtsam.noiseModel.mEstimator.Cauchy,
+        }
         return gtsam.noiseModel.Robust.Create(estimators[self.name].Create(self.width), gaussian)
 
 

@@ -38,8 +38,8 @@ _LOG = logging.getLogger(__name__)
 _SCREENING_ROUNDS = 8
 _FINAL_ROUNDS = 6
 _TYPICAL_RANGE_M = 10.0
-_FURTHEST_PARALLAX_SIGMAS = 0.1
-"""Points start no further out than where their parallax is this many sigmas of a pixel."""
+_FURTHEST_PARALLAX_SIGMAS = 0.01
+"""Points are placed no further out than where their parallax is this many sigmas of a pixel."""
 _WEAK_RANGE_SIGMA = 0.3
 """A landmark whose range is known to no better than this share of it gets the weak prior."""
 _STRETCHED = 500.0
@@ -65,7 +65,7 @@ class SolveOptions:
     the observations itself and their sigmas are guesses."""
     max_iterations: int = 100
     """Of the final least squares; reaching it means not converged."""
-    relative_decrease: float = 1e-9
+    relative_decrease: float = 1e-7
     """The final least squares stops where an iteration lowers the cost by a smaller share."""
 
     def __post_init__(self) -> None:
@@ -113,11 +113,14 @@ def solve(
 class _Weak:
     """Landmarks whose range is all but free."""
 
-    distance_m: FloatArray
-    """(landmarks,) from their origins"""
     needs_prior: BoolArray
-    """(landmarks,)"""
-    needs_qr: bool
+    """(landmarks,) whether the weak prior keeps the system regular"""
+    prior_m: FloatArray
+    """(landmarks,) its sigma: ten times the distance, so that it says nothing"""
+    stretched: BoolArray
+    """(landmarks,) which are too long in range for GTSAM's Cholesky"""
+    bearable_m: FloatArray
+    """(landmarks,) sigma of a prior that it bears, for steps whose landmarks are placed anew anyway"""
 
 
 class _Adjustment:
@@ -145,7 +148,7 @@ class _Adjustment:
         self.sigma_px = self.observations.sigma_px.copy()
         self.reason = np.full(len(self.observations), "", dtype=object)
         self.measurements = self._measure()
-        self.landmarks = self._triangulate()
+        self.landmarks = self._triangulate(self.values, np.ones(len(self.measurements.row)))
         self.points_m = self._points(self.landmarks, self._views(self.values))
         self.accepted = np.ones(len(self.measurements.row), dtype=bool)
 
@@ -211,29 +214,33 @@ class _Adjustment:
             calibration=calibration[self.traverse.image_eye],
         )
 
-    def _triangulate(self) -> Landmarks:
-        views = self._views(self.values)
-        centre, direction = rays_of(self.measurements, views)
-        return triangulate(centre, direction, self.measurements.landmark, np.ones(len(centre)))
+    def _triangulate(self, values: gtsam.Values, weight: FloatArray) -> Landmarks:
+        """Linear triangulation; a landmark behind a camera starts far off where its cameras look instead."""
+        m, views = self.measurements, self._views(values)
+        centre, direction = rays_of(m, views)
+        landmarks = triangulate(centre, direction, m.landmark, weight)
+        _, _, in_front = evaluate(landmarks, m, views)
+        behind = np.bincount(m.landmark, ~in_front & (weight > 0), minlength=m.n_landmarks) > 0
+        mean = np.add.reduceat(weight[:, None] * direction, m.starts)
+        ahead = landmarks.moved_to(landmarks.origin_m + self._reach_m(landmarks, views)[:, None] * mean)
+        return replace(landmarks, vector=np.where(behind[:, None], ahead.vector, landmarks.vector))
 
     # --- the rounds ---
 
     def run(self) -> Solution:
         """Screen, adjust, and collect."""
-        if self.options.loss == "none":
-            self._set_aside_behind()
-        else:
+        if self.options.loss != "none":
             self._screen_at_start()
             self._screening_rounds()
         outcome = self._final_rounds()
         return self._collect(outcome)
 
     def _set_aside_behind(self) -> None:
-        """Without a loss every observation stays, but for landmarks that no step can bring to the front."""
-        views = self._views(self.values)
-        self.landmarks = refine(self.landmarks, self.measurements, views, self.accepted.astype(float))
-        _, _, in_front = evaluate(self.landmarks, self.measurements, views)
-        self._drop(~in_front, "behind")
+        """Leave out for good what is behind its camera although all else is in place."""
+        _, _, in_front = evaluate(self.landmarks, self.measurements, self._views(self.values))
+        behind = self.accepted & ~in_front
+        self.accepted = self.accepted & ~behind
+        self.reason[self.measurements.row[behind]] = "behind"
 
     def _screen_at_start(self) -> None:
         """Gross outliers, judged with what telemetry may be wrong by added to the noise."""
@@ -243,7 +250,9 @@ class _Adjustment:
         stop_rad = np.array([s.sigma_rotation_rad for s in t.stops])[t.image_stop[m.image]]
         stop_m = np.array([s.sigma_translation_m for s in t.stops])[t.image_stop[m.image]]
         first = refine(self.landmarks, m, views, self.accepted.astype(float))
-        distance = np.linalg.norm(self._points(first, views)[m.landmark] - views.world_t_camera[m.image], axis=1)
+        distance = np.linalg.norm(
+            self._points(first, views)[m.landmark] - views.world_t_camera[m.image], axis=1
+        )
         focal = views.calibration[m.image, 0, 0]
         telemetry_px = focal * np.sqrt(frame**2 + stop_rad**2 + (stop_m / distance.clip(1.0)) ** 2)
         sigma = self.observations.sigma_px[m.row]
@@ -295,25 +304,28 @@ class _Adjustment:
         rule = StopRule(
             max_iterations=options.max_iterations,
             relative_decrease=options.relative_decrease,
-            absolute_cost=1e-20 * len(self.measurements.row),
+            absolute_cost=1e-16 * len(self.measurements.row),
         )
         rescale = options.rescale_noise
         if rescale is None:
             rescale = self.observations.origin == "images"
         costs: list[float] = []
         self._approach(StopRule(max_iterations=20, relative_decrease=1e-4), SQUARED, stage="approach")
+        self._set_aside_behind()
         for _ in range(_FINAL_ROUNDS):
             outcome = self._adjust(rule)
-            fresh = list(outcome.costs)
-            costs += fresh if not costs else fresh[1:]
+            gained = costs[-1] - outcome.costs[-1] if costs else np.inf
+            costs += outcome.costs if not costs else outcome.costs[1:]
             moved = self._recarry()
             if rescale:
                 factor = self._noise_factor()
                 self.sigma_px *= factor
                 self.measurements = self.measurements.scaled(factor)
                 moved |= abs(factor - 1) > 1e-3
-            gained = fresh[0] - fresh[-1]
-            if not moved and gained <= 1e-6 * fresh[-1]:
+            # Landmarks that the weak prior held back may have further to go.
+            if not moved and (
+                gained <= 1e-6 * costs[-1] or not self._weak(self._present()).needs_prior.any()
+            ):
                 break
         return replace(outcome, costs=tuple(costs))
 
@@ -334,9 +346,8 @@ class _Adjustment:
         for number in range(1, rule.max_iterations + 1):
             weak = self._weak(present)
             graph = gtsam.NonlinearFactorGraph(observed)
-            graph.push_back(explicit.proximal_factors(self.points_m, weak.distance_m, weak.needs_prior))
-            start = explicit.with_landmarks(self.values, self.points_m, present)
-            step = linear_step(graph, start, by_qr=weak.needs_qr)
+            graph.push_back(explicit.proximal_factors(self.points_m, weak.bearable_m, weak.stretched))
+            step = linear_step(graph, explicit.with_landmarks(self.values, self.points_m, present))
             before, landmarks_before, points_before = self.values, self.landmarks, self.points_m
             for shrink in (1.0, 0.25, 0.0625, 0.0156):
                 self.values = self.template.retract(before, step, shrink)
@@ -367,9 +378,11 @@ class _Adjustment:
         self.graph = gtsam.NonlinearFactorGraph(self.factors)
         self.graph.push_back(explicit.factors(kept))
         weak = self._weak(present)
-        self.graph.push_back(explicit.proximal_factors(self.points_m, weak.distance_m, weak.needs_prior))
+        self.graph.push_back(explicit.proximal_factors(self.points_m, weak.prior_m, weak.needs_prior))
         values = explicit.with_landmarks(self.values, self.points_m, present)
-        outcome = optimise(self.graph, values, rule, by_qr=weak.needs_qr, on_iteration=self.on_iteration)
+        outcome = optimise(
+            self.graph, values, rule, by_qr=bool(weak.stretched.any()), on_iteration=self.on_iteration
+        )
         self.graph_values = outcome.values
         self.values = self.template.only_cameras(outcome.values)
         found = explicit.points_m(outcome.values, present)
@@ -378,7 +391,7 @@ class _Adjustment:
         return outcome
 
     def _place(self, loss: Loss) -> None:
-        """Landmarks where they fit best with the cameras as they are; those behind a camera are left out."""
+        """Landmarks where they fit best with the cameras as they are."""
         views = self._views(self.values)
         m = self.measurements
         self.landmarks = refine(self.landmarks, m, views, self.accepted.astype(float), loss)
@@ -391,9 +404,10 @@ class _Adjustment:
         sigma = point_sigma_m(self.points_m, m, views, self.accepted)
         sideways = distance * float(np.median(self.sigma_px)) / float(np.median(views.calibration[:, 0, 0]))
         return _Weak(
-            distance_m=distance,
             needs_prior=present & (sigma > _WEAK_RANGE_SIGMA * distance),
-            needs_qr=bool(np.any(sigma[present] > _STRETCHED * sideways[present])),
+            prior_m=10 * distance,
+            stretched=present & (sigma > _STRETCHED * sideways),
+            bearable_m=2 * _STRETCHED * sideways,
         )
 
     # --- helpers ---
@@ -403,22 +417,17 @@ class _Adjustment:
         m = self.measurements
         return np.asarray(np.bincount(m.landmark, self.accepted, minlength=m.n_landmarks) >= 2)
 
-    def _drop(self, rows: BoolArray, reason: str) -> None:
-        """Leave out measurements for good, and those of landmarks that thereby have only one left."""
-        if rows.any():
-            self.accepted = self.accepted & ~rows
-            self.reason[self.measurements.row[rows]] = reason
-
     def _points(self, landmarks: Landmarks, views: CameraViews) -> FloatArray:
-        """World points, none further than where parallax tells nothing; beyond infinity somewhat nearer."""
+        """World points, none further than where parallax tells nothing, be it beyond infinity."""
+        return landmarks.points_m(self._reach_m(landmarks, views) / _FURTHEST_PARALLAX_SIGMAS)
+
+    def _reach_m(self, landmarks: Landmarks, views: CameraViews) -> FloatArray:
+        """Distance (landmarks,) where the parallax over a landmark's cameras is one sigma of a pixel."""
         m = self.measurements
         arm = np.linalg.norm(views.world_t_camera[m.image] - landmarks.origin_m[m.landmark], axis=1)
         baseline = 2 * np.maximum.reduceat(arm, m.starts).clip(1e-3)
         focal = float(np.median(views.calibration[:, 0, 0]))
-        reach = baseline * focal / float(np.median(self.observations.sigma_px))
-        far = landmarks.points_m(reach / _FURTHEST_PARALLAX_SIGMAS)
-        near = landmarks.points_m(reach)
-        return np.where(landmarks.vector[:, 3:] <= 0, near, far)
+        return np.asarray(baseline * focal / float(np.median(self.observations.sigma_px)))
 
     def _recarry(self) -> bool:
         """Carry pixels again where that depends on the range; whether any moved by a thousandth of a pixel."""
@@ -463,7 +472,10 @@ class _Adjustment:
             self.reason[row] = np.where(self.reason[row] == "", reason, self.reason[row])
 
         initial_landmarks = refine(
-            self._triangulate_kept(kept), m, self._views(self.initial_values), kept.astype(float)
+            self._triangulate(self.initial_values, kept.astype(float)),
+            m,
+            self._views(self.initial_values),
+            kept.astype(float),
         )
         initial_points = self._points(initial_landmarks, self._views(self.initial_values))
         initial_points = np.where(present[:, None], initial_points, np.nan)
@@ -490,17 +502,15 @@ class _Adjustment:
             landmark_track=self.landmark_track,
             used=used,
             reason=tuple(str(r) for r in self.reason),
-            residual_initial_px=self._raw_residuals(initial_landmarks, self._views(self.initial_values), present),
+            residual_initial_px=self._raw_residuals(
+                initial_landmarks, self._views(self.initial_values), present
+            ),
             residual_final_px=self._raw_residuals(self.landmarks, self._views(self.values), present),
             sigma_px=self.sigma_px,
             stop_covariance=stop_covariance,
             angle_sigma_rad=angle_sigma,
             warnings=tuple([*self.warnings, *self._late_warnings(used), *connection_warnings(t, used)]),
         )
-
-    def _triangulate_kept(self, kept: BoolArray) -> Landmarks:
-        centre, direction = rays_of(self.measurements, self._views(self.initial_values))
-        return triangulate(centre, direction, self.measurements.landmark, kept.astype(float))
 
     def _raw_residuals(self, landmarks: Landmarks, views: CameraViews, present: BoolArray) -> FloatArray:
         """Projected minus measured (observations, 2) in raw pixels; NaN where there is no landmark."""

@@ -14,8 +14,6 @@ from pancam_graph.losses import SQUARED, Loss
 
 __all__ = ["ExplicitLandmarks"]
 
-_PROXIMAL_RANGES = 10.0
-
 
 class ExplicitLandmarks:
     """One Point3 variable `L` per landmark, one native factor per observation.
@@ -63,15 +61,16 @@ class ExplicitLandmarks:
             )
         return graph
 
-    def proximal_factors(self, points_m: FloatArray, range_m: FloatArray, weak: BoolArray) -> gtsam.NonlinearFactorGraph:
-        """The stated weak prior of landmarks whose depth their rays leave undetermined.
+    def proximal_factors(
+        self, points_m: FloatArray, sigma_m: FloatArray, which: BoolArray
+    ) -> gtsam.NonlinearFactorGraph:
+        """Priors of some landmarks, centred on where they are, with sigmas (landmarks,).
 
-        Centred on where they start, with a sigma of ten times their distance. It is moved along from round
-        to round, so that it keeps the system regular and biases nothing.
+        They are moved along from round to round, so that they keep the system regular and bias nothing.
         """
         graph = gtsam.NonlinearFactorGraph()
-        for j in np.flatnonzero(weak):
-            noise = gtsam.noiseModel.Isotropic.Sigma(3, _PROXIMAL_RANGES * float(range_m[j]))
+        for j in np.flatnonzero(which):
+            noise = gtsam.noiseModel.Isotropic.Sigma(3, float(sigma_m[j]))
             graph.push_back(gtsam.PriorFactorPoint3(self.key(j), points_m[j], noise))
         return graph
 

@@ -210,7 +210,9 @@ class FactorTemplate:
         masts_R, _ = pose_arrays(masts)
         mounts_R, _ = pose_arrays([e.head_T_camera for e in t.rig.eyes])
         head_R = (
-            masts_R[t.image_stop].transpose(0, 2, 1) @ world_R_camera @ mounts_R[t.image_eye].transpose(0, 2, 1)
+            masts_R[t.image_stop].transpose(0, 2, 1)
+            @ world_R_camera
+            @ mounts_R[t.image_eye].transpose(0, 2, 1)
         )
         before = t.rig.mast_T_head(pan_tilt_rad[t.image_frame, 0], pan_tilt_rad[t.image_frame, 1])[0]
         found, nominal = pan_tilt_from_rotation(head_R), pan_tilt_from_rotation(before)

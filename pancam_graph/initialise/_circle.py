@@ -54,7 +54,9 @@ def fit_circle(centres_m: FloatArray, up: FloatArray | None = None) -> CircleFit
     mean = points.mean(axis=0)
     _, spread, axes = np.linalg.svd(points - mean, full_matrices=False)
     if spread[0] < 1e-9:
-        raise GeometryError(f"circle: the {n} centres coincide within {spread[0]:.1e} m; no circle is determined")
+        raise GeometryError(
+            f"circle: the {n} centres coincide within {spread[0]:.1e} m; no circle is determined"
+        )
     if spread[1] < 1e-6 * spread[0]:
         raise GeometryError(
             f"circle: the {n} centres are collinear within {spread[1]:.1e} m; no circle is determined"

@@ -1,0 +1,107 @@
+"""What the command-line programs share: parsing, progress on a terminal, one sentence for bad input."""
+
+import argparse
+import logging
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import NoReturn
+
+from rich.console import Console
+from rich.logging import RichHandler
+from rich.table import Table
+
+from pancam_graph._optimise import Iteration
+from pancam_graph.errors import PancamGraphError
+from pancam_graph.solution import Solution
+
+__all__ = ["Parser", "Progress", "print_summary", "run", "show_log"]
+
+BAD_INPUT = 2
+_STAGES = {"screening": "looking for outliers", "approach": "adjusting", "solve": "adjusting to the end"}
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose complaints are one line."""
+
+    def __init__(self, description: str) -> None:
+        super().__init__(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+        self.add_argument("--verbose", action="store_true", help="log what is done, on standard error")
+
+    def error(self, message: str) -> NoReturn:
+        """Print one line and end with status 2."""
+        self.exit(BAD_INPUT, f"{self.prog}: {message} (--help explains)\n")
+
+
+def run(main: Callable[[], int]) -> NoReturn:
+    """Run a program: bad input ends it with one sentence on standard error and status 2."""
+    try:
+        sys.exit(main())
+    except PancamGraphError as error:
+        sys.stderr.write(f"{str(error).strip()}\n")
+        sys.exit(BAD_INPUT)
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted; nothing was written\n")
+        sys.exit(130)
+
+
+def show_log(*, verbose: bool) -> None:
+    """Send the package's log to standard error, if asked for."""
+    if verbose:
+        console = Console(stderr=True)
+        logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[RichHandler(console=console)])
+
+
+class Progress:
+    """A line on the terminal that says what is going on; nothing where standard error is no terminal."""
+
+    def __init__(self) -> None:
+        self.console = Console(stderr=True)
+        self._status = self.console.status("") if self.console.is_terminal else None
+
+    @contextmanager
+    def shown(self, text: str) -> Iterator[None]:
+        """Show the line while the block runs."""
+        self.say(text)
+        if self._status is None:
+            yield
+            return
+        with self._status:
+            yield
+
+    def say(self, text: str) -> None:
+        """Change the line."""
+        if self._status is not None:
+            self._status.update(text)
+
+    def images(self, what: str, done: int, total: int) -> None:
+        """Progress of the image front end."""
+        self.say(f"{what} {done} of {total}")
+
+    def iteration(self, iteration: Iteration) -> None:
+        """Progress of the solve."""
+        self.say(f"{_STAGES[iteration.stage]}: step {iteration.number}, cost {iteration.cost:.6g}")
+
+
+def print_summary(solution: Solution, where: str) -> None:
+    """What a solve did: a table on a terminal, one line where standard output is piped."""
+    used, total = int(solution.used.sum()), len(solution.used)
+    console = Console()
+    if not console.is_terminal:
+        sys.stdout.write(
+            f"{'converged' if solution.converged else 'NOT converged'}: RMS {solution.rms_initial_px:.3f} -> "
+            f"{solution.rms_final_px:.3f} px over {used} of {total} observations; {where}\n"
+        )
+        return
+    table = Table(title=solution.traverse.name or None, title_justify="left")
+    for column in ("", "before", "after"):
+        table.add_column(column, justify="right" if column else "left")
+    table.add_row("RMS of the residuals, px", f"{solution.rms_initial_px:.3f}", f"{solution.rms_final_px:.3f}")
+    table.add_row("cost", f"{solution.cost_initial:.6g}", f"{solution.cost_final:.6g}")
+    table.add_row("observations", f"{total}", f"{used} used")
+    console.print(table)
+    state = "converged" if solution.converged else "[bold red]not converged[/]"
+    console.print(f"{state}: {solution.stop_reason}; {solution.seconds.solve:.1f} s")
+    for warning in solution.warnings:
+        console.print(f"[yellow]warning[/] {warning}", highlight=False)
+    console.print(f"results in [bold]{where}[/]", highlight=False)

@@ -1,0 +1,60 @@
+"""Refine a rover traverse: mast poses, pointing and terrain points from images taken by a camera mast.
+
+TRAVERSE is a folder with traverse.json, or a folder of rover images with PDS labels (MER, MSL,
+Mars 2020). OUT gets solution.json, points.ply, residuals.csv and report.html; an older OUT is
+replaced once the new results are complete.
+
+Exit status: 0 solved, 1 not converged (results are written), 2 bad input (nothing is written).
+"""
+
+import time
+from pathlib import Path
+
+from pancam_graph import SolveOptions, find_observations, read_input, solve
+from pancam_graph.io import check_out
+from pancam_graph.program import Parser, Progress, print_summary, run, show_log
+
+
+def main() -> int:
+    """Read, match images where observations are missing, solve, write."""
+    parser = Parser(__doc__ or "")
+    parser.add_argument("traverse", type=Path, metavar="TRAVERSE", help="folder to read")
+    parser.add_argument("--out", type=Path, required=True, help="folder to write")
+    parser.add_argument(
+        "--model",
+        choices=("mast", "circle", "free"),
+        default="mast",
+        help="mast: rigid pan-tilt mast (default); circle: camera centres on the mast's circles, rotations free; "
+        "free: every camera on its own",
+    )
+    parser.add_argument(
+        "--landmarks", choices=("explicit",), default="explicit", help="terrain points as variables of the graph"
+    )
+    parser.add_argument(
+        "--loss",
+        choices=("none", "huber", "cauchy"),
+        default="huber",
+        help="robust loss while outliers are sought (default huber); none: keep every observation",
+    )
+    parser.add_argument("--no-report", action="store_true", help="do not write report.html")
+    arguments = parser.parse_args()
+    show_log(verbose=arguments.verbose)
+    progress = Progress()
+
+    begin = time.perf_counter()
+    with progress.shown(f"reading {arguments.traverse}"):
+        check_out(arguments.out)
+        traverse = read_input(arguments.traverse)
+        if traverse.observations is None:
+            traverse = find_observations(traverse, progress=progress.images)
+        read_s = time.perf_counter() - begin
+        options = SolveOptions(model=arguments.model, landmarks=arguments.landmarks, loss=arguments.loss)
+        solution = solve(traverse, options, on_iteration=progress.iteration).with_seconds(read=read_s)
+        progress.say("writing the results")
+        solution = solution.save(arguments.out, report=not arguments.no_report)
+    print_summary(solution, str(arguments.out))
+    return 0 if solution.converged else 1
+
+
+if __name__ == "__main__":
+    run(main)
