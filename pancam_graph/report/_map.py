@@ -1,0 +1,177 @@
+"""The map: stops with their uncertainty ellipses, viewing directions and landmarks from above."""
+
+from html import escape
+
+import numpy as np
+
+from pancam_graph.geometry import FloatArray, pose_arrays
+from pancam_graph.report._look import AFTER, BEFORE, INK, RESIDUAL_SCALE, Figure, axis, layout
+from pancam_graph.report._numbers import Json, decimals_for, polyline, round_factor, rounded, short, thinned
+from pancam_graph.report._scene import label_stops, near_spacing
+from pancam_graph.report._terrain import Terrain
+from pancam_graph.solution import Solution
+
+__all__ = ["ellipse_outlines", "make_map", "translation_covariance_in_world"]
+
+_MAX_LANDMARKS = 4_000
+_ELLIPSE_STEPS = 48
+_RADIUS_95 = float(np.sqrt(-2 * np.log(1 - 0.95)))
+"""Radius, in standard deviations, of the ellipse that holds 95 % of a plane normal distribution."""
+
+
+def translation_covariance_in_world(world_R_mast: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Covariances of positions in world axes (n, 3, 3) from those of poses in body axes (n, 6, 6).
+
+    A pose moves as `world_T_mast * Exp([w, v])`, rotation first: its position moves by
+    `world_R_mast v`, so the lower right block is turned by world_R_mast (n, 3, 3) from both sides.
+    """
+    return np.asarray(world_R_mast @ covariance[:, 3:, 3:] @ np.swapaxes(world_R_mast, 1, 2))
+
+
+def ellipse_outlines(covariance_m2: FloatArray, radius: float) -> FloatArray:
+    """Closed outlines (n, steps, 2) about zero of the ellipses of covariances (n, 2, 2).
+
+    `radius` is in standard deviations. Round-off below zero in an eigenvalue counts as zero.
+    """
+    angle = np.linspace(0, 2 * np.pi, _ELLIPSE_STEPS + 1)
+    circle = np.column_stack([np.cos(angle), np.sin(angle)])
+    value, vector = np.linalg.eigh(covariance_m2)
+    half_axes = vector * np.sqrt(np.maximum(value, 0.0))[:, None, :]
+    return np.asarray(radius * circle @ np.swapaxes(half_axes, 1, 2))
+
+
+def _landmark_trace(terrain: Terrain) -> Json:
+    keep = thinned(len(terrain.points_m), _MAX_LANDMARKS)
+    decimals = decimals_for(terrain.extent_m)
+    return {
+        "type": "scatter",
+        "mode": "markers",
+        "x": rounded(terrain.points_m[keep, 0], decimals),
+        "y": rounded(terrain.points_m[keep, 1], decimals),
+        "marker": {
+            "size": 3,
+            "opacity": 0.7,
+            "color": rounded(terrain.residual_px[keep], decimals_for(terrain.residual_limit_px)),
+            "colorscale": RESIDUAL_SCALE,
+            "cmin": 0,
+            "cmax": terrain.residual_limit_px,
+        },
+        "hoverinfo": "skip",
+        "name": "landmark",
+    }
+
+
+def _direction_trace(solution: Solution, terrain: Terrain, length_m: float) -> Json:
+    """A line from the mast along each frame's mean line of sight."""
+    traverse = solution.traverse
+    sight = np.zeros((len(traverse.frames), 2))
+    np.add.at(sight, traverse.image_frame, solution.final.world_R_camera[:, :2, 2])
+    norm = np.linalg.norm(sight, axis=1)
+    seen = norm > 1e-6  # False for NaN too
+    _, stops_m = pose_arrays(solution.final.world_T_mast)
+    start = (stops_m - terrain.origin_m)[traverse.frame_stop[seen], :2]
+    end = start + length_m * sight[seen] / norm[seen, None]
+    x, y = polyline(np.stack([start, end], axis=1), decimals_for(terrain.extent_m) + 1)
+    line = {"color": BEFORE, "width": 1}
+    name = "frame: viewing direction"
+    return {
+        "type": "scatter",
+        "mode": "lines",
+        "x": x,
+        "y": y,
+        "line": line,
+        "hoverinfo": "skip",
+        "name": name,
+    }
+
+
+def make_map(solution: Solution, terrain: Terrain) -> Figure:
+    """The map of a solution, over the ground plan of the scene's box.
+
+    Ellipses hold 95 % of the formal uncertainty, body covariances turned to the world; where they are too
+    small to be seen they are enlarged by a factor that the caption states. A held stop has none.
+    """
+    traverse = solution.traverse
+    stops_R, stops_m = pose_arrays(solution.final.world_T_mast)
+    at = stops_m[:, :2] - terrain.origin_m[:2]
+    decimals = decimals_for(terrain.extent_m) + 1
+    covariance = translation_covariance_in_world(stops_R, solution.stop_covariance)[:, :2, :2]
+    uncertain = np.isfinite(covariance).all(axis=(1, 2)) & (np.trace(covariance, axis1=1, axis2=2) > 0)
+    outlines = ellipse_outlines(covariance[uncertain], _RADIUS_95)
+    largest_m = float(np.linalg.norm(outlines, axis=2).max()) if len(outlines) else 0.0
+    room_m = min(0.05 * terrain.extent_m, 0.45 * near_spacing(stops_m))
+    enlarged = round_factor(room_m / largest_m) if 0 < largest_m < 0.2 * room_m else 1.0
+    traces = [_landmark_trace(terrain), _direction_trace(solution, terrain, 0.9 * room_m)]
+    if len(outlines):
+        x, y = polyline(at[uncertain][:, None] + enlarged * outlines, decimals)
+        times = f", {enlarged:,.0f} times enlarged" if enlarged > 1 else ""
+        traces.append(
+            {
+                "type": "scatter",
+                "mode": "lines",
+                "x": x,
+                "y": y,
+                "fill": "toself",
+                "fillcolor": "rgba(0,114,178,0.22)",
+                "line": {"color": AFTER, "width": 2},
+                "hoverinfo": "skip",
+                "name": f"95 % ellipse{times}",
+            }
+        )
+    names = [escape(s.id) for s in traverse.stops]
+    for name, chosen, symbol in (("stop", uncertain, "circle"), ("stop, held", ~uncertain, "square-open")):
+        rows = np.flatnonzero(chosen).tolist()
+        if rows:
+            traces.append(
+                {
+                    "type": "scatter",
+                    "mode": "markers",
+                    "x": rounded(at[rows, 0], decimals),
+                    "y": rounded(at[rows, 1], decimals),
+                    "marker": {"size": 8, "color": INK, "symbol": symbol, "line": {"width": 2, "color": INK}},
+                    "text": [names[row] for row in rows],
+                    "hovertemplate": "stop %{text}<br>x %{x} m, y %{y} m<extra></extra>",
+                    "name": name,
+                }
+            )
+    labels = [
+        {
+            "x": at[row, 0],
+            "y": at[row, 1] - 1.15 * room_m,
+            "text": names[row],
+            "showarrow": False,
+            "yanchor": "top",
+            "bgcolor": "rgba(255,255,255,0.85)",
+            "borderpad": 1,
+        }
+        for row in label_stops(stops_m, 0.14 * terrain.extent_m)
+    ]
+    low, high = (corner[:2].round(6).tolist() for corner in (terrain.low_m, terrain.high_m))
+    return Figure(
+        id="map",
+        traces=tuple(traces),
+        layout=layout(
+            xaxis=axis("x (m)", range=[low[0], high[0]], zeroline=False),
+            yaxis=axis("y (m)", range=[low[1], high[1]], zeroline=False, scaleanchor="x"),
+            annotations=labels,
+            margin={"l": 60, "r": 15, "t": 32, "b": 110},
+            legend={"orientation": "h", "x": 0, "y": -0.15, "yanchor": "top", "itemsizing": "constant"},
+        ),
+        caption=_caption(terrain, enlarged, largest_m, held=int(np.sum(~uncertain))),
+    )
+
+
+def _caption(terrain: Terrain, enlarged: float, largest_m: float, *, held: int) -> str:
+    parts = ["Seen from above; landmarks in the colours of the scene."]
+    if largest_m > 0:
+        size = f"{short(largest_m * 1000)} mm" if largest_m < 1 else f"{short(largest_m)} m"
+        parts.append(f"Ellipses hold 95 % of a stop's formal uncertainty; the longest half axis is {size}.")
+    if enlarged > 1:
+        parts.append(f"They are drawn {enlarged:,.0f} times larger than they are.")
+    if held:
+        parts.append(
+            "An open square is a stop that is held, or whose uncertainty is not known: it has no ellipse."
+        )
+    if len(terrain.points_m) > _MAX_LANDMARKS:
+        parts.append(f"{_MAX_LANDMARKS:,} landmarks are drawn, evenly chosen.")
+    return " ".join(parts)

@@ -1,0 +1,55 @@
+"""The style sheet of the page."""
+
+__all__ = ["STYLE"]
+
+STYLE = """
+:root {
+  --ink: #1f2933; --muted: #52606d; --line: #d9e0e6; --soft: #f4f6f8; --after: #0072b2; --warn: #8a4b00;
+}
+* { box-sizing: border-box; }
+html { background: #ffffff; color: var(--ink); font: 15px/1.5 system-ui, "Segoe UI", sans-serif; }
+body { max-width: 1640px; margin: 0 auto; padding: 18px 26px 40px; }
+h1 { font-size: 25px; line-height: 1.25; margin: 0 0 4px; overflow-wrap: anywhere; }
+h2 { font-size: 19px; margin: 0 0 4px; }
+p { margin: 0 0 10px; max-width: 130ch; }
+section { margin-top: 30px; }
+.lead { font-size: 16px; overflow-wrap: anywhere; }
+.caption { color: var(--muted); font-size: 14px; margin-top: 6px; overflow-wrap: anywhere; }
+.warnings { border-left: 5px solid #e69f00; background: #fff7e6; padding: 10px 16px; margin: 12px 0; }
+.warnings h2 { font-size: 16px; color: var(--warn); }
+.warnings ul { margin: 0; padding-left: 20px; max-height: 210px; overflow: auto; overflow-wrap: anywhere; }
+.figures { display: grid; grid-template-columns: repeat(auto-fit, minmax(200px, 1fr)); gap: 12px; }
+.figures { margin: 14px 0 0; }
+.figures div { background: var(--soft);
+  border: 1px solid var(--line); border-radius: 6px; padding: 9px 13px; }
+.figures dt { color: var(--muted); font-size: 13px; }
+.figures dd { margin: 0; }
+.figures .value { font-size: 20px; font-weight: 600; line-height: 1.35; font-variant-numeric: tabular-nums; }
+.figures .bad { color: #b54300; }
+.figures .note { color: var(--muted); font-size: 13px; overflow-wrap: anywhere; }
+.pair { display: grid; grid-template-columns: minmax(0, 1fr) minmax(0, 1fr); gap: 26px; }
+@media (max-width: 1000px) { .pair { grid-template-columns: minmax(0, 1fr); } }
+.pair section { min-width: 0; }
+.plot { width: 100%; border: 1px solid var(--line); border-radius: 6px; overflow: hidden; }
+#scene { height: 600px; }
+#map, #histogram { height: 540px; }
+#corrections { height: 520px; }
+.controls { display: flex; flex-wrap: wrap; gap: 8px 18px; align-items: center; margin: 6px 0 8px; }
+.controls select { font: inherit; max-width: 640px; padding: 3px 6px; }
+.scroll { max-height: 440px; overflow: auto; border: 1px solid var(--line); border-radius: 6px; }
+table { border-collapse: collapse; width: 100%; font-size: 13.5px; font-variant-numeric: tabular-nums; }
+th, td { padding: 4px 9px; white-space: nowrap; }
+th { position: sticky; top: 0; background: var(--soft); box-shadow: inset 0 -1px 0 var(--line); }
+th button { font: inherit; font-size: 13px; font-weight: 600; color: inherit; cursor: pointer; }
+th button { background: none; border: 0; padding: 2px 0; }
+th button::after { content: " ↕"; color: #9aa5b1; }
+th[aria-sort=ascending] button::after { content: " ↑"; color: var(--after); }
+th[aria-sort=descending] button::after { content: " ↓"; color: var(--after); }
+td { border-top: 1px solid #eef1f4; }
+.text { text-align: left; }
+.number { text-align: right; }
+tbody tr:hover { background: #eef6fb; }
+.notes li { max-width: 130ch; margin-bottom: 4px; }
+.failed { color: #b54300; padding: 14px; }
+code { font-size: 14px; }
+"""

@@ -1,0 +1,113 @@
+"""Tables of images and stops, as HTML that is read without any script."""
+
+from collections.abc import Sequence
+from html import escape
+
+import gtsam
+import numpy as np
+
+from pancam_graph.geometry import pose_arrays
+from pancam_graph.report._images import ImageResiduals
+from pancam_graph.report._map import translation_covariance_in_world
+from pancam_graph.report._numbers import fixed
+from pancam_graph.solution import Solution
+
+__all__ = ["image_table", "stop_table", "table"]
+
+
+def table(name: str, columns: Sequence[tuple[str, str]], rows: Sequence[Sequence[str]], texts: int) -> str:
+    """A scrollable table whose columns sort when their heads are pressed.
+
+    `columns` are heads and their explanations; the first `texts` columns hold text, the others numbers.
+    Everything is escaped here.
+    """
+    kinds = ["text" if i < texts else "number" for i in range(len(columns))]
+    heads = "".join(
+        f'<th scope="col" class="{kind}">'
+        f'<button type="button" title="{escape(why)}">{escape(head)}</button></th>'
+        for (head, why), kind in zip(columns, kinds, strict=True)
+    )
+    body = "\n".join(
+        "<tr>"
+        + "".join(f'<td class="{k}">{escape(c)}</td>' for c, k in zip(row, kinds, strict=True))
+        + "</tr>"
+        for row in rows
+    )
+    return (
+        f'<div class="scroll" tabindex="0" role="region" aria-label="{escape(name)}">\n'
+        f'<table class="sortable">\n'
+        f"<thead><tr>{heads}</tr></thead>\n<tbody>\n{body}\n</tbody>\n</table>\n</div>"
+    )
+
+
+def image_table(solution: Solution, residuals: Sequence[ImageResiduals]) -> str:
+    """One row per image: what it saw and how well it fits."""
+    traverse = solution.traverse
+    columns = (
+        ("image", "id of the image"),
+        ("stop", "id of its stop"),
+        ("camera", "name of the eye"),
+        ("used", "observations that took part"),
+        ("rejected", "observations left out: outliers, points seen once, points behind a camera"),
+        ("RMS before (px)", "root mean square length of the residuals of the used observations at the start"),
+        ("RMS after (px)", "the same at the end"),
+        ("median after (px)", "median length of the residuals of the used observations at the end"),
+    )
+    rows = [
+        (
+            image.id,
+            traverse.stops[int(stop)].id,
+            image.camera,
+            str(entry.used),
+            str(entry.rejected),
+            fixed(entry.before_px, 3),
+            fixed(entry.after_px, 3),
+            fixed(entry.median_px, 3),
+        )
+        for image, stop, entry in zip(traverse.images, traverse.image_stop, residuals, strict=True)
+    ]
+    return table("Images", columns, rows, texts=3)
+
+
+def stop_table(solution: Solution) -> str:
+    """One row per stop: where it is, how far it moved from its prior, and how sure that is."""
+    traverse = solution.traverse
+    stops_R, stops_m = pose_arrays(solution.final.world_T_mast)
+    in_world = translation_covariance_in_world(stops_R, solution.stop_covariance)
+    sigma_mm = 1e3 * np.sqrt(np.maximum(np.diagonal(in_world, axis1=1, axis2=2), 0))
+    turn = np.sqrt(np.maximum(np.diagonal(solution.stop_covariance[:, :3, :3], axis1=1, axis2=2), 0))
+    columns = (
+        ("stop", "id of the stop"),
+        ("images", "images taken there"),
+        ("x (m)", "position of the mast in the world"),
+        ("y (m)", "position of the mast in the world"),
+        ("z (m)", "position of the mast in the world"),
+        ("shift (mm)", "distance from the position that the input gave"),
+        ("sigma x (mm)", "formal standard deviation along the world's x"),
+        ("sigma y (mm)", "formal standard deviation along the world's y"),
+        ("sigma z (mm)", "formal standard deviation along the world's z"),
+        ("turn (°)", "angle between the orientation that the input gave and the adjusted one"),
+        ("sigma roll (°)", "formal standard deviation of a turn about the mast's x axis"),
+        ("sigma pitch (°)", "formal standard deviation of a turn about the mast's y axis"),
+        ("sigma heading (°)", "formal standard deviation of a turn about the mast's z axis"),
+    )
+    images = np.bincount(traverse.image_stop, minlength=len(traverse.stops))
+    rows = []
+    for row, (stop, pose) in enumerate(zip(traverse.stops, solution.final.world_T_mast, strict=True)):
+        change = stop.world_T_mast.between(pose)
+        angle_rad = float(np.linalg.norm(gtsam.Rot3.Logmap(change.rotation())))
+        held = not np.any(solution.stop_covariance[row])
+        sigmas = ["held"] * 3 if held else [fixed(s, 2) for s in sigma_mm[row]]
+        turns = ["held"] * 3 if held else [fixed(np.rad2deg(s), 4) for s in turn[row]]
+        rows.append(
+            (
+                stop.id,
+                str(int(images[row])),
+                *(fixed(c, 4) for c in stops_m[row]),
+                fixed(1e3 * float(np.linalg.norm(change.translation())), 2),
+                *sigmas,
+                fixed(np.rad2deg(angle_rad), 4),
+                *turns,
+            )
+        )
+    return table("Stops", columns, rows, texts=1)
