@@ -158,7 +158,27 @@ def test_truncated_files_are_refused(tmp_path: Path, suffix: str, share: float) 
             b"PDS_VERSION_ID = PDS3\r\nRECORD_BYTES = 5",
             "a.IMG: expected a label that closes with the line END",
         ),
-        (b"PDS_VERSION_ID = PDS3\r\n)(= = =\r\nEND\r\n", "a.IMG: expected a PDS3 label, found text"),
+        (
+            b"PDS_VERSION_ID = PDS3\r\n)(= = =\r\nEND\r\n",
+            "a.IMG: expected entries of a PDS3 label, found text",
+        ),
+        # What pvl's lenient parser would loop on for ever:
+        (
+            b"PDS_VERSION_ID = PDS3\r\nX = (1.5 )=EL_5 = ( 6\r\nEND\r\n",
+            "a.IMG: expected entries of a PDS3 label",
+        ),
+        (
+            b"PDS_VERSION_ID = PDS3\r\nGROUP = R=A\r\nEND_GROUP = RA\r\nEND\r\n",
+            "a.IMG: expected the end of group R=A, found END_GROUP = RA",
+        ),
+        (
+            b"PDS_VERSION_ID = PDS3\r\nOBJECT = IMAGE /* pixels */\r\nEND\r\n",
+            "a.IMG: expected the end of group IMAGE, found the end of the label",
+        ),
+        (
+            b"PDS_VERSION_ID = PDS3\r\nEND_OBJECT = IMAGE\r\nEND\r\n",
+            "a.IMG: expected the end of group none open, found END_OBJECT = IMAGE",
+        ),
         (b"PDS_VERSION_ID = PDS3\r\nEND\r\n", "a.IMG: expected a group IMAGE, found none"),
         (
             b"PDS_VERSION_ID = PDS3\r\nOBJECT = IMAGE\r\nLINES = 1\r\nEND_OBJECT = IMAGE\r\nEND\r\n",

@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
-import pvl
 from pvl.decoder import OmniDecoder
 from pvl.exceptions import LexerError, ParseError, QuantityError
+from pvl.grammar import OmniGrammar
+from pvl.parser import PVLParser
 
 from pancam_graph.errors import ImageError, InputError
 from pancam_graph.geometry import FloatArray
@@ -25,10 +26,8 @@ __all__ = ["ImageLayout", "LabelGroup", "PdsLabel", "read_label"]
 _MAX_LABEL_BYTES = 1 << 20
 _STARTS = (b"PDS_VERSION_ID", b"ODL_VERSION_ID", b"CCSD3ZF")
 _END = re.compile(rb"^[ \t]*END[ \t]*(?:\r|\n|\x00|\Z)", re.MULTILINE)
-_GROUPS = re.compile(
-    r"^[ \t]*(?P<kind>GROUP|OBJECT)[ \t]*=[ \t]*(?P<name>\w+)[ \t]*\r?$.*?"
-    r"^[ \t]*END_(?P=kind)[ \t]*=[ \t]*(?P=name)[ \t]*\r?$",
-    re.MULTILINE | re.DOTALL,
+_BLOCK = re.compile(
+    r"[ \t]*(?P<end>BEGIN_|END_)?(?P<kind>GROUP|OBJECT)[ \t]*=[ \t]*(?P<name>.*?)[ \t]*(/\*.*\*/)?[ \t]*"
 )
 _WANTED = re.compile(
     r"IMAGE|GEOMETRIC_CAMERA_MODEL(_PARMS)?|(ROVER|PMA|RSM)_(COORD_|COORDINATE_)SYSTEM(_PARMS)?"
@@ -284,28 +283,68 @@ def read_label(file: Path) -> PdsLabel:
         raise InputError(
             f"{label_file}: expected a label that closes with the line END, found none in {len(head)} bytes"
         )
-    text = head[: end.end()].decode("latin-1").rstrip("\x00")
-    # The parser would take 0.4 s for a whole label, 0.05 s for the groups that are used and no dates.
-    text = _GROUPS.sub(lambda match: match[0] if _WANTED.fullmatch(match["name"]) else "", text)
-    try:
-        items = pvl.loads(text, decoder=_decoder())
-    except (ParseError, LexerError, QuantityError, ValueError) as error:
-        first_line = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise InputError(
-            f"{label_file}: expected a PDS3 label, found text that is none: {first_line}"
-        ) from error
+    top, groups = _split_groups(label_file, head[: end.start()].decode("latin-1"))
+    items = _parsed(label_file, top)
+    items |= {name: _parsed(f"{label_file}: {name}", text) for name, text in groups.items()}
     return PdsLabel(file=file, label_file=label_file, top=LabelGroup(str(label_file), items))
 
 
-def _decoder() -> Any:
-    """A decoder that leaves dates as text: trying all their formats takes most of a label's time."""
+def _split_groups(label_file: Path, text: str) -> tuple[str, dict[str, str]]:
+    """Text outside all groups and objects, and the text of each one that is used, nested ones apart.
+
+    pvl's own parser does not come to an end on some broken groups, and takes 0.4 s for a whole label.
+    """
+    top: list[str] = []
+    used: dict[str, list[str]] = {}
+    lines = top
+    stack: list[tuple[str, list[str]]] = []
+    for line in text.replace("\r", "").split("\n"):
+        block = _BLOCK.fullmatch(line)
+        if block is None:
+            lines.append(line)
+        elif block["end"] == "END_":
+            name, outer = stack.pop() if stack else ("none open", top)
+            if block["name"].upper() != name:
+                found = f"END_{block['kind']} = {block['name']}"
+                raise InputError(f"{label_file}: expected the end of group {name}, found {found}")
+            lines = outer
+        else:
+            name = block["name"].upper()
+            stack.append((name, lines))
+            lines = []
+            if _WANTED.fullmatch(name):
+                lines = used.setdefault(name, lines)
+    if stack:
+        raise InputError(
+            f"{label_file}: expected the end of group {stack[-1][0]}, found the end of the label"
+        )
+    return "\n".join(top), {name: "\n".join(body) for name, body in used.items()}
+
+
+def _parsed(where: Path | str, text: str) -> dict[str, Any]:
+    """Entries of text without groups; of an entry that is there twice, the first."""
+    try:
+        module = _parser().parse(text + "\nEND\n")
+    except (ParseError, LexerError, QuantityError, ValueError, StopIteration) as error:
+        first_line = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise InputError(
+            f"{where}: expected entries of a PDS3 label, found text that is none: {first_line}"
+        ) from error
+    return dict(reversed(list(module.items())))
+
+
+def _parser() -> Any:
+    """A parser that accepts all dialects, but raises where the lenient one of pvl would loop for ever.
+
+    It leaves dates as text: trying all their formats takes most of a label's time.
+    """
 
     def no_date(value: str) -> NoReturn:
         raise ValueError(value)
 
     decoder = OmniDecoder()
     decoder.decode_datetime = no_date
-    return decoder
+    return PVLParser(grammar=OmniGrammar(), decoder=decoder)
 
 
 def _head(file: Path) -> bytes:
