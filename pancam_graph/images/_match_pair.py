@@ -1,0 +1,89 @@
+"""All that happens to one pair of images: match, correct the geometry, match again, verify."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from pancam_graph.geometry import BoolArray, FloatArray
+from pancam_graph.images._features import Features
+from pancam_graph.images._match import Matches, match_in_windows
+from pancam_graph.images._options import FrontEndOptions
+from pancam_graph.images._pairs import PairGeometry, Segments
+from pancam_graph.images._verify import PairFit, epipolar_px, fit_pair
+
+__all__ = ["match_pair"]
+
+_TRUE_PX = 1.0
+_CHANCE_SIGMAS = 4.0
+_HORIZON_RAD = np.deg2rad(3.0)
+_DECK_PX = 3.0
+
+
+def match_pair(
+    pair: PairGeometry, features_a: Features, features_b: Features, options: FrontEndOptions
+) -> Matches:
+    """Verified matches of two images; none where what agrees could as well be chance.
+
+    First the windows are as wide as telemetry is uncertain. The matches found correct the pair's geometry;
+    then the windows are as wide as the correction is uncertain, which finds more matches, and the same ones
+    wherever the pointing started from.
+    """
+    nothing = Matches.none()
+    start = PairFit(p=np.zeros(len(pair.sigma)), root=np.diag(pair.sigma))
+    segments = pair.segments(features_a.uv_px, start.p, start.root, options.search_slack_px, options)
+    matches = _search(pair, features_a, features_b, segments, options)
+    if len(matches) < options.min_pair_matches:
+        return nothing
+    half_width = segments.far_radius_px[matches.a]
+    uv_a, uv_b = features_a.uv_px[matches.a], features_b.uv_px[matches.b]
+    fit = fit_pair(pair, uv_a, uv_b, start, float(half_width.max()), options)
+    distance, _ = epipolar_px(pair, fit.p, uv_a, uv_b, options)
+    # Wrong matches lie anywhere in their windows: so many would agree by chance.
+    chance = np.minimum(1.0, _TRUE_PX * np.hypot(1.0, segments.magnification[matches.a]) / half_width)
+    expected, spread = float(chance.sum()), float(np.sqrt(np.sum(chance * (1 - chance))))
+    agreeing = np.count_nonzero(distance < _TRUE_PX)
+    if agreeing < max(options.min_pair_matches, expected + _CHANCE_SIGMAS * spread):
+        return nothing
+
+    segments = pair.segments(features_a.uv_px, fit.p, fit.root, options.guided_slack_px, options)
+    matches = _search(pair, features_a, features_b, segments, options)
+    if len(matches) < options.min_pair_matches:
+        return nothing
+    uv_a, uv_b = features_a.uv_px[matches.a], features_b.uv_px[matches.b]
+    fit = fit_pair(pair, uv_a, uv_b, fit, options.guided_slack_px, options)
+    distance, _ = epipolar_px(pair, fit.p, uv_a, uv_b, options)
+    matches = matches.select(distance < _threshold_px(distance, options))
+    return matches if len(matches) >= options.min_pair_matches else nothing
+
+
+def _threshold_px(distance_px: FloatArray, options: FrontEndOptions) -> float:
+    # The median of |x| over a Gaussian is 0.6745 sigma. Matches that are all exact keep what rounding moves.
+    scale = float(np.median(distance_px)) / 0.6745
+    return min(max(options.epipolar_scales * scale, options.sigma_px), options.max_epipolar_px)
+
+
+def _search(
+    pair: PairGeometry,
+    features_a: Features,
+    features_b: Features,
+    segments: Segments,
+    options: FrontEndOptions,
+) -> Matches:
+    matches = match_in_windows(features_a, features_b, segments, options)
+    if pair.same_stop or not len(matches):
+        return matches
+    uv_a, uv_b = features_a.uv_px[matches.a], features_b.uv_px[matches.b]
+    return matches.select(~_on_rover(pair, uv_a, uv_b, options))
+
+
+def _on_rover(pair: PairGeometry, uv_a: FloatArray, uv_b: FloatArray, options: FrontEndOptions) -> BoolArray:
+    """Which matches (n,) of two stops stand still relative to the mast: the rover itself.
+
+    A match stands still if, within the pointing's uncertainty, it lies where a point fixed to the mast
+    would, at any depth. Distant terrain does so too where the rover has not turned between the stops, so
+    what is seen near or above the horizon is taken for terrain; an antenna that rises so high is not
+    recognised.
+    """
+    fixed = replace(pair, rover_fixed=True)
+    still = fixed.segments(uv_a, np.zeros(len(fixed.sigma)), np.diag(fixed.sigma), _DECK_PX, options)
+    return np.asarray(still.holds(uv_b) & (pair.elevation_rad(uv_a) < -_HORIZON_RAD))

@@ -1,0 +1,59 @@
+"""Options of the image front end."""
+
+from dataclasses import dataclass, fields
+
+from pancam_graph.errors import InputError
+
+__all__ = ["FrontEndOptions"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrontEndOptions:
+    """How observations are found in images. The defaults suit mast cameras over natural terrain.
+
+    Raises InputError for a number that is not above 0, and for a ratio of 1 or more.
+    """
+
+    tile_px: float = 64.0
+    """Size of the tiles over which brightness and contrast are evened out."""
+    max_contrast_gain: float = 4.0
+    """How much contrast is raised at most; more finds more features in haze, and more noise."""
+    contrast_threshold: float = 0.01
+    """SIFT's; lower finds fainter features."""
+    max_features: int = 20_000
+    """The strongest features kept per image, evenly over a grid of cells."""
+    min_depth_m: float = 0.5
+    """Nothing nearer than this is matched."""
+    search_sigmas: float = 4.0
+    """How many standard deviations of the telemetry the search window reaches."""
+    search_slack_px: float = 3.0
+    """Added to the search window: what telemetry's sigma does not stand for."""
+    mount_sigma_rad: float = 1.05e-3
+    """How well an eye's orientation on the head is known, twist and flex of the mast included."""
+    ratio: float = 0.85
+    """Largest distance of a match's descriptors relative to the best other candidate in the window."""
+    max_descriptor_distance: float = 0.5
+    """Largest distance between a match's descriptors, which have unit length."""
+    guided_slack_px: float = 2.0
+    """Half width of the window of the second search, along the epipolar segments that the first one found."""
+    max_epipolar_px: float = 1.5
+    """A match further than this from its epipolar segment is rejected, whatever the scatter of the others."""
+    epipolar_scales: float = 4.0
+    """A match is rejected further than this many robust standard deviations from its epipolar segment."""
+    min_pair_matches: int = 12
+    """A pair of images with fewer verified matches gives none."""
+    sigma_px: float = 0.2
+    """Standard deviation of each coordinate of a feature of size 0: a guess, which a solve rescales."""
+    sigma_per_size: float = 0.03
+    """What a feature's diameter adds to its standard deviation, in quadrature, as a share of the diameter."""
+    refined_sigma_px: float = 0.12
+    """Standard deviation of positions that least-squares matching refined."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if not value > 0:
+                raise InputError(f"FrontEndOptions: {entry.name}: expected a number above 0, found {value}")
+        if self.ratio >= 1:
+            raise InputError(f"FrontEndOptions: ratio: expected a number below 1, found {self.ratio}")

@@ -1,0 +1,73 @@
+"""From matches of pairs to tracks: one number for each terrain point."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pancam_graph.geometry import FloatArray, IntArray
+
+__all__ = ["Links", "join_tracks"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Links:
+    """Matches over all pairs of images: a feature of one image is the same thing as one of another."""
+
+    image_a: IntArray
+    """(n,)"""
+    feature_a: IntArray
+    """(n,)"""
+    image_b: IntArray
+    """(n,)"""
+    feature_b: IntArray
+    """(n,)"""
+    distance: FloatArray
+    """(n,) how unlike the two are; smaller is trusted more."""
+
+    @staticmethod
+    def concatenate(parts: "list[Links]") -> "Links":
+        """The links of several pairs in one."""
+        names = ("image_a", "feature_a", "image_b", "feature_b")
+        empty = np.empty(0, dtype=np.int64)
+        columns = {n: np.concatenate([empty, *(getattr(p, n) for p in parts)]) for n in names}
+        return Links(**columns, distance=np.concatenate([np.empty(0), *(p.distance for p in parts)]))
+
+
+def join_tracks(links: Links) -> tuple[IntArray, IntArray, IntArray]:
+    """Join links to tracks that hold at most one feature of each image.
+
+    Links are taken best first (ties: in the order of their images and features). One that would put two
+    features of an image into a track is refused, and only it: both its ends stay in the tracks they have.
+    So of two features that compete for a track the worse one leaves, alone or with what hangs on it, and
+    never the whole track. Returns columns `image`, `feature`, `track` of equal length, sorted by track,
+    then image; tracks are numbered from 0 in the order of their first image and feature.
+    """
+    ends = np.concatenate(
+        [
+            np.column_stack([links.image_a, links.feature_a]),
+            np.column_stack([links.image_b, links.feature_b]),
+        ]
+    )
+    if not len(ends):
+        return ends[:, 0], ends[:, 0], ends[:, 0]
+    nodes, index = np.unique(ends, axis=0, return_inverse=True)
+    from_node, to_node = index.reshape(2, -1)
+    order = np.lexsort((to_node, from_node, links.distance))
+    track_of = list(range(len(nodes)))
+    members = [[i] for i in range(len(nodes))]
+    images = [{int(i)} for i in nodes[:, 0]]
+    for i, j in zip(from_node[order].tolist(), to_node[order].tolist(), strict=True):
+        keep, gone = sorted((track_of[i], track_of[j]), key=lambda k: (-len(members[k]), k))
+        if keep == gone or not images[keep].isdisjoint(images[gone]):
+            continue
+        for member in members[gone]:
+            track_of[member] = keep
+        members[keep] += members[gone]
+        images[keep] |= images[gone]
+        members[gone] = []
+    # Nodes are sorted by image and feature, so a track's first node is its lowest.
+    tracks = [sorted(m) for m in members if len(m) > 1]
+    tracks.sort(key=lambda m: m[0])
+    rows = np.array([i for m in tracks for i in m], dtype=np.int64)
+    number = np.repeat(np.arange(len(tracks), dtype=np.int64), [len(m) for m in tracks])
+    return nodes[rows, 0], nodes[rows, 1], number

@@ -1,0 +1,183 @@
+"""Robust correction of a pair's relative geometry, and each match's distance from its epipolar line."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pancam_graph.geometry import FloatArray
+from pancam_graph.images._options import FrontEndOptions
+from pancam_graph.images._pairs import FAR_M, PairGeometry
+
+__all__ = ["PairFit", "epipolar_px", "fit_pair"]
+
+_STEPS_PER_OCTAVE = 2
+_FINAL_STEPS = 4
+_MAX_SAMPLE = 1500
+_NOISE_PX = 0.3
+_FINEST_SCALE_PX = 0.5
+_DEPTH_CANDIDATES = 7
+_DEPTH_STEPS = 2
+_FINAL_DEPTH_STEPS = 6
+_DIFFERENCE = 1e-3
+_MIN_PARALLAX_PX = 0.05
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PairFit:
+    """Corrections of a pair's geometry (see `PairGeometry`) that its matches ask for."""
+
+    p: FloatArray
+    """Corrections."""
+    root: FloatArray
+    """Square root of their covariance, `root @ root.T`."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Lines:
+    """Lines of sight of n features of a, and where b saw the same things."""
+
+    origin_m: FloatArray
+    direction: FloatArray
+    uv_b: FloatArray
+    noise: FloatArray
+    """(n,) what noise of one pixel per coordinate in both images amounts to in b."""
+
+    @staticmethod
+    def of(geometry: PairGeometry, uv_a: FloatArray, uv_b: FloatArray) -> "_Lines":
+        rays = geometry.camera_a.unproject(uv_a)
+        return _Lines(
+            origin_m=rays.origin_m,
+            direction=rays.direction,
+            uv_b=uv_b,
+            noise=np.hypot(1.0, geometry.magnification(uv_a)),
+        )
+
+    def points_m(self, inverse_depth: FloatArray) -> FloatArray:
+        return self.origin_m + self.direction / np.maximum(inverse_depth, 1 / FAR_M)[:, None]
+
+    def residual_px(self, geometry: PairGeometry, p: FloatArray, inverse_depth: FloatArray) -> FloatArray:
+        return self.uv_b - geometry.transfer(self.points_m(inverse_depth), p)[0]
+
+
+def fit_pair(
+    geometry: PairGeometry,
+    uv_a: FloatArray,
+    uv_b: FloatArray,
+    start: PairFit,
+    start_scale_px: float,
+    options: FrontEndOptions,
+) -> PairFit:
+    """Corrections that bring most matches onto their epipolar lines, against the prior of the telemetry.
+
+    `uv_a`, `uv_b` are (n, 2) matched pixels, of which many may be wrong: weights follow Geman and McClure
+    with a scale that shrinks from `start_scale_px` to half a pixel (graduated non-convexity: Blake and
+    Zisserman 1987), so that nothing is drawn at random. The prior is centred on p = 0 with
+    `geometry.sigma`; `start.p` is only the start.
+    """
+    every = max(1, -(-len(uv_a) // _MAX_SAMPLE))
+    lines = _Lines.of(geometry, uv_a[::every], uv_b[::every])
+    prior = np.diag(geometry.sigma)[:, geometry.sigma > 0]
+    columns = prior.shape[1]
+    q = np.linalg.lstsq(prior, start.p, rcond=None)[0]
+    octaves = max(0.0, float(np.log2(start_scale_px / _FINEST_SCALE_PX)))
+    shrinking = start_scale_px * 0.5 ** np.arange(0, octaves, 1 / _STEPS_PER_OCTAVE)
+    information = np.eye(columns)
+    inverse_depth = _nearest_candidate(geometry, prior @ q, lines, options)
+    for scale in [*shrinking, *[_FINEST_SCALE_PX] * _FINAL_STEPS]:
+        p = prior @ q
+        inverse_depth = _refine_depths(geometry, p, lines, inverse_depth, options, _DEPTH_STEPS)
+        residual, across = _across(geometry, p, lines, inverse_depth, options)
+        jacobian = np.empty((len(residual), 2, columns))
+        for k in range(columns):
+            moved = lines.residual_px(geometry, p + _DIFFERENCE * prior[:, k], inverse_depth)
+            jacobian[:, :, k] = (moved - residual) / _DIFFERENCE
+        r = np.einsum("nij,nj->ni", across, residual) / lines.noise[:, None]
+        J = across @ jacobian / lines.noise[:, None, None]
+        weight = (scale**2 / (scale**2 + np.sum(r * r, axis=1))) ** 2 / _NOISE_PX**2
+        information = np.eye(columns) + np.einsum("n,nik,nil->kl", weight, J, J)
+        gradient = q + np.einsum("n,nik,ni->k", weight, J, r)
+        q = q - np.linalg.solve(information, gradient)
+    return PairFit(p=prior @ q, root=prior @ np.linalg.inv(np.linalg.cholesky(information)).T)
+
+
+def epipolar_px(
+    geometry: PairGeometry, p: FloatArray, uv_a: FloatArray, uv_b: FloatArray, options: FrontEndOptions
+) -> tuple[FloatArray, FloatArray]:
+    """How far matched pixels (n, 2) are from agreeing, at the corrections p, and at which inverse depths.
+
+    The distance (n,) is that of the pixel in b from the line of sight of the pixel in a, whose depth may
+    be anything from `options.min_depth_m` to infinity; it is divided by what one pixel of noise in both
+    images would cause. Inverse depths (n,) are per metre from camera a.
+    """
+    lines = _Lines.of(geometry, uv_a, uv_b)
+    inverse_depth = _nearest_candidate(geometry, p, lines, options)
+    inverse_depth = _refine_depths(geometry, p, lines, inverse_depth, options, _FINAL_DEPTH_STEPS)
+    residual, across = _across(geometry, p, lines, inverse_depth, options)
+    return np.linalg.norm(np.einsum("nij,nj->ni", across, residual), axis=1) / lines.noise, inverse_depth
+
+
+def _nearest_candidate(
+    geometry: PairGeometry, p: FloatArray, lines: _Lines, options: FrontEndOptions
+) -> FloatArray:
+    """Inverse depths (n,), out of a few, whose pixels in b are nearest to the matched ones."""
+    best, best_distance = np.zeros(len(lines.uv_b)), np.full(len(lines.uv_b), np.inf)
+    for candidate in np.linspace(0, 1, _DEPTH_CANDIDATES) ** 2 / options.min_depth_m:
+        trial = np.full(len(best), candidate)
+        pixel, seen = geometry.transfer(lines.points_m(trial), p)
+        distance = np.where(seen, np.linalg.norm(lines.uv_b - pixel, axis=1), np.inf)
+        better = distance < best_distance
+        best[better], best_distance[better] = candidate, distance[better]
+    return best
+
+
+def _refine_depths(
+    geometry: PairGeometry,
+    p: FloatArray,
+    lines: _Lines,
+    inverse_depth: FloatArray,
+    options: FrontEndOptions,
+    steps: int,
+) -> FloatArray:
+    """Inverse depths (n,) after some Gauss-Newton steps towards the matched pixels, infinity to nearest."""
+    nearest = 1 / options.min_depth_m
+    for _ in range(steps):
+        residual, slope = _along(geometry, p, lines, inverse_depth, options)
+        length2 = np.maximum(np.einsum("ni,ni->n", slope, slope), 1e-12)
+        step = np.clip(-np.einsum("ni,ni->n", slope, residual) / length2, -nearest / 3, nearest / 3)
+        inverse_depth = np.clip(inverse_depth + step, 0.0, nearest)
+    return inverse_depth
+
+
+def _along(
+    geometry: PairGeometry,
+    p: FloatArray,
+    lines: _Lines,
+    inverse_depth: FloatArray,
+    options: FrontEndOptions,
+) -> tuple[FloatArray, FloatArray]:
+    """Residuals (n, 2) and their derivative (n, 2) by the inverse depth."""
+    step = _DIFFERENCE / options.min_depth_m
+    residual = lines.residual_px(geometry, p, inverse_depth)
+    return residual, (lines.residual_px(geometry, p, inverse_depth + step) - residual) / step
+
+
+def _across(
+    geometry: PairGeometry,
+    p: FloatArray,
+    lines: _Lines,
+    inverse_depth: FloatArray,
+    options: FrontEndOptions,
+) -> tuple[FloatArray, FloatArray]:
+    """Residuals (n, 2) and the projection (n, 2, 2) onto what no change of depth can mend.
+
+    That is the component across the epipolar line; both components where the depth is at the end of its
+    range or moves nothing (no baseline).
+    """
+    residual, slope = _along(geometry, p, lines, inverse_depth, options)
+    nearest = 1 / options.min_depth_m
+    length = np.linalg.norm(slope, axis=1)
+    downhill = np.einsum("ni,ni->n", slope, residual)
+    stuck = ((inverse_depth <= 0) & (downhill > 0)) | ((inverse_depth >= nearest) & (downhill < 0))
+    stuck |= length * nearest < _MIN_PARALLAX_PX
+    unit = np.where(stuck[:, None], 0.0, slope / np.maximum(length, 1e-12)[:, None])
+    return residual, np.eye(2) - unit[:, :, None] * unit[:, None, :]
