@@ -20,7 +20,7 @@ from pancam_graph.geometry import FloatArray, rz
 from pancam_graph.report import write_report
 from pancam_graph.report._figures import histogram_edges, make_corrections, make_histogram
 from pancam_graph.report._images import choose_images, image_residuals, magnification, vector_panels
-from pancam_graph.report._map import ellipse_outlines, make_map, translation_covariance_in_world
+from pancam_graph.report._map import ellipse_outlines, make_map, place_labels, translation_covariance_in_world
 from pancam_graph.report._numbers import round_factor, rounded, short, thinned
 from pancam_graph.report._page import headline, lead, make_page
 from pancam_graph.report._scene import eye_circles, label_stops, make_masts, make_scene
@@ -543,6 +543,19 @@ def test_labels_keep_their_distance() -> None:
     assert label_stops(stops, 2.5) == [0, 3, 6, 9]
 
 
+def test_map_labels_cover_neither_stops_nor_labels() -> None:
+    rng = np.random.default_rng(5)
+    stops, half = rng.uniform(0, 30, (40, 2)), np.array([2.0, 0.5])
+    placed = place_labels(stops, [2 * half] * len(stops), clear_m=0.6)
+    assert 10 < len(placed) < 40
+    for row, centre in placed.items():
+        assert not np.any(np.all(np.abs(stops - centre) < half, axis=1))
+        for other, at in placed.items():
+            assert other == row or np.any(np.abs(at - centre) >= 2 * half - 1e-9)
+    alone = place_labels(np.zeros((1, 2)), [2 * half], clear_m=0.6)
+    np.testing.assert_allclose(alone[0], [0.0, -1.1])
+
+
 @pytest.mark.parametrize(
     ("wanted", "found"), [(0.3, 1), (1, 1), (1.99, 1), (2, 2), (9.9, 5), (10, 10), (730, 500), (np.inf, 1)]
 )
@@ -562,7 +575,8 @@ def test_magnification_of_round_off_is_one() -> None:
         (0.41234, "0.412"),
         (12345.6, "12,346"),
         (1000.4, "1,000"),
-        (2.5e-9, "2.5·10⁻⁹"),
+        (2.5e-9, "2.50·10⁻⁹"),
+        (97_036_128.0, "9.70·10⁷"),
         (float("nan"), "\N{EN DASH}"),
         (150.2, "150"),
     ],

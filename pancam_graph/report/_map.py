@@ -7,14 +7,16 @@ import numpy as np
 from pancam_graph.geometry import FloatArray, pose_arrays
 from pancam_graph.report._look import AFTER, BEFORE, INK, RESIDUAL_SCALE, Figure, axis, layout
 from pancam_graph.report._numbers import Json, decimals_for, polyline, round_factor, rounded, short, thinned
-from pancam_graph.report._scene import label_stops, near_spacing
+from pancam_graph.report._scene import near_spacing
 from pancam_graph.report._terrain import Terrain
 from pancam_graph.solution import Solution
 
-__all__ = ["ellipse_outlines", "make_map", "translation_covariance_in_world"]
+__all__ = ["ellipse_outlines", "make_map", "place_labels", "translation_covariance_in_world"]
 
 _MAX_LANDMARKS = 4_000
 _ELLIPSE_STEPS = 48
+_WIDTH_PX = 480
+"""Least width of the map's drawing area at laptop size, for the room that labels need."""
 _RADIUS_95 = float(np.sqrt(-2 * np.log(1 - 0.95)))
 """Radius, in standard deviations, of the ellipse that holds 95 % of a plane normal distribution."""
 
@@ -38,6 +40,26 @@ def ellipse_outlines(covariance_m2: FloatArray, radius: float) -> FloatArray:
     value, vector = np.linalg.eigh(covariance_m2)
     half_axes = vector * np.sqrt(np.maximum(value, 0.0))[:, None, :]
     return np.asarray(radius * circle @ np.swapaxes(half_axes, 1, 2))
+
+
+def place_labels(at_m: FloatArray, sizes_m: list[FloatArray], *, clear_m: float) -> dict[int, FloatArray]:
+    """Centres of the labels of stops (n, 2), by row, so that none covers a stop or another label.
+
+    A label of size (width, height) goes below, above, right or left of its stop, `clear_m` away; one
+    that has room nowhere is left out.
+    """
+    placed: dict[int, FloatArray] = {}
+    for row, (stop, size) in enumerate(zip(at_m, sizes_m, strict=True)):
+        up, right = np.array([0.0, clear_m + size[1] / 2]), np.array([clear_m + size[0] / 2, 0.0])
+        for centre in (stop - up, stop + up, stop + right, stop - right):
+            covers_stop = np.any(np.all(np.abs(at_m - centre) < size / 2 + 0.25 * clear_m, axis=1))
+            covers_label = any(
+                np.all(np.abs(other - centre) < (size + sizes_m[i]) / 2) for i, other in placed.items()
+            )
+            if not covers_stop and not covers_label:
+                placed[row] = centre
+                break
+    return placed
 
 
 def _landmark_trace(terrain: Terrain) -> Json:
@@ -134,17 +156,18 @@ def make_map(solution: Solution, terrain: Terrain) -> Figure:
                     "name": name,
                 }
             )
+    px_m = _WIDTH_PX / terrain.extent_m
+    sizes = [np.array([7.5 * len(s.id) + 6, 19.0]) / px_m for s in traverse.stops]
     labels = [
         {
-            "x": at[row, 0],
-            "y": at[row, 1] - 1.15 * room_m,
+            "x": round(float(x), 4),
+            "y": round(float(y), 4),
             "text": names[row],
             "showarrow": False,
-            "yanchor": "top",
             "bgcolor": "rgba(255,255,255,0.85)",
             "borderpad": 1,
         }
-        for row in label_stops(stops_m, 0.14 * terrain.extent_m)
+        for row, (x, y) in place_labels(at, sizes, clear_m=1.1 * room_m).items()
     ]
     low, high = (corner[:2].round(6).tolist() for corner in (terrain.low_m, terrain.high_m))
     return Figure(

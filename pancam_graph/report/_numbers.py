@@ -81,8 +81,8 @@ def short(value: float) -> str:
     size = abs(value)
     if size == 0:
         return "0"
-    if size < 1e-3 or size >= 1e9:
-        mantissa, exponent = f"{value:.1e}".split("e")
+    if size < 1e-3 or size >= 1e6:
+        mantissa, exponent = f"{value:.2e}".split("e")
         return f"{mantissa}·10{str(int(exponent)).translate(_SUPERSCRIPT)}"
     if size >= 999.5:
         return f"{value:,.0f}"

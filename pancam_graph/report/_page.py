@@ -99,10 +99,13 @@ def headline(solution: Solution) -> list[tuple[str, str, str, bool]]:
     used = int(solution.used.sum())
     rejected = len(solution.used) - used
     whys = [why for ok, why in zip(solution.used.tolist(), solution.reason, strict=True) if not ok]
-    remark = ", ".join(f"{whys.count(why):,} {_REASONS.get(why, why)}" for why in sorted(set(whys)) if why)
+    kinds = sorted({why for why in whys if why})
+    remark = ", ".join(f"{whys.count(why):,} {_REASONS.get(why, why)}" for why in kinds)
+    if len(kinds) == 1:
+        remark = _REASONS.get(kinds[0], kinds[0])
     seconds = solution.seconds
     parts = (("reading", seconds.read), ("start", seconds.initialise), ("solving", seconds.solve))
-    share = f"{100 * rejected / max(len(solution.used), 1):.1f} % rejected"
+    share = 100 * rejected / max(len(solution.used), 1)
     return [
         (
             "residual, RMS",
@@ -119,7 +122,7 @@ def headline(solution: Solution) -> list[tuple[str, str, str, bool]]:
         (
             "observations",
             f"{used:,} used",
-            f"{rejected:,} rejected ({share.removesuffix(' rejected')}){': ' + remark if remark else ''}",
+            f"{rejected:,} rejected ({share:.1f} %){': ' + remark if remark else ''}",
             used == 0,
         ),
         (

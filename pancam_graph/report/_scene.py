@@ -257,11 +257,14 @@ def _landmark_trace(solution: Solution, terrain: Terrain) -> Json:
 def _view(name: str, low: FloatArray, high: FloatArray, *, true_size: bool) -> Json:
     """Ranges and shape of a view, all axes to one scale."""
     side = high - low
-    ratio = (0.95 if true_size else 1.25) * side / side.max()
+    # A long and narrow scene is seen across and has room to be larger.
+    wide = 0.8 if true_size else 1.25 + 0.4 * (1 - side[:2].min() / side[:2].max())
+    ratio = wide * side / side.max()
     return {
         "name": name,
         "true_size": true_size,
         "range": [[float(f"{a:.6g}"), float(f"{b:.6g}")] for a, b in zip(low, high, strict=True)],
+        "ticks": np.maximum(4, np.round(9 * side / side.max())).astype(int).tolist(),
         "ratio": dict(zip("xyz", np.round(ratio, 4).tolist(), strict=True)),
     }
 
@@ -269,8 +272,8 @@ def _view(name: str, low: FloatArray, high: FloatArray, *, true_size: bool) -> J
 def _camera(side: FloatArray) -> Json:
     """Where the reader looks from at first: from above, across the longer horizontal side (3,)."""
     across = np.array([side[1], side[0]]) + 0.25 * side[:2].max()
-    x, y = -1.27 * across / np.linalg.norm(across)
-    lower = -0.16 * side[:2].min() / side[:2].max()
+    x, y = -1.32 * across / np.linalg.norm(across)
+    lower = -0.21 * side[:2].min() / side[:2].max()
     return {
         "eye": {"x": round(float(x), 3), "y": round(float(y), 3), "z": 0.6},
         "center": {"x": 0.0, "y": 0.0, "z": round(float(lower), 3)},
@@ -305,10 +308,10 @@ def make_scene(solution: Solution, terrain: Terrain, masts: Masts) -> tuple[Figu
             "gridcolor": GRID,
             "zerolinecolor": GRID,
             "showbackground": False,
-            "nticks": 6 if name == "z" else 9,
+            "nticks": ticks,
             "showspikes": False,
         }
-        for name, bounds in zip("xyz", first["range"], strict=True)
+        for name, bounds, ticks in zip("xyz", first["range"], first["ticks"], strict=True)
     }
     figure = Figure(
         id="scene",

@@ -20,13 +20,19 @@ function filled(select, names) {
 }
 
 function drawScene(page) {
-  const roles = page.figures.find((figure) => figure.id === "scene").data.map((trace) => trace.meta);
+  const scene = page.figures.find((figure) => figure.id === "scene");
+  const roles = scene.data.map((trace) => trace.meta);
+  const labels = structuredClone(scene.layout.scene.annotations);
   const select = filled(document.getElementById("scene-view"), page.views.map((view) => view.name));
   select.addEventListener("change", () => {
     const view = page.views[Number(select.value)];
     const hidden = view.true_size ? "far" : "near";
-    const layout = { "scene.aspectratio": view.ratio };
-    ["x", "y", "z"].forEach((name, i) => { layout[`scene.${name}axis.range`] = view.range[i]; });
+    // Close to one mast its name would only hide it.
+    const layout = { "scene.aspectratio": view.ratio, "scene.annotations": view.true_size ? [] : labels };
+    ["x", "y", "z"].forEach((name, i) => {
+      layout[`scene.${name}axis.range`] = view.range[i];
+      layout[`scene.${name}axis.nticks`] = view.ticks[i];
+    });
     Plotly.update("scene", { visible: roles.map((role) => role !== hidden) }, layout);
   });
 }

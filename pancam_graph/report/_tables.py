@@ -14,6 +14,8 @@ from pancam_graph.solution import Solution
 
 __all__ = ["image_table", "stop_table", "table"]
 
+_SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
+
 
 def table(name: str, columns: Sequence[tuple[str, str]], rows: Sequence[Sequence[str]], texts: int) -> str:
     """A scrollable table whose columns sort when their heads are pressed.
@@ -78,20 +80,18 @@ def stop_table(solution: Solution) -> str:
     turn = np.sqrt(np.maximum(np.diagonal(solution.stop_covariance[:, :3, :3], axis1=1, axis2=2), 0))
     columns = (
         ("stop", "id of the stop"),
-        ("images", "images taken there"),
         ("x (m)", "position of the mast in the world"),
         ("y (m)", "position of the mast in the world"),
         ("z (m)", "position of the mast in the world"),
         ("shift (mm)", "distance from the position that the input gave"),
-        ("sigma x (mm)", "formal standard deviation along the world's x"),
-        ("sigma y (mm)", "formal standard deviation along the world's y"),
-        ("sigma z (mm)", "formal standard deviation along the world's z"),
+        (f"{_SIGMA} x (mm)", "formal standard deviation along the world's x"),
+        (f"{_SIGMA} y (mm)", "formal standard deviation along the world's y"),
+        (f"{_SIGMA} z (mm)", "formal standard deviation along the world's z"),
         ("turn (°)", "angle between the orientation that the input gave and the adjusted one"),
-        ("sigma roll (°)", "formal standard deviation of a turn about the mast's x axis"),
-        ("sigma pitch (°)", "formal standard deviation of a turn about the mast's y axis"),
-        ("sigma heading (°)", "formal standard deviation of a turn about the mast's z axis"),
+        (f"{_SIGMA} roll (°)", "formal standard deviation of a turn about the mast's x axis"),
+        (f"{_SIGMA} pitch (°)", "formal standard deviation of a turn about the mast's y axis"),
+        (f"{_SIGMA} heading (°)", "formal standard deviation of a turn about the mast's z axis"),
     )
-    images = np.bincount(traverse.image_stop, minlength=len(traverse.stops))
     rows = []
     for row, (stop, pose) in enumerate(zip(traverse.stops, solution.final.world_T_mast, strict=True)):
         change = stop.world_T_mast.between(pose)
@@ -102,7 +102,6 @@ def stop_table(solution: Solution) -> str:
         rows.append(
             (
                 stop.id,
-                str(int(images[row])),
                 *(fixed(c, 4) for c in stops_m[row]),
                 fixed(1e3 * float(np.linalg.norm(change.translation())), 2),
                 *sigmas,
