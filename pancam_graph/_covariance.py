@@ -73,7 +73,7 @@ class _JointCovariance:
 
 
 def _pointing_sigma(template: FactorTemplate, joint: _JointCovariance, state: State) -> FloatArray:
-    """Sigmas of pan and tilt as a frame's camera poses give them, the mean over its eyes, in the mast frame."""
+    """Sigmas of pan and tilt as a frame's camera poses give them, as the mean over its eyes."""
     t = template.traverse
     variance = np.zeros((len(t.frames), 2))
     for frame in range(len(t.frames)):

@@ -11,6 +11,8 @@ from pancam_graph.errors import SolveError
 __all__ = ["Iteration", "Outcome", "StopRule", "linear_step", "optimise"]
 
 _LOG = logging.getLogger(__name__)
+_INDETERMINATE = "ndeterminate"
+"""Part of GTSAM's message for a system without a unique solution."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +62,7 @@ def optimise(
     """
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setlambdaUpperBound(1e10)
-    parameters.setLinearSolverType(_solver(by_qr))
+    _set_elimination(parameters, graph, values, by_qr=by_qr)
     try:
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
         costs = [optimizer.error()]
@@ -86,29 +88,44 @@ def optimise(
     return Outcome(values=optimizer.values(), converged=converged, reason=reason, costs=tuple(costs))
 
 
-def linear_step(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, *, by_qr: bool = False
-) -> gtsam.VectorValues:
+def linear_step(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.VectorValues:
     """The Gauss-Newton step of the graph at the values. Raises SolveError where it is not determined."""
-    parameters = gtsam.GaussNewtonParams()
-    parameters.setLinearSolverType(_solver(by_qr))
-    try:
-        optimizer = gtsam.GaussNewtonOptimizer(graph, values, parameters)
-        optimizer.iterate()
-    except RuntimeError as error:
-        raise _explained(error) from error
+    for by_qr in (False, True):
+        parameters = gtsam.GaussNewtonParams()
+        _set_elimination(parameters, graph, values, by_qr=by_qr)
+        try:
+            optimizer = gtsam.GaussNewtonOptimizer(graph, values, parameters)
+            optimizer.iterate()
+        except RuntimeError as error:
+            if by_qr or _INDETERMINATE not in str(error):
+                raise _explained(error) from error
+        else:
+            break
     return values.localCoordinates(optimizer.values())
 
 
-def _solver(by_qr: bool) -> str:
-    # GTSAM's Cholesky refuses a variable whose directions differ by more than 4096 in standard deviation,
-    # as the range of a far landmark does; QR is three times slower and minds less.
-    return "MULTIFRONTAL_QR" if by_qr else "MULTIFRONTAL_CHOLESKY"
+def _set_elimination(
+    parameters: gtsam.NonlinearOptimizerParams,
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    *,
+    by_qr: bool,
+) -> None:
+    """Choose the factorisation and the order of elimination.
+
+    GTSAM's Cholesky refuses a variable of which one direction is known 4096 times better than another: the
+    range of a far landmark, or a camera pose that a tight tie holds once its angles are eliminated. So angles
+    and masts come last; and QR, three times slower, minds less.
+    """
+    parameters.setLinearSolverType("MULTIFRONTAL_QR" if by_qr else "MULTIFRONTAL_CHOLESKY")
+    last = [key for key in values.keys() if chr(gtsam.symbolChr(key)) in "AMR"]  # noqa: SIM118  gtsam.Values
+    ordering = gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(graph, last, False)
+    parameters.setOrdering(ordering)
 
 
 def _explained(error: RuntimeError) -> Exception:
     """GTSAM's word that a system is indeterminate, as our own; any other exception as it is."""
     text = str(error).strip().replace("\n", " ")
-    if "ndeterminate" not in text:
+    if _INDETERMINATE not in text:
         return error
     return SolveError(f"nothing holds a direction of the solution: {text.split('.')[0]}")

@@ -80,7 +80,10 @@ def screen(
         test, dof = _normalised(residual, cofactor)
         if sweep == 0:
             scale = max(min_scale, _robust_scale(test[accepted & in_front], dof[accepted & in_front]))
-        excess = np.where(in_front, test / scale**2 - limit[dof], np.inf)
+        # No residual may exceed the noise itself, even where the cofactor shows no direction of it.
+        length = np.einsum("ni,ni->n", residual, residual)
+        excess = np.maximum(test / scale**2 - limit[dof], length / scale**2 - limit[2])
+        excess = np.where(in_front, excess, np.inf)
         bad = accepted & (excess > 0)
         goes = bad & (excess >= _segment_max(np.where(accepted, excess, -np.inf), k)[k])
         goes |= bad & (_count(accepted, k) <= 2)[k]

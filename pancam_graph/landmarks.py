@@ -14,6 +14,7 @@ from pancam_graph.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.losses import SQUARED, Loss
 
 _BEHIND_COST = 1e12
+_REFINE_STEPS = 15
 
 __all__ = [
     "CameraViews",
@@ -173,22 +174,56 @@ def refine(
     weight: FloatArray,
     loss: Loss = SQUARED,
     *,
-    iterations: int = 15,
+    beyond_infinity: bool = False,
 ) -> Landmarks:
     """Best landmarks with all cameras held: Levenberg-Marquardt for each on its own.
 
     `weight` (n,) multiplies each observation's cost; 0 leaves it out. A step that would raise a landmark's
     cost or move it behind a camera is not taken; directions that its rays leave free are not moved along.
+    Landmarks whose rays diverge end at infinity, or beyond it where that is allowed.
     """
+    free = _refine(landmarks, measurements, views, weight, loss, held_at_infinity=False)
+    beyond = np.flatnonzero(free.vector[:, 3] < 0)
+    if beyond_infinity or len(beyond) == 0:
+        return free
+    rows = np.flatnonzero((free.vector[:, 3] < 0)[measurements.landmark])
+    flat = free.vector[beyond] * [1.0, 1.0, 1.0, 0.0]
+    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
+    bound = _refine(
+        Landmarks(vector=flat, origin_m=free.origin_m[beyond]),
+        measurements.part(rows),
+        views,
+        weight[rows],
+        loss,
+        held_at_infinity=True,
+    )
+    vector = free.vector.copy()
+    vector[beyond] = bound.vector
+    return replace(free, vector=vector)
+
+
+def _refine(
+    landmarks: Landmarks,
+    measurements: Measurements,
+    views: CameraViews,
+    weight: FloatArray,
+    loss: Loss,
+    *,
+    held_at_infinity: bool,
+) -> Landmarks:
     vector = landmarks.vector.copy()
     damping = np.full(len(vector), 1e-6)
     active = np.arange(len(vector))
     rows = np.arange(len(measurements.row))
-    for _ in range(iterations):
+    for _ in range(_REFINE_STEPS):
         part, own = measurements.part(rows), weight[rows]
         now = replace(landmarks, vector=vector[active], origin_m=landmarks.origin_m[active])
         residual, b, in_front = evaluate(now, part, views)
         cost = _landmark_cost(residual, in_front, own, part.starts, loss)
+        if held_at_infinity:  # no step along w
+            w = _tangent_basis(now.vector)[:, 3, :]
+            w /= np.linalg.norm(w, axis=1, keepdims=True)
+            b = b - np.einsum("nij,nj->ni", b, w[part.landmark])[:, :, None] * w[part.landmark][:, None, :]
         wb = (own * loss.weight(residual))[:, None, None] * b
         v = np.add.reduceat(b.transpose(0, 2, 1) @ wb, part.starts)
         g = np.add.reduceat(np.einsum("nij,ni->nj", wb, residual), part.starts)

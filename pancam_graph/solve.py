@@ -15,7 +15,7 @@ from pancam_graph._optimise import Iteration, Outcome, StopRule, linear_step, op
 from pancam_graph._rejection import rays_of, screen
 from pancam_graph.cameras import carry_to_pinhole
 from pancam_graph.errors import InputError, SolveError
-from pancam_graph.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.geometry import BoolArray, FloatArray
 from pancam_graph.graph import DEFAULT_TIES, ExplicitLandmarks, FactorTemplate, Model, Tie
 from pancam_graph.initialise import Start, start_from_telemetry
 from pancam_graph.landmarks import (
@@ -476,6 +476,7 @@ class _Adjustment:
             m,
             self._views(self.initial_values),
             kept.astype(float),
+            beyond_infinity=True,
         )
         initial_points = self._points(initial_landmarks, self._views(self.initial_values))
         initial_points = np.where(present[:, None], initial_points, np.nan)

@@ -5,8 +5,8 @@ from pancam_graph.cameras._base import Rays as Rays
 from pancam_graph.cameras._cahv import CAHV as CAHV
 from pancam_graph.cameras._cahv import CAHVOR as CAHVOR
 from pancam_graph.cameras._cahv import CAHVORE as CAHVORE
+from pancam_graph.cameras._carry import carry_to_pinhole as carry_to_pinhole
 from pancam_graph.cameras._matrix import decompose_projection as decompose_projection
 from pancam_graph.cameras._matrix import projection_matrix as projection_matrix
 from pancam_graph.cameras._pinhole import Brown as Brown
 from pancam_graph.cameras._pinhole import Pinhole as Pinhole
-from pancam_graph.cameras._carry import carry_to_pinhole as carry_to_pinhole

@@ -55,8 +55,8 @@ class ExplicitLandmarks:
                     self.template.camera_key(image),
                     self.key(int(m.landmark[i])),
                     self._calibration[eye[image]],
-                    False,  # noqa: FBT003  no exception from inside the optimiser
-                    False,  # noqa: FBT003  no message either
+                    False,
+                    False,
                 )
             )
         return graph
