@@ -69,9 +69,12 @@ def circle_factor(
     def residual(
         camera: gtsam.Pose3, circle: gtsam.Pose3, radius: float, pan_tilt: FloatArray
     ) -> tuple[FloatArray, tuple[FloatArray, ...]]:
-        poses = ((p.rotation().matrix(), p.translation()) for p in (camera, circle))
         error, (d_camera, d_circle, d_radius, d_angle) = circle_residual(
-            *poses, radius, float(pan_tilt[0]), offset
+            (camera.rotation().matrix(), camera.translation()),
+            (circle.rotation().matrix(), circle.translation()),
+            radius,
+            float(pan_tilt[0]),
+            offset,
         )
         d_pan_tilt = np.zeros((3, len(pan_tilt)))
         d_pan_tilt[:, 0] = d_angle[:, 0]

@@ -87,7 +87,7 @@ def _pointing_sigma(template: FactorTemplate, joint: _JointCovariance, state: St
         d_pan = np.array([-np.cos(pan) * np.tan(tilt), -np.sin(pan) * np.tan(tilt), 1.0])
         d_tilt = np.array([np.sin(pan), -np.cos(pan), 0.0])
         d_angles = np.vstack([d_pan, d_tilt])
-        rows = [joint.rows[template.camera_key(i)][:3] for i in images]
+        rows = [joint.rows[template.camera_key(int(i))][:3] for i in images]
         blocks = [d_angles @ mast_R.T @ state.world_R_camera[i] / len(images) for i in images]
         if isinstance(slot := template.mast(stop), Key):
             rows.append(joint.rows[slot.key][:3])

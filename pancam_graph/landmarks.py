@@ -96,7 +96,8 @@ class Landmarks:
         A landmark beyond infinity is placed at that distance too.
         """
         x, w = self.vector[:, :3], self.vector[:, 3]
-        return self.origin_m + x / np.maximum(w, np.linalg.norm(x, axis=1) / furthest_m)[:, None]
+        depth = np.maximum(w, np.linalg.norm(x, axis=1) / furthest_m)
+        return np.asarray(self.origin_m + x / depth[:, None])
 
     def moved_to(self, points_m: FloatArray) -> "Landmarks":
         """Landmarks of the same origins at world points (landmarks, 3)."""
@@ -164,7 +165,7 @@ def _tangent_basis(vector: FloatArray) -> FloatArray:
     v = vector.copy()
     v[:, 0] += np.where(v[:, 0] >= 0, 1.0, -1.0)
     reflection = np.eye(4) - 2 * v[:, :, None] * v[:, None, :] / np.einsum("li,li->l", v, v)[:, None, None]
-    return reflection[:, :, 1:]
+    return np.asarray(reflection[:, :, 1:])
 
 
 def refine(

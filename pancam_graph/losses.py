@@ -37,7 +37,8 @@ class Loss:
         squared = np.einsum("ni,ni->n", residual, residual)
         if self.name == "huber":
             length = np.sqrt(squared)
-            return np.where(length <= self.width, squared / 2, self.width * (length - self.width / 2))
+            beyond = self.width * (length - self.width / 2)
+            return np.asarray(np.where(length <= self.width, squared / 2, beyond))
         if self.name == "cauchy":
             return np.asarray(0.5 * self.width**2 * np.log1p(squared / self.width**2))
         return np.asarray(squared / 2)
@@ -55,11 +56,10 @@ class Loss:
         """GTSAM's noise model of this loss over a Gaussian one."""
         if self.name == "none":
             return gaussian
-        estimators = {
-            "huber": gtsam.noiseModel.mEstimator.Huber,
-            "cauchy": gtsam.noiseModel.mEstimator.Cauchy,
-        }
-        return gtsam.noiseModel.Robust.Create(estimators[self.name].Create(self.width), gaussian)
+        estimators = gtsam.noiseModel.mEstimator
+        if self.name == "huber":
+            return gtsam.noiseModel.Robust.Create(estimators.Huber.Create(self.width), gaussian)
+        return gtsam.noiseModel.Robust.Create(estimators.Cauchy.Create(self.width), gaussian)
 
 
 SQUARED = Loss("none", np.inf)

@@ -96,7 +96,9 @@ def print_summary(solution: Solution, where: str) -> None:
     table = Table(title=solution.traverse.name or None, title_justify="left")
     for column in ("", "before", "after"):
         table.add_column(column, justify="right" if column else "left")
-    table.add_row("RMS of the residuals, px", f"{solution.rms_initial_px:.3f}", f"{solution.rms_final_px:.3f}")
+    table.add_row(
+        "RMS of the residuals, px", f"{solution.rms_initial_px:.3f}", f"{solution.rms_final_px:.3f}"
+    )
     table.add_row("cost", f"{solution.cost_initial:.6g}", f"{solution.cost_final:.6g}")
     table.add_row("observations", f"{total}", f"{used} used")
     console.print(table)

@@ -177,7 +177,7 @@ class _Adjustment:
         n_single = int(single.sum())
         if n_single:
             self.warnings.append(
-                f"{n_single} track{'s' if n_single != 1 else ''} seen once: left out, as one ray places nothing"
+                f"{n_single} track{'s' if n_single != 1 else ''} seen once: left out, one ray places nothing"
             )
         if not valid.all():
             self.warnings.append(
@@ -430,7 +430,7 @@ class _Adjustment:
         return np.asarray(baseline * focal / float(np.median(self.observations.sigma_px)))
 
     def _recarry(self) -> bool:
-        """Carry pixels again where that depends on the range; whether any moved by a thousandth of a pixel."""
+        """Carry pixels again where that depends on the range; whether any moved noticeably."""
         m = self.measurements
         centre = self._views(self.values).world_t_camera[m.image]
         found = np.linalg.norm(self.points_m[m.landmark] - centre, axis=1)
@@ -510,7 +510,7 @@ class _Adjustment:
             sigma_px=self.sigma_px,
             stop_covariance=stop_covariance,
             angle_sigma_rad=angle_sigma,
-            warnings=tuple([*self.warnings, *self._late_warnings(used), *connection_warnings(t, used)]),
+            warnings=(*self.warnings, *self._late_warnings(used), *connection_warnings(t, used)),
         )
 
     def _raw_residuals(self, landmarks: Landmarks, views: CameraViews, present: BoolArray) -> FloatArray:

@@ -24,11 +24,14 @@ def main() -> int:
         "--model",
         choices=("mast", "circle", "free"),
         default="mast",
-        help="mast: rigid pan-tilt mast (default); circle: camera centres on the mast's circles, rotations free; "
-        "free: every camera on its own",
+        help="mast: rigid pan-tilt mast (default); circle: camera centres on the mast's circles, rotations "
+        "free; free: every camera on its own",
     )
     parser.add_argument(
-        "--landmarks", choices=("explicit",), default="explicit", help="terrain points as variables of the graph"
+        "--landmarks",
+        choices=("explicit",),
+        default="explicit",
+        help="explicit: terrain points are variables of the graph",
     )
     parser.add_argument(
         "--loss",

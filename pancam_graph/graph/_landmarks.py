@@ -71,21 +71,21 @@ class ExplicitLandmarks:
         graph = gtsam.NonlinearFactorGraph()
         for j in np.flatnonzero(which):
             noise = gtsam.noiseModel.Isotropic.Sigma(3, float(sigma_m[j]))
-            graph.push_back(gtsam.PriorFactorPoint3(self.key(j), points_m[j], noise))
+            graph.push_back(gtsam.PriorFactorPoint3(self.key(int(j)), points_m[j], noise))
         return graph
 
     def with_landmarks(self, cameras: gtsam.Values, points_m: FloatArray, present: BoolArray) -> gtsam.Values:
         """The cameras' values together with those of the landmarks that take part."""
         values = gtsam.Values(cameras)
         for j in np.flatnonzero(present):
-            values.insert(self.key(j), points_m[j])
+            values.insert(self.key(int(j)), points_m[j])
         return values
 
     def points_m(self, values: gtsam.Values, present: BoolArray) -> FloatArray:
         """Landmarks (landmarks, 3) from the values; NaN for those that do not take part."""
         points = np.full((len(present), 3), np.nan)
         for j in np.flatnonzero(present):
-            points[j] = values.atPoint3(self.key(j))
+            points[j] = values.atPoint3(self.key(int(j)))
         return points
 
 

@@ -223,11 +223,11 @@ class FactorTemplate:
 def _mean_by_frame(traverse: Traverse, per_image: FloatArray) -> FloatArray:
     count = np.bincount(traverse.image_frame, minlength=len(traverse.frames)).clip(1)
     sums = [np.bincount(traverse.image_frame, c, minlength=len(traverse.frames)) for c in per_image.T]
-    return np.stack(sums, axis=1) / count[:, None]
+    return np.asarray(np.stack(sums, axis=1) / count[:, None])
 
 
 def _diagonal(sigmas: FloatArray) -> gtsam.noiseModel.Base:
-    """Diagonal noise; entries of 0 are held exactly."""
+    """Diagonal noise; entries of 0 are held exactly (1e3 is GTSAM's own weight of a violation)."""
     if np.all(sigmas > 0):
         return gtsam.noiseModel.Diagonal.Sigmas(sigmas)
-    return gtsam.noiseModel.Constrained.MixedSigmas(sigmas)
+    return gtsam.noiseModel.Constrained.MixedSigmas(np.full(len(sigmas), 1e3), sigmas)

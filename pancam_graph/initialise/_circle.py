@@ -32,7 +32,7 @@ class CircleFit:
 
     @property
     def short_arc(self) -> bool:
-        """Whether the points cover less than a quarter: centre and radius then trade off against each other."""
+        """Whether the points cover less than a quarter: centre and radius then trade off."""
         return self.arc_rad < _SHORT_ARC_RAD
 
 
@@ -82,10 +82,7 @@ def fit_circle(centres_m: FloatArray, up: FloatArray | None = None) -> CircleFit
     phi = np.unwrap(np.arctan2(arm[:, 1], arm[:, 0]))
     turn = np.sign(phi[-1] - phi[0]) or 1.0
     z = normal * np.sign(np.linalg.det(np.vstack([axes[:2], normal])))
-    if up is not None:
-        z_wanted = z if z @ up >= 0 else -z
-    else:
-        z_wanted = z * turn
+    z_wanted = z * (turn if up is None else np.sign(z @ up) or 1.0)
     if z_wanted @ z < 0:
         phi = -phi
     x = (points[0] - mean) @ axes[:2].T - centre
