@@ -27,7 +27,7 @@ def covariances(
     t = template.traverse
     stops = np.zeros((len(t.stops), 6, 6))
     sigma = np.zeros((len(t.frames), 2))
-    joint = _JointCovariance(graph, values)
+    joint = _JointCovariance(graph, values, template.held_components())
     for i in range(len(t.stops)):
         if isinstance(slot := template.mast(i), Key):
             stops[i] = joint.block(slot.key, slot.key)
@@ -42,7 +42,9 @@ def covariances(
 class _JointCovariance:
     """Covariance of everything but the landmarks, which are marginalised by their own 3 x 3 blocks."""
 
-    def __init__(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+    def __init__(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, held: dict[int, IntArray]
+    ) -> None:
         keys = sorted(values.keys())
         dims = np.array([_DIMENSION[chr(gtsam.symbolChr(key))] for key in keys])
         landmark = np.repeat([chr(gtsam.symbolChr(key)) == "L" for key in keys], dims)
@@ -53,23 +55,30 @@ class _JointCovariance:
         points, rest = jacobian[:, landmark], jacobian[:, ~landmark]
         weighted = points @ _inverse_of_blocks((points.T @ points).tobsr((3, 3)))
         information = (rest.T @ rest - (weighted.T @ rest).T @ (points.T @ rest)).toarray()
-        # Unit diagonal first: radians and metres differ by orders of magnitude.
-        scale = 1 / np.sqrt(np.diag(information).clip(1e-300))
-        try:
-            half = cho_factor(information * scale[:, None] * scale, lower=True)
-        except np.linalg.LinAlgError as error:
-            raise SolveError(f"covariances: nothing holds a direction of the solution: {error}") from error
-        self.matrix: FloatArray = cho_solve(half, np.diag(scale)) * scale[:, None]
         self.rows: dict[int, IntArray] = {}
+        free = np.ones(len(information), dtype=bool)
         end = 0
         for key, dim in zip(keys, dims, strict=True):
             if chr(gtsam.symbolChr(key)) != "L":
                 self.rows[key] = np.arange(end, end + dim)
+                free[end + held.get(key, np.zeros(0, dtype=np.int64))] = False
                 end += dim
+        self.matrix: FloatArray = np.zeros_like(information)
+        self.matrix[np.ix_(free, free)] = _inverse(information[np.ix_(free, free)])
 
     def block(self, a: int, b: int) -> FloatArray:
         """Covariance of two variables."""
         return self.matrix[np.ix_(self.rows[a], self.rows[b])]
+
+
+def _inverse(information: FloatArray) -> FloatArray:
+    """Inverse of an information matrix, unit diagonal first: radians and metres differ by much."""
+    scale = 1 / np.sqrt(np.diag(information).clip(1e-300))
+    try:
+        half = cho_factor(information * scale[:, None] * scale, lower=True)
+    except np.linalg.LinAlgError as error:
+        raise SolveError(f"covariances: nothing holds a direction of the solution: {error}") from error
+    return np.asarray(cho_solve(half, np.diag(scale)) * scale[:, None])
 
 
 def _pointing_sigma(template: FactorTemplate, joint: _JointCovariance, state: State) -> FloatArray:

@@ -80,9 +80,10 @@ def screen(
         test, dof = _normalised(residual, cofactor)
         if sweep == 0:
             scale = max(min_scale, _robust_scale(test[accepted & in_front], dof[accepted & in_front]))
-        # No residual may exceed the noise itself, even where the cofactor shows no direction of it.
+        # What takes part may not exceed the noise itself, even where its cofactor shows no direction of it.
         length = np.einsum("ni,ni->n", residual, residual)
-        excess = np.maximum(test / scale**2 - limit[dof], length / scale**2 - limit[2])
+        excess = test / scale**2 - limit[dof]
+        excess = np.where(accepted, np.maximum(excess, length / scale**2 - limit[2]), excess)
         excess = np.where(in_front, excess, np.inf)
         bad = accepted & (excess > 0)
         goes = bad & (excess >= _segment_max(np.where(accepted, excess, -np.inf), k)[k])

@@ -42,6 +42,8 @@ _FURTHEST_PARALLAX_SIGMAS = 0.01
 """Points are placed no further out than where their parallax is this many sigmas of a pixel."""
 _WEAK_RANGE_SIGMA = 0.3
 """A landmark whose range is known to no better than this share of it gets the weak prior."""
+_CARRIED_PX = 1e-6
+"""Pixels of CAHVORE cameras are carried anew until none moves by more."""
 _STRETCHED = 500.0
 """A landmark this many times less certain in range than sideways is too much for GTSAM's Cholesky."""
 
@@ -430,7 +432,7 @@ class _Adjustment:
         return np.asarray(baseline * focal / float(np.median(self.observations.sigma_px)))
 
     def _recarry(self) -> bool:
-        """Carry pixels again where that depends on the range; whether any moved noticeably."""
+        """Carry pixels again where that depends on the range; whether any moved."""
         m = self.measurements
         centre = self._views(self.values).world_t_camera[m.image]
         found = np.linalg.norm(self.points_m[m.landmark] - centre, axis=1)
@@ -438,7 +440,7 @@ class _Adjustment:
         range_m[m.row] = np.where(np.isfinite(found), found, _TYPICAL_RANGE_M)
         uv, turn, valid = self._carry(range_m)
         shift = np.where(valid[m.row], np.linalg.norm(uv[m.row] - m.uv_px, axis=1), 0.0)
-        if shift.max(initial=0.0) < 1e-3:
+        if shift.max(initial=0.0) < _CARRIED_PX:
             return False
         keep = valid[m.row, None]
         whitening = turn[m.row] / self.sigma_px[m.row, None, None]

@@ -17,8 +17,8 @@ def carry_to_pinhole(
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Pixels (n, 2) as the camera's pinhole would have measured them, and how residuals turn back.
 
-    `range_m` (n,) is the distance of what each pixel sees; it matters only where the entrance pupil
-    moves (CAHVORE), and there a rough value is enough unless the point is within a metre.
+    The camera is in its own frame. `range_m` (n,) is the distance from its centre to what each pixel sees; it
+    matters only where the entrance pupil moves (CAHVORE); there a rough value does unless the point is near.
 
     Returns the pinhole's pixels (n, 2), matrices (n, 2, 2) that take small residuals of the pinhole to
     residuals of the image, and validity (n,): False outside either model's domain.
@@ -28,7 +28,11 @@ def carry_to_pinhole(
         n = len(uv_px)
         return uv_px, np.broadcast_to(np.eye(2), (n, 2, 2)).copy(), np.ones(n, dtype=bool)
     rays = camera.unproject(uv_px)
-    points = rays.origin_m + range_m[:, None] * rays.direction
+    # The range counts from the centre; the ray starts at the pupil.
+    along = np.einsum("ni,ni->n", rays.origin_m, rays.direction)
+    apart = np.einsum("ni,ni->n", rays.origin_m, rays.origin_m)
+    reach = np.sqrt(np.maximum(range_m**2 + along**2 - apart, 1e-12)) - along
+    points = rays.origin_m + reach[:, None] * rays.direction
     carried, d_pinhole, in_front = pinhole.project_with_jacobian(points)
     _, d_camera, seen = camera.project_with_jacobian(points)
     # Both derivatives vanish along the line of sight, so any right inverse of one serves the other.

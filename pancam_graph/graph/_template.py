@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from pancam_graph.factors import CircleOffset, Fixed, Key, Slot, circle_factor, mast_factor
-from pancam_graph.geometry import FloatArray, pan_tilt_from_rotation, pose_arrays, wrap_angle
+from pancam_graph.geometry import FloatArray, IntArray, pan_tilt_from_rotation, pose_arrays, wrap_angle
 from pancam_graph.graph._options import Model, Tie
 from pancam_graph.solution import State
 from pancam_graph.traverse import Traverse
@@ -44,6 +44,18 @@ class FactorTemplate:
         if entry.sigma_pan_rad == 0 and entry.sigma_tilt_rad == 0:
             return Fixed(self.traverse.pan_tilt_rad[frame])
         return Key(gtsam.symbol("A", frame))
+
+    def held_components(self) -> dict[int, IntArray]:
+        """Tangent components of variables that telemetry holds while others of the same variable are free."""
+        held: dict[int, IntArray] = {}
+        for i, stop in enumerate(self.traverse.stops):
+            if isinstance(slot := self.mast(i), Key):
+                sigmas = np.repeat([stop.sigma_rotation_rad, stop.sigma_translation_m], 3)
+                held[slot.key] = np.flatnonzero(sigmas == 0)
+        for i, frame in enumerate(self.traverse.frames):
+            if isinstance(slot := self.pan_tilt(i), Key):
+                held[slot.key] = np.flatnonzero(np.array([frame.sigma_pan_rad, frame.sigma_tilt_rad]) == 0)
+        return held
 
     @staticmethod
     def camera_key(image: int) -> int:
