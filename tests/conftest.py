@@ -5,18 +5,39 @@ from pathlib import Path
 
 import pytest
 
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def shared(name: str) -> Path:
+    """A file or folder that is not in the repository; the test is skipped where it is missing.
+
+    Looked for in the folder that PANCAM_GRAPH_SHARED names, then in ../shared beside the repository.
+    """
+    named = os.environ.get("PANCAM_GRAPH_SHARED")
+    roots = [Path(named)] if named else []
+    roots.append(ROOT.parent / "shared")
+    for root in roots:
+        if (root / name).exists():
+            return root / name
+    pytest.skip(f"no {name} in {' or '.join(str(r) for r in roots)}; set PANCAM_GRAPH_SHARED")
+
 
 @pytest.fixture(scope="session")
 def opportunity_folder() -> Path:
-    """Five left Navcam images of Opportunity, sol 4087; not in the repository.
+    """Five left Navcam images of Opportunity, sol 4087."""
+    return shared("data/opportunity_navcam_sol4087")
 
-    Looked for in the folder that PANCAM_GRAPH_DATA names, then in ../shared/data beside the repository.
-    """
-    name = "opportunity_navcam_sol4087"
-    named = os.environ.get("PANCAM_GRAPH_DATA")
-    roots = [Path(named)] if named else []
-    roots.append(Path(__file__).resolve().parents[1].parent / "shared" / "data")
-    for root in roots:
-        if (root / name).is_dir():
-            return root / name
-    pytest.skip(f"no folder {name} in {' or '.join(str(r) for r in roots)}; set PANCAM_GRAPH_DATA")
+
+@pytest.fixture(scope="session")
+def bench_generator() -> Path:
+    """The program that writes the traverses of the benchmark."""
+    return shared("bench/make_traverse.py")
+
+
+@pytest.fixture(scope="session")
+def scripts_folder() -> Path:
+    """The repository's programs; tests of an installed wheel have none."""
+    folder = ROOT / "scripts"
+    if not folder.is_dir():
+        pytest.skip(f"no {folder}: the programs are part of the repository, not of the package")
+    return folder

@@ -26,7 +26,6 @@ from pancam_graph.rigs import TEMPLATES, Eye, Rig, mer_navcam
 from pancam_graph.simulate import Simulation
 
 SMALL = SimulationOptions(stops=2, pans=3, sweep_rad=1.5, points_per_image=15)
-BENCH = Path(__file__).resolve().parents[2] / "shared" / "bench" / "make_traverse.py"
 
 CERES_COST = {"mer-pancam": 925.735246, "mer-navcam": 10935.916532, "exomars-wac": 7402.282391}
 """Final costs of Ceres 2.1 (DENSE_SCHUR, function tolerance 1e-12) on make_traverse.py --stops 3, seed 0."""
@@ -67,12 +66,12 @@ def test_robust_solve_of_clean_data_is_the_plain_one() -> None:
 
 
 @pytest.mark.parametrize("rig", CERES_COST)
-def test_optimum_of_an_independent_solver(rig: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_optimum_of_an_independent_solver(
+    rig: str, tmp_path: Path, bench_generator: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The traverses of the benchmark end at Ceres's cost: the soft tie is as good as rigid."""
-    if not BENCH.exists():
-        pytest.skip("the benchmark's generator is not beside this checkout (../shared/bench)")
-    monkeypatch.setattr(sys, "argv", [str(BENCH), str(tmp_path), "--rig", rig, "--stops", "3"])
-    runpy.run_path(str(BENCH), run_name="__main__")
+    monkeypatch.setattr(sys, "argv", [str(bench_generator), str(tmp_path), "--rig", rig, "--stops", "3"])
+    runpy.run_path(str(bench_generator), run_name="__main__")
     solution = solve(read_traverse(tmp_path), SolveOptions(loss="none"))
     assert solution.converged
     assert solution.cost_final == pytest.approx(CERES_COST[rig], rel=1e-4)
