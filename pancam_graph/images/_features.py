@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pancam_graph.cameras import Camera
-from pancam_graph.geometry import FloatArray, IntArray
+from pancam_graph.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.images._normalise import normalise, usable_mask
 from pancam_graph.images._options import FrontEndOptions
 
@@ -46,10 +46,11 @@ class Features:
 
 
 def find_features(
-    image: NDArray[Any], camera: Camera, camera_up: FloatArray, options: FrontEndOptions
+    image: NDArray[Any], wanted: BoolArray, camera: Camera, camera_up: FloatArray, options: FrontEndOptions
 ) -> Features:
-    """Features of an image (height, width) that `camera` took.
+    """Features of an image (height, width) that `camera` took, in the pieces of it that are `wanted`.
 
+    `wanted` is a grid over the image, by row and column.
     `camera_up` is the world's vertical as a unit vector (3,) in the camera frame. Descriptors are turned
     to its image instead of the local gradient's direction: a mast never rolls, so this compares like with
     like and saves one unknown. Returns no features, never an error, for an image without texture.
@@ -59,9 +60,11 @@ def find_features(
     sift: Any = cv2.SIFT.create(
         nfeatures=0, contrastThreshold=options.contrast_threshold, enable_precise_upscale=True
     )
+    wanted_mask = cv2.resize(wanted.astype(np.uint8), grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    usable = usable_mask(image) & (wanted_mask > 0)
     found = sift.detect(grey, None)
     table = np.array([(k.pt[1], k.pt[0], k.size, k.response) for k in found]).reshape(-1, 4)
-    rows = _choose(table, usable_mask(image), options.max_features)
+    rows = _choose(table, usable, options.max_features)
     chosen = [found[i] for i in rows]
     angles = _vertical_angle_deg(camera, camera_up, table[rows][:, [1, 0]])
     for keypoint, angle in zip(chosen, angles, strict=True):

@@ -2,17 +2,20 @@
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from pancam_graph.errors import ImageError, InputError
+from pancam_graph.geometry import BoolArray
 from pancam_graph.images._features import Features, find_features
 from pancam_graph.images._match import Matches
 from pancam_graph.images._match_pair import match_pair
 from pancam_graph.images._options import FrontEndOptions
-from pancam_graph.images._pairs import PairGeometry, overlapping_pairs
+from pancam_graph.images._overlap import overlap_cells, overlapping_pairs
+from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._refine import refine_tracks
 from pancam_graph.images._tracks import Links, join_tracks
 from pancam_graph.io.image_files import GreyImage, read_image
@@ -22,6 +25,7 @@ __all__ = ["find_observations"]
 
 _LOG = logging.getLogger(__name__)
 _SURE_OVERLAP = 0.1
+_SURE_DEPTH_M = 3.0
 _WORLD_UP = np.array([0.0, 0.0, 1.0])
 
 Progress = Callable[[str, int, int], None]
@@ -53,22 +57,23 @@ def find_observations(
     one that cannot be read or has another size than its camera.
     """
     images = _read_images(traverse)
-    features = _all_features(traverse, images, options, progress)
     pairs = [
-        p
-        for p in overlapping_pairs(traverse, options, _staged("overlaps", progress))
-        if traverse.images[p.a].file is not None and traverse.images[p.b].file is not None
+        pair
+        for pair in overlapping_pairs(traverse, options, _staged("overlaps", progress))
+        if images[pair.a] is not None and images[pair.b] is not None
     ]
+    features = _all_features(traverse, images, overlap_cells(traverse, pairs, options), options, progress)
     parts, warnings = [], []
+    far = replace(options, min_depth_m=max(options.min_depth_m, _SURE_DEPTH_M))
     for k, pair in enumerate(pairs):
         matches = match_pair(pair, features[pair.a], features[pair.b], options)
         names = traverse.images[pair.a].id, traverse.images[pair.b].id
         _LOG.info("%s, %s: %d matches", *names, len(matches))
         if len(matches):
             parts.append(_links(pair, matches))
-        elif pair.overlap(options, widened=False) > _SURE_OVERLAP:
+        elif np.mean(pair.overlap(far, widened=False)) > _SURE_OVERLAP:
             warnings.append(
-                f"images {names[0]} and {names[1]}: they overlap by pointing, but no matches were found"
+                f"images {names[0]} and {names[1]}: no matches, although they overlap by pointing"
             )
         if progress is not None:
             progress("matches", k + 1, len(pairs))
@@ -129,10 +134,11 @@ def _read_images(traverse: Traverse) -> list[GreyImage | None]:
 def _all_features(
     traverse: Traverse,
     images: list[GreyImage | None],
+    wanted: BoolArray,
     options: FrontEndOptions,
     progress: Progress | None,
 ) -> list[Features]:
-    """Features of every image; none for an image without a file."""
+    """Features of every image where it overlaps others; none for an image without a file."""
     world_R_camera, _ = traverse.camera_poses()
     features = []
     for i, (image, eye) in enumerate(zip(images, traverse.image_eye, strict=True)):
@@ -140,7 +146,8 @@ def _all_features(
             features.append(Features.none())
         else:
             camera_up = world_R_camera[i].T @ _WORLD_UP
-            features.append(find_features(image, traverse.rig.eyes[eye].camera, camera_up, options))
+            camera = traverse.rig.eyes[eye].camera
+            features.append(find_features(image, wanted[i], camera, camera_up, options))
         _LOG.info("%s: %d features", traverse.images[i].id, len(features[i]))
         if progress is not None:
             progress("features", i + 1, len(images))

@@ -29,7 +29,7 @@ def match_pair(
     wherever the pointing started from.
     """
     nothing = Matches.none()
-    start = PairFit(p=np.zeros(len(pair.sigma)), root=np.diag(pair.sigma))
+    start = PairFit(p=pair.no_correction, root=np.diag(pair.sigma))
     segments = pair.segments(features_a.uv_px, start.p, start.root, options.search_slack_px, options)
     matches = _search(pair, features_a, features_b, segments, options)
     if len(matches) < options.min_pair_matches:
@@ -85,5 +85,5 @@ def _on_rover(pair: PairGeometry, uv_a: FloatArray, uv_b: FloatArray, options: F
     recognised.
     """
     fixed = replace(pair, rover_fixed=True)
-    still = fixed.segments(uv_a, np.zeros(len(fixed.sigma)), np.diag(fixed.sigma), _DECK_PX, options)
+    still = fixed.segments(uv_a, fixed.no_correction, np.diag(fixed.sigma), _DECK_PX, options)
     return np.asarray(still.holds(uv_b) & (pair.elevation_rad(uv_a) < -_HORIZON_RAD))

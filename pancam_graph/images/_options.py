@@ -24,6 +24,8 @@ class FrontEndOptions:
     """The strongest features kept per image, evenly over a grid of cells."""
     min_depth_m: float = 0.5
     """Nothing nearer than this is matched."""
+    max_stop_distance_m: float = 20.0
+    """Images of stops further apart are not compared."""
     search_sigmas: float = 4.0
     """How many standard deviations of the telemetry the search window reaches."""
     search_slack_px: float = 3.0

@@ -1,8 +1,8 @@
 """What the pointing says about two images: whether they overlap, and where to look for a feature."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -12,14 +12,16 @@ from pancam_graph.geometry import BoolArray, FloatArray, IntArray, compose, pose
 from pancam_graph.images._options import FrontEndOptions
 from pancam_graph.traverse import Traverse
 
-__all__ = ["PairGeometry", "Segments", "overlapping_pairs"]
+__all__ = ["FAR_M", "PairGeometry", "Relative", "Segments", "inspected_depths_m", "move_pixels"]
 
 FAR_M = 1e7
 """Stands for infinity: a baseline of 100 m is 1e-5 rad there."""
 
-_GRID = 9
 _DEPTHS = 16
 _COARSE_FARTHEST_M = 200.0
+_DIFFERENCE = 1e-2
+_MAX_TURN_RAD = np.deg2rad(45.0)
+_MAX_ZOOM = 2.5
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -72,6 +74,19 @@ class Segments:
         rows = np.arange(len(uv_px))
         each = [self.select(rows[i : i + 1]).reach(uv_px[i : i + 1])[0, 0] for i in rows]
         return np.array(each, dtype=bool)
+
+
+class Relative(NamedTuple):
+    """Pose of camera a in the frame of camera b."""
+
+    R: FloatArray
+    """(3, 3)"""
+    t: FloatArray
+    """(3,) metres."""
+
+    def of(self, points_m: FloatArray) -> FloatArray:
+        """Points (n, 3) in the frame of camera b, from those in the frame of camera a."""
+        return np.asarray(points_m @ self.R.T + self.t)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,8 +151,13 @@ class PairGeometry:
             parts.append(np.repeat([rotation, translation], 3))
         return np.concatenate(parts)
 
-    def b_T_a(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Rotation (3, 3) and translation (3,) from camera a to camera b at the corrections p."""
+    @property
+    def no_correction(self) -> FloatArray:
+        """The corrections p = 0."""
+        return np.zeros(len(self.sigma))
+
+    def b_T_a(self, p: FloatArray) -> Relative:
+        """Pose of camera a in the frame of camera b at the corrections p."""
         rows = np.array([self.a, self.b])
         angles = self.traverse.pan_tilt_rad[self.traverse.image_frame[rows]]
         if not self.same_frame:
@@ -148,12 +168,18 @@ class PairGeometry:
             stops[1] = stops[1].retract(p[7:13])
             R, t = compose(*pose_arrays(stops), R, t)
         b_R = (R[1] @ gtsam.Rot3.Expmap(p[:3]).matrix()).T
-        return b_R @ R[0], b_R @ (t[0] - t[1])
+        return Relative(b_R @ R[0], b_R @ (t[0] - t[1]))
 
-    def transfer(self, points_m: FloatArray, p: FloatArray) -> tuple[FloatArray, BoolArray]:
+    def d_b_T_a(self, p: FloatArray, root: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Derivatives of `b_T_a` along root's k columns: rotation (k, 3, 3) and translation (k, 3)."""
+        base = self.b_T_a(p)
+        moved = [self.b_T_a(p + _DIFFERENCE * column) for column in root.T if np.any(column)]
+        d_R = np.array([m.R - base.R for m in moved]).reshape(-1, 3, 3)
+        return d_R / _DIFFERENCE, np.array([m.t - base.t for m in moved]).reshape(-1, 3) / _DIFFERENCE
+
+    def transfer(self, points_m: FloatArray, b_T_a: Relative) -> tuple[FloatArray, BoolArray]:
         """Pixels in b (n, 2) of points (n, 3) in the frame of camera a, and their validity (n,)."""
-        R, t = self.b_T_a(p)
-        return self.camera_b.project(points_m @ R.T + t)
+        return self.camera_b.project(b_T_a.of(points_m))
 
     def segments(
         self, uv_px: FloatArray, p: FloatArray, root: FloatArray, slack_px: float, options: FrontEndOptions
@@ -164,21 +190,25 @@ class PairGeometry:
         deviations and `slack_px` pixels of the coarser image.
         """
         rays = self.camera_a.unproject(uv_px)
-        n = len(uv_px)
+        n, b_T_a = len(uv_px), self.b_T_a(p)
+        d_b_T_a = self.d_b_T_a(p, root)
         magnification = self.magnification(uv_px)
         slack = slack_px * np.maximum(magnification, 1.0)
         far_radius = slack + options.search_sigmas * self._spread_px(
-            rays.origin_m + FAR_M * rays.direction, p, root
+            rays.origin_m + FAR_M * rays.direction, b_T_a, d_b_T_a
         )
 
-        # The depths whose pixels fall on b, or near it, form one run; its ends make the segment.
-        depths = np.append(np.geomspace(options.min_depth_m, _COARSE_FARTHEST_M, _DEPTHS), FAR_M)[::-1]
+        # The depths that both see alike, and whose pixels fall on b or near it, form one run: its ends are
+        # those of the segment.
+        depths = inspected_depths_m(options.min_depth_m)
         pixels, inside = np.empty((len(depths), n, 2)), np.empty((len(depths), n), dtype=bool)
         size = np.array([self.camera_b.width_px, self.camera_b.height_px])
         margin = far_radius[:, None]
         for k, depth in enumerate(depths):
-            pixels[k], seen = self.transfer(rays.origin_m + depth * rays.direction, p)
+            points = rays.origin_m + depth * rays.direction
+            pixels[k], seen = self.transfer(points, b_T_a)
             inside[k] = seen & np.all((pixels[k] > -margin) & (pixels[k] < size - 1 + margin), axis=1)
+            inside[k] &= _alike(points, b_T_a)
         first, last = inside.argmax(axis=0), len(depths) - 1 - inside[::-1].argmax(axis=0)
         row = np.arange(n)
         far_px, near_px = pixels[first, row], pixels[last, row]
@@ -192,7 +222,7 @@ class PairGeometry:
         number = np.arange(len(depths))[:, None]
         between = inside & (number >= first) & (number <= last)
         bow = np.max(np.abs(np.einsum("kni,ni->kn", pixels - far_px, across)) * between, axis=0)
-        near_spread = self._spread_px(rays.origin_m + depths[last][:, None] * rays.direction, p, root)
+        near_spread = self._spread_px(rays.origin_m + depths[last][:, None] * rays.direction, b_T_a, d_b_T_a)
         return Segments(
             far_px=far_px,
             near_px=near_px,
@@ -202,20 +232,18 @@ class PairGeometry:
             valid=rays.valid & inside.any(axis=0),
         )
 
-    def _spread_px(self, points_m: FloatArray, p: FloatArray, root: FloatArray) -> FloatArray:
+    def _spread_px(
+        self, points_m: FloatArray, b_T_a: Relative, d_b_T_a: tuple[FloatArray, FloatArray]
+    ) -> FloatArray:
         """Standard deviation (n,) of the pixels in b of points (n, 3) in the frame of camera a."""
-        pixels, _ = self.transfer(points_m, p)
-        variance = np.zeros(len(points_m))
-        for column in root.T:
-            if np.any(column):
-                variance += np.sum((self.transfer(points_m, p + column)[0] - pixels) ** 2, axis=1)
-        return np.sqrt(variance)
+        _, d_uv, _ = self.camera_b.project_with_jacobian(b_T_a.of(points_m))
+        return np.asarray(np.sqrt(np.sum(move_pixels(points_m, d_uv, d_b_T_a) ** 2, axis=(1, 2))))
 
     def magnification(self, uv_px: FloatArray) -> FloatArray:
         """How much larger b shows distant terrain than a, by lengths, at pixels (n, 2) of a."""
         shifts = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
         rays = self.camera_a.unproject((uv_px + shifts[:, None]).reshape(-1, 2))
-        pixels, _ = self.transfer(rays.origin_m + FAR_M * rays.direction, np.zeros(len(self.sigma)))
+        pixels, _ = self.transfer(rays.origin_m + FAR_M * rays.direction, self.b_T_a(self.no_correction))
         centre, right, down = pixels.reshape(3, -1, 2)
         area = np.abs(np.linalg.det(np.stack([right - centre, down - centre], -1)))
         return np.asarray(np.sqrt(np.where(np.isfinite(area), area, 1.0)))
@@ -228,30 +256,42 @@ class PairGeometry:
         up = self.traverse.stops[stop].world_T_mast.rotation().matrix()[2] @ mast_R[0]
         return np.asarray(np.arcsin(np.clip(self.camera_a.unproject(uv_px).direction @ up, -1.0, 1.0)))
 
-    def overlap(self, options: FrontEndOptions, *, widened: bool) -> float:
-        """Share of a grid over a that can lie on b: within the search window, or as telemetry has it."""
-        u, v = np.meshgrid(
-            np.linspace(0, self.camera_a.width_px - 1, _GRID),
-            np.linspace(0, self.camera_a.height_px - 1, _GRID),
-        )
-        grid = np.column_stack([u.ravel(), v.ravel()])
+    def overlap(self, options: FrontEndOptions, *, widened: bool, cells: int = 8) -> BoolArray:
+        """Which of cells x cells pieces of image a, by row and column, can lie on b.
+
+        Within the search window, if `widened`, else exactly as telemetry has it.
+        """
+        size = np.array([self.camera_a.width_px, self.camera_a.height_px])
+        u, v = np.meshgrid(*np.linspace(0, size - 1, cells + 1).T)
         root = np.diag(self.sigma) if widened else np.zeros((len(self.sigma), 0))
         slack_px = options.search_slack_px if widened else 0.0
-        found = self.segments(grid, np.zeros(len(self.sigma)), root, slack_px, options)
-        return float(np.mean(found.valid))
+        corners = np.column_stack([u.ravel(), v.ravel()])
+        valid = self.segments(corners, self.no_correction, root, slack_px, options).valid
+        corner = valid.reshape(u.shape)
+        return np.asarray(corner[:-1, :-1] | corner[1:, :-1] | corner[:-1, 1:] | corner[1:, 1:])
 
 
-def overlapping_pairs(
-    traverse: Traverse, options: FrontEndOptions, progress: Callable[[int, int], None] | None = None
-) -> list[PairGeometry]:
-    """Pairs of images (a before b) that can see the same terrain by all that telemetry knows."""
-    pairs = []
-    n = len(traverse.images)
-    for a in range(n):
-        for b in range(a + 1, n):
-            pair = PairGeometry(traverse, a, b, options.mount_sigma_rad)
-            if pair.overlap(options, widened=True) > 0:
-                pairs.append(pair)
-        if progress is not None:
-            progress(a + 1, n)
-    return pairs
+def move_pixels(points_m: FloatArray, d_uv: FloatArray, d_b_T_a: tuple[FloatArray, FloatArray]) -> FloatArray:
+    """How pixels in b move (n, 2, k) with k changes of the pose, see `PairGeometry.d_b_T_a`.
+
+    Of points (n, 3) in the frame of camera a; `d_uv` (n, 2, 3) is how a pixel moves with the point in that
+    of b.
+    """
+    d_R, d_t = d_b_T_a
+    moved = points_m @ np.swapaxes(d_R, 1, 2) + d_t[:, None]
+    return np.asarray(d_uv @ np.moveaxis(moved, 0, 2))
+
+
+def _alike(points_m: FloatArray, b_T_a: Relative) -> BoolArray:
+    """Whether points (n, 3) in the frame of camera a are seen from similar sides and distances, (n,)."""
+    from_b = b_T_a.of(points_m)
+    from_a = from_b - b_T_a.t
+    range_a, range_b = np.linalg.norm(from_a, axis=1), np.linalg.norm(from_b, axis=1)
+    cosine = np.einsum("ni,ni->n", from_a, from_b) / np.maximum(range_a * range_b, 1e-12)
+    near = (range_a < _MAX_ZOOM * range_b) & (range_b < _MAX_ZOOM * range_a)
+    return np.asarray(near & (cosine > np.cos(_MAX_TURN_RAD)))
+
+
+def inspected_depths_m(min_depth_m: float) -> FloatArray:
+    """Depths, farthest first, that stand for all those from `min_depth_m` to infinity."""
+    return np.append(np.geomspace(min_depth_m, _COARSE_FARTHEST_M, _DEPTHS), FAR_M)[::-1]

@@ -124,13 +124,13 @@ def _refine_pair(
 
 def _affine(pair: PairGeometry, uv_a: FloatArray, uv_b: FloatArray, options: FrontEndOptions) -> FloatArray:
     """Derivative (n, 2, 2) of the pixel in b by that in a, on a sphere around camera a through each point."""
-    p = np.zeros(len(pair.sigma))
-    _, inverse_depth = epipolar_px(pair, p, uv_a, uv_b, options)
+    b_T_a = pair.b_T_a(pair.no_correction)
+    _, inverse_depth = epipolar_px(pair, pair.no_correction, uv_a, uv_b, options)
     depth_m = 1 / np.maximum(inverse_depth, 1 / FAR_M)
     pixels = []
     for shift in ([0.0, 0.0], [1.0, 0.0], [0.0, 1.0]):
         rays = pair.camera_a.unproject(uv_a + shift)
-        pixels.append(pair.transfer(rays.origin_m + depth_m[:, None] * rays.direction, p)[0])
+        pixels.append(pair.transfer(rays.origin_m + depth_m[:, None] * rays.direction, b_T_a)[0])
     return np.stack([pixels[1] - pixels[0], pixels[2] - pixels[0]], -1)
 
 

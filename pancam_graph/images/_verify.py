@@ -6,7 +6,7 @@ import numpy as np
 
 from pancam_graph.geometry import FloatArray
 from pancam_graph.images._options import FrontEndOptions
-from pancam_graph.images._pairs import FAR_M, PairGeometry
+from pancam_graph.images._pairs import FAR_M, PairGeometry, Relative, move_pixels
 
 __all__ = ["PairFit", "epipolar_px", "fit_pair"]
 
@@ -18,7 +18,6 @@ _FINEST_SCALE_PX = 0.5
 _DEPTH_CANDIDATES = 7
 _DEPTH_STEPS = 2
 _FINAL_DEPTH_STEPS = 6
-_DIFFERENCE = 1e-3
 _MIN_PARALLAX_PX = 0.05
 
 
@@ -55,8 +54,36 @@ class _Lines:
     def points_m(self, inverse_depth: FloatArray) -> FloatArray:
         return self.origin_m + self.direction / np.maximum(inverse_depth, 1 / FAR_M)[:, None]
 
-    def residual_px(self, geometry: PairGeometry, p: FloatArray, inverse_depth: FloatArray) -> FloatArray:
-        return self.uv_b - geometry.transfer(self.points_m(inverse_depth), p)[0]
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Misfit:
+    """How the lines of sight, at some depths, miss the pixels of b."""
+
+    residual_px: FloatArray
+    """(n, 2) measured minus projected."""
+    d_uv: FloatArray
+    """(n, 2, 3) derivative of the projection by the point in the frame of b."""
+    slope: FloatArray
+    """(n, 2) derivative of the residual by the inverse depth."""
+
+    @staticmethod
+    def of(geometry: PairGeometry, b_T_a: Relative, lines: _Lines, inverse_depth: FloatArray) -> "_Misfit":
+        uv, d_uv, _ = geometry.camera_b.project_with_jacobian(b_T_a.of(lines.points_m(inverse_depth)))
+        d_point = lines.direction @ b_T_a.R.T / np.maximum(inverse_depth, 1 / FAR_M)[:, None] ** 2
+        return _Misfit(residual_px=lines.uv_b - uv, d_uv=d_uv, slope=np.einsum("nij,nj->ni", d_uv, d_point))
+
+    def across(self, inverse_depth: FloatArray, nearest: float) -> FloatArray:
+        """Projection (n, 2, 2) onto what no change of depth can mend.
+
+        That is the component across the epipolar line; both components where the inverse depth is at the
+        end of its range, 0 to `nearest`, or moves nothing (no baseline).
+        """
+        length = np.linalg.norm(self.slope, axis=1)
+        downhill = np.einsum("ni,ni->n", self.slope, self.residual_px)
+        stuck = ((inverse_depth <= 0) & (downhill > 0)) | ((inverse_depth >= nearest) & (downhill < 0))
+        stuck |= length * nearest < _MIN_PARALLAX_PX
+        unit = np.where(stuck[:, None], 0.0, self.slope / np.maximum(length, 1e-12)[:, None])
+        return np.asarray(np.eye(2) - unit[:, :, None] * unit[:, None, :])
 
 
 def fit_pair(
@@ -82,17 +109,16 @@ def fit_pair(
     octaves = max(0.0, float(np.log2(start_scale_px / _FINEST_SCALE_PX)))
     shrinking = start_scale_px * 0.5 ** np.arange(0, octaves, 1 / _STEPS_PER_OCTAVE)
     information = np.eye(columns)
-    inverse_depth = _nearest_candidate(geometry, prior @ q, lines, options)
+    nearest = 1 / options.min_depth_m
+    # The corrections are small: the pose's derivatives are those at the start.
+    d_b_T_a = geometry.d_b_T_a(start.p, prior)
+    inverse_depth = _nearest_candidate(geometry, geometry.b_T_a(start.p), lines, nearest)
     for scale in [*shrinking, *[_FINEST_SCALE_PX] * _FINAL_STEPS]:
-        p = prior @ q
-        inverse_depth = _refine_depths(geometry, p, lines, inverse_depth, options, _DEPTH_STEPS)
-        residual, across = _across(geometry, p, lines, inverse_depth, options)
-        jacobian = np.empty((len(residual), 2, columns))
-        for k in range(columns):
-            moved = lines.residual_px(geometry, p + _DIFFERENCE * prior[:, k], inverse_depth)
-            jacobian[:, :, k] = (moved - residual) / _DIFFERENCE
-        r = np.einsum("nij,nj->ni", across, residual) / lines.noise[:, None]
-        J = across @ jacobian / lines.noise[:, None, None]
+        b_T_a = geometry.b_T_a(prior @ q)
+        inverse_depth, misfit = _refine_depths(geometry, b_T_a, lines, inverse_depth, nearest, _DEPTH_STEPS)
+        across = misfit.across(inverse_depth, nearest) / lines.noise[:, None, None]
+        r = np.einsum("nij,nj->ni", across, misfit.residual_px)
+        J = -across @ move_pixels(lines.points_m(inverse_depth), misfit.d_uv, d_b_T_a)
         weight = (scale**2 / (scale**2 + np.sum(r * r, axis=1))) ** 2 / _NOISE_PX**2
         information = np.eye(columns) + np.einsum("n,nik,nil->kl", weight, J, J)
         gradient = q + np.einsum("n,nik,ni->k", weight, J, r)
@@ -110,20 +136,19 @@ def epipolar_px(
     images would cause. Inverse depths (n,) are per metre from camera a.
     """
     lines = _Lines.of(geometry, uv_a, uv_b)
-    inverse_depth = _nearest_candidate(geometry, p, lines, options)
-    inverse_depth = _refine_depths(geometry, p, lines, inverse_depth, options, _FINAL_DEPTH_STEPS)
-    residual, across = _across(geometry, p, lines, inverse_depth, options)
-    return np.linalg.norm(np.einsum("nij,nj->ni", across, residual), axis=1) / lines.noise, inverse_depth
+    b_T_a, nearest = geometry.b_T_a(p), 1 / options.min_depth_m
+    inverse_depth = _nearest_candidate(geometry, b_T_a, lines, nearest)
+    inverse_depth, misfit = _refine_depths(geometry, b_T_a, lines, inverse_depth, nearest, _FINAL_DEPTH_STEPS)
+    missed = np.einsum("nij,nj->ni", misfit.across(inverse_depth, nearest), misfit.residual_px)
+    return np.linalg.norm(missed, axis=1) / lines.noise, inverse_depth
 
 
-def _nearest_candidate(
-    geometry: PairGeometry, p: FloatArray, lines: _Lines, options: FrontEndOptions
-) -> FloatArray:
+def _nearest_candidate(geometry: PairGeometry, b_T_a: Relative, lines: _Lines, nearest: float) -> FloatArray:
     """Inverse depths (n,), out of a few, whose pixels in b are nearest to the matched ones."""
     best, best_distance = np.zeros(len(lines.uv_b)), np.full(len(lines.uv_b), np.inf)
-    for candidate in np.linspace(0, 1, _DEPTH_CANDIDATES) ** 2 / options.min_depth_m:
+    for candidate in np.linspace(0, 1, _DEPTH_CANDIDATES) ** 2 * nearest:
         trial = np.full(len(best), candidate)
-        pixel, seen = geometry.transfer(lines.points_m(trial), p)
+        pixel, seen = geometry.transfer(lines.points_m(trial), b_T_a)
         distance = np.where(seen, np.linalg.norm(lines.uv_b - pixel, axis=1), np.inf)
         better = distance < best_distance
         best[better], best_distance[better] = candidate, distance[better]
@@ -132,52 +157,18 @@ def _nearest_candidate(
 
 def _refine_depths(
     geometry: PairGeometry,
-    p: FloatArray,
+    b_T_a: Relative,
     lines: _Lines,
     inverse_depth: FloatArray,
-    options: FrontEndOptions,
+    nearest: float,
     steps: int,
-) -> FloatArray:
-    """Inverse depths (n,) after some Gauss-Newton steps towards the matched pixels, infinity to nearest."""
-    nearest = 1 / options.min_depth_m
+) -> tuple[FloatArray, _Misfit]:
+    """Inverse depths (n,) after Gauss-Newton steps towards the matched pixels, and the misfit there."""
+    misfit = _Misfit.of(geometry, b_T_a, lines, inverse_depth)
     for _ in range(steps):
-        residual, slope = _along(geometry, p, lines, inverse_depth, options)
+        slope = misfit.slope
         length2 = np.maximum(np.einsum("ni,ni->n", slope, slope), 1e-12)
-        step = np.clip(-np.einsum("ni,ni->n", slope, residual) / length2, -nearest / 3, nearest / 3)
-        inverse_depth = np.clip(inverse_depth + step, 0.0, nearest)
-    return inverse_depth
-
-
-def _along(
-    geometry: PairGeometry,
-    p: FloatArray,
-    lines: _Lines,
-    inverse_depth: FloatArray,
-    options: FrontEndOptions,
-) -> tuple[FloatArray, FloatArray]:
-    """Residuals (n, 2) and their derivative (n, 2) by the inverse depth."""
-    step = _DIFFERENCE / options.min_depth_m
-    residual = lines.residual_px(geometry, p, inverse_depth)
-    return residual, (lines.residual_px(geometry, p, inverse_depth + step) - residual) / step
-
-
-def _across(
-    geometry: PairGeometry,
-    p: FloatArray,
-    lines: _Lines,
-    inverse_depth: FloatArray,
-    options: FrontEndOptions,
-) -> tuple[FloatArray, FloatArray]:
-    """Residuals (n, 2) and the projection (n, 2, 2) onto what no change of depth can mend.
-
-    That is the component across the epipolar line; both components where the depth is at the end of its
-    range or moves nothing (no baseline).
-    """
-    residual, slope = _along(geometry, p, lines, inverse_depth, options)
-    nearest = 1 / options.min_depth_m
-    length = np.linalg.norm(slope, axis=1)
-    downhill = np.einsum("ni,ni->n", slope, residual)
-    stuck = ((inverse_depth <= 0) & (downhill > 0)) | ((inverse_depth >= nearest) & (downhill < 0))
-    stuck |= length * nearest < _MIN_PARALLAX_PX
-    unit = np.where(stuck[:, None], 0.0, slope / np.maximum(length, 1e-12)[:, None])
-    return residual, np.eye(2) - unit[:, :, None] * unit[:, None, :]
+        step = -np.einsum("ni,ni->n", slope, misfit.residual_px) / length2
+        inverse_depth = np.clip(inverse_depth + np.clip(step, -nearest / 3, nearest / 3), 0.0, nearest)
+        misfit = _Misfit.of(geometry, b_T_a, lines, inverse_depth)
+    return inverse_depth, misfit

@@ -1,0 +1,83 @@
+"""Which images overlap, and on which parts of them, by all that telemetry knows."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pancam_graph.cameras import Camera
+from pancam_graph.geometry import BoolArray, FloatArray
+from pancam_graph.images._options import FrontEndOptions
+from pancam_graph.images._pairs import PairGeometry, inspected_depths_m
+from pancam_graph.traverse import Traverse
+
+__all__ = ["overlap_cells", "overlapping_pairs"]
+
+_GRID = 5
+_CELLS = 32
+
+
+def overlapping_pairs(
+    traverse: Traverse, options: FrontEndOptions, progress: Callable[[int, int], None] | None = None
+) -> list[PairGeometry]:
+    """Pairs of images (a before b) that can see the same terrain by all that telemetry knows."""
+    candidates = np.argwhere(np.triu(_cones_meet(traverse, options), 1))
+    pairs = []
+    for k, (a, b) in enumerate(candidates.tolist()):
+        pair = PairGeometry(traverse, a, b, options.mount_sigma_rad)
+        # Both ways: a narrow eye's whole field can lie between the corners of a wide one's pieces.
+        if any(p.overlap(options, widened=True).any() for p in (pair, replace(pair, a=b, b=a))):
+            pairs.append(pair)
+        if progress is not None:
+            progress(k + 1, len(candidates))
+    return pairs
+
+
+def _cones_meet(traverse: Traverse, options: FrontEndOptions) -> BoolArray:
+    """Which images (images, images) may see a common point, by the cones around their fields: a sieve."""
+    R, centre = traverse.camera_poses()
+    axis_of, half_of = zip(*(_cone(e.camera) for e in traverse.rig.eyes), strict=True)
+    axis = np.einsum("nij,nj->ni", R, np.array(axis_of)[traverse.image_eye])
+    half = np.array(half_of)[traverse.image_eye]
+    stop = traverse.image_stop
+    pointing = np.array([np.hypot(f.sigma_pan_rad, f.sigma_tilt_rad) for f in traverse.frames])
+    turn = np.array([s.sigma_rotation_rad for s in traverse.stops])[stop]
+    shift = np.array([s.sigma_translation_m for s in traverse.stops])[stop]
+    slack = np.hypot(pointing[traverse.image_frame], turn * np.sqrt(3)) + options.mount_sigma_rad
+    place = np.array([s.world_T_mast.translation() for s in traverse.stops])[stop]
+    meet = np.zeros((len(R), len(R)), dtype=bool)
+    depths = inspected_depths_m(options.min_depth_m)
+    for a, eye in enumerate(traverse.image_eye):
+        camera = traverse.rig.eyes[eye].camera
+        size = np.array([camera.width_px, camera.height_px])
+        u, v = np.meshgrid(*np.linspace(0, size - 1, _GRID).T)
+        direction = camera.unproject(np.column_stack([u.ravel(), v.ravel()])).direction @ R[a].T
+        points = (centre[a] + depths[:, None, None] * direction).reshape(-1, 3)
+        to_point = points[:, None] - centre
+        range_m = np.maximum(np.linalg.norm(to_point, axis=2), 1e-6)
+        angle = np.arccos(np.clip(np.einsum("kni,ni->kn", to_point, axis) / range_m, -1.0, 1.0))
+        gap = half[a] / (_GRID - 1)
+        spread = slack + slack[a] + np.sqrt(3) * np.where(stop == stop[a], 0.0, shift + shift[a]) / range_m
+        close = np.linalg.norm(place - place[a], axis=1) <= options.max_stop_distance_m
+        meet[a] = close & np.any(angle < half + gap + options.search_sigmas * spread, axis=0)
+    return np.asarray(meet | meet.T)
+
+
+def _cone(camera: Camera) -> tuple[FloatArray, float]:
+    """Axis (3,) and half angle of a cone around the camera's field."""
+    right, bottom = camera.width_px - 1.0, camera.height_px - 1.0
+    edge = np.array(
+        [[x * right, y * bottom] for x in (0, 0.5, 1) for y in (0, 0.5, 1) if (x, y) != (0.5, 0.5)]
+    )
+    axis = camera.unproject(np.array([[right / 2, bottom / 2]])).direction[0]
+    cosine = camera.unproject(edge).direction @ axis
+    return axis, float(np.arccos(np.clip(cosine.min(), -1.0, 1.0)))
+
+
+def overlap_cells(traverse: Traverse, pairs: Sequence[PairGeometry], options: FrontEndOptions) -> BoolArray:
+    """Which pieces of each image any of the pairs overlap on, (images, 32, 32) by row and column."""
+    wanted = np.zeros((len(traverse.images), _CELLS, _CELLS), dtype=bool)
+    for pair in pairs:
+        for one in (pair, replace(pair, a=pair.b, b=pair.a)):
+            wanted[one.a] |= one.overlap(options, widened=True, cells=_CELLS)
+    return wanted

@@ -1,0 +1,421 @@
+"""Finding observations in images: rendered scenes with known truth, and five frames of Opportunity."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import gtsam
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from pancam_graph import Frame, Image, Observations, Stop, Traverse
+from pancam_graph.cameras import Pinhole
+from pancam_graph.errors import ImageError, InputError
+from pancam_graph.geometry import HEAD_R_FORWARD_CAMERA, FloatArray, rz
+from pancam_graph.images import FrontEndOptions, find_observations
+from pancam_graph.images._features import find_features
+from pancam_graph.images._normalise import usable_mask
+from pancam_graph.images._tracks import Links, join_tracks
+from pancam_graph.io import read_pds
+from pancam_graph.rigs import Eye, Rig
+
+SIZE_PX = 240
+RADIUS_M = 5.0  # of the textured sphere that surrounds the first stop
+DECK_M = -0.6  # height of the rover's deck in the mast frame
+DECK_HALF_M = 1.2
+_STEP_RAD = 3e-3
+
+
+def small_rig() -> Rig:
+    camera = Pinhole(
+        width_px=SIZE_PX,
+        height_px=SIZE_PX,
+        fx_px=290.0,
+        fy_px=290.0,
+        cx_px=(SIZE_PX - 1) / 2,
+        cy_px=(SIZE_PX - 1) / 2,
+    )
+    eyes = tuple(
+        Eye(
+            name=name,
+            camera=camera,
+            head_T_camera=gtsam.Pose3(gtsam.Rot3(HEAD_R_FORWARD_CAMERA), np.array([0.1, y, 0.05])),
+        )
+        for name, y in (("left", 0.1), ("right", -0.1))
+    )
+    return Rig(name="small", pan_T_tilt=gtsam.Pose3(), eyes=eyes)
+
+
+def noise_texture(shape: tuple[int, int], seed: int) -> FloatArray:
+    rng = np.random.default_rng(seed)
+    out = np.zeros(shape)
+    for scale in (1.5, 3.0, 6.0, 15.0):
+        octave = ndimage.gaussian_filter(rng.standard_normal(shape), scale, mode="wrap")
+        out += octave / octave.std()
+    return out
+
+
+class Scene:
+    """A textured sphere fixed to the world and, if wanted, a textured deck fixed to each mast."""
+
+    def __init__(self, *, deck: bool = False) -> None:
+        self.sphere = noise_texture((700, 1100), 1)
+        self.deck = noise_texture((400, 400), 2) if deck else None
+
+    def points_m(self, traverse: Traverse, row: int, uv_px: FloatArray) -> tuple[FloatArray, np.ndarray]:
+        """World points that pixels of an image see, and whether they are on the deck."""
+        stops = [s.world_T_mast for s in traverse.stops]
+        R, centre = traverse.camera_poses()
+        camera = traverse.rig.eyes[traverse.image_eye[row]].camera
+        direction = camera.unproject(uv_px).direction @ R[row].T
+        along = direction @ centre[row]
+        reach = -along + np.sqrt(along**2 - centre[row] @ centre[row] + RADIUS_M**2)
+        world_T_mast = stops[traverse.image_stop[row]]
+        mast_c = world_T_mast.transformTo(centre[row])
+        mast_d = direction @ world_T_mast.rotation().matrix()
+        deck_reach = (DECK_M - mast_c[2]) / np.minimum(mast_d[:, 2], -1e-6)
+        on = np.abs(mast_c + deck_reach[:, None] * mast_d).max(axis=1) < DECK_HALF_M
+        on &= self.deck is not None
+        return centre[row] + np.where(on, deck_reach, reach)[:, None] * direction, on
+
+    def render(self, traverse: Traverse, row: int, bits: int = 8) -> np.ndarray:
+        u, v = np.meshgrid(np.arange(SIZE_PX), np.arange(SIZE_PX))
+        points, on_deck = self.points_m(traverse, row, np.column_stack([u.ravel(), v.ravel()]).astype(float))
+        azimuth, elevation = np.arctan2(points[:, 1], points[:, 0]), np.arcsin(points[:, 2] / RADIUS_M)
+        at = [350 - elevation / _STEP_RAD, 550 - azimuth / _STEP_RAD]
+        grey = ndimage.map_coordinates(self.sphere, at, order=3, mode="wrap")
+        if self.deck is not None:
+            mast = (points - traverse.stops[traverse.image_stop[row]].world_T_mast.translation()) @ (
+                traverse.stops[traverse.image_stop[row]].world_T_mast.rotation().matrix()
+            )
+            at = [200 + 160 * mast[:, 0], 200 + 160 * mast[:, 1]]
+            grey = np.where(on_deck, ndimage.map_coordinates(self.deck, at, order=3, mode="wrap"), grey)
+        noise = np.random.default_rng(row).normal(scale=0.02, size=grey.shape)
+        scaled = np.clip(0.5 + 0.1 * (grey + noise), 0, 1) * (2**bits - 1)
+        return np.rint(scaled).astype(np.uint8 if bits == 8 else np.uint16).reshape(SIZE_PX, SIZE_PX)
+
+
+def make_traverse(
+    folder: Path,
+    *,
+    pans_deg: tuple[float, ...] = (-26.0, 0.0, 26.0),
+    tilt_deg: float = 0.0,
+    stops: tuple[gtsam.Pose3, ...] = (gtsam.Pose3(),),
+    deck: bool = False,
+    bits: int = 8,
+) -> tuple[Traverse, Scene]:
+    """A traverse whose telemetry is the truth, with rendered image files in `folder`."""
+    scene = Scene(deck=deck)
+    sigma = float(np.deg2rad(0.1))
+    places = tuple(
+        Stop(id=f"s{k}", world_T_mast=pose, sigma_rotation_rad=2e-3, sigma_translation_m=0.02)
+        for k, pose in enumerate(stops)
+    )
+    frames = tuple(
+        Frame(
+            id=f"{s.id}-f{k}",
+            stop=s.id,
+            pan_rad=float(np.deg2rad(pan)),
+            tilt_rad=float(np.deg2rad(tilt_deg)),
+            sigma_pan_rad=sigma,
+            sigma_tilt_rad=sigma,
+        )
+        for s in places
+        for k, pan in enumerate(pans_deg)
+    )
+    images = tuple(
+        Image(id=f"{f.id}-{eye}", frame=f.id, camera=eye, file=f"{f.id}-{eye}.png")
+        for f in frames
+        for eye in ("left", "right")
+    )
+    truth = Traverse(
+        name="rendered", rig=small_rig(), stops=places, frames=frames, images=images, folder=folder
+    )
+    for row, image in enumerate(images):
+        assert cv2.imwrite(str(folder / str(image.file)), scene.render(truth, row, bits))
+    return truth, scene
+
+
+def disturbed(traverse: Traverse, sigma_deg: float, seed: int) -> Traverse:
+    """The traverse with pan and tilt moved, and its sigmas widened to match."""
+    sigma = float(np.deg2rad(sigma_deg))
+    change = np.random.default_rng(seed).normal(scale=sigma, size=(len(traverse.frames), 2))
+    frames = tuple(
+        replace(
+            f, pan_rad=f.pan_rad + d[0], tilt_rad=f.tilt_rad + d[1], sigma_pan_rad=sigma, sigma_tilt_rad=sigma
+        )
+        for f, d in zip(traverse.frames, change.tolist(), strict=True)
+    )
+    return replace(traverse, frames=frames)
+
+
+def found_in(traverse: Traverse) -> Observations:
+    assert traverse.observations is not None
+    return traverse.observations
+
+
+def errors_px(truth: Traverse, scene: Scene, obs: Observations) -> FloatArray:
+    """Distance of each observation from where its track's first one says it is, by the true scene."""
+    R, centre = truth.camera_poses()
+    first = np.searchsorted(obs.track, obs.track)
+    error = np.zeros(len(obs))
+    for row in range(len(truth.images)):
+        camera = truth.rig.eyes[truth.image_eye[row]].camera
+        for origin in range(len(truth.images)):
+            k = np.flatnonzero(
+                (obs.image == row) & (obs.image[first] == origin) & (first != np.arange(len(obs)))
+            )
+            if len(k):
+                points, _ = scene.points_m(truth, origin, obs.uv_px[first[k]])
+                pixel, _ = camera.project((points - centre[row]) @ R[row])
+                error[k] = np.linalg.norm(pixel - obs.uv_px[k], axis=1)
+    return error[first != np.arange(len(obs))]
+
+
+def as_bytes(obs: Observations) -> bytes:
+    return b"".join(c.tobytes() for c in (obs.image, obs.track, obs.uv_px, obs.sigma_px))
+
+
+@pytest.fixture(scope="module")
+def panorama(tmp_path_factory: pytest.TempPathFactory) -> tuple[Traverse, Scene]:
+    return make_traverse(tmp_path_factory.mktemp("panorama"))
+
+
+@pytest.fixture(scope="module")
+def panorama_found(panorama: tuple[Traverse, Scene]) -> Traverse:
+    return find_observations(panorama[0])
+
+
+def test_feature_positions_count_from_the_centre_of_the_first_pixel() -> None:
+    rng = np.random.default_rng(3)
+    v, u = np.mgrid[:SIZE_PX, :SIZE_PX].astype(float)
+    grid = np.stack(np.meshgrid(np.arange(30, 220, 45), np.arange(30, 220, 45)), -1).reshape(-1, 2)
+    spots = grid + rng.uniform(-0.5, 0.5, grid.shape)
+    image = sum(120 * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * 1.8**2)) for x, y in spots) + 60
+    camera = small_rig().eyes[0].camera
+    up = np.array([0.0, -1.0, 0.0])
+    found = find_features(
+        np.rint(image).astype(np.uint8), np.ones((4, 4), dtype=bool), camera, up, FrontEndOptions()
+    )
+    difference = found.uv_px[:, None] - spots
+    nearest = np.linalg.norm(difference, axis=2).argmin(axis=1)
+    offset = difference[np.arange(len(found)), nearest]
+    offset = offset[np.linalg.norm(offset, axis=1) < 1]
+    assert len(offset) > 0.8 * len(spots)
+    assert np.abs(np.median(offset, axis=0)).max() < 0.03
+
+
+def test_blocks_of_zeros_are_not_used_but_single_dark_pixels_are() -> None:
+    image = np.full((60, 60), 9, dtype=np.uint16)
+    image[:, :10] = 0
+    image[40, 40] = 0
+    usable = usable_mask(image)
+    assert not usable[:, :18].any()
+    assert usable[:, 25:].all()
+
+
+def test_tracks_lie_where_the_scene_says(panorama: tuple[Traverse, Scene], panorama_found: Traverse) -> None:
+    truth, scene = panorama
+    obs = found_in(panorama_found)
+    assert obs.origin == "images"
+    assert panorama_found.warnings == ()
+    error = errors_px(truth, scene, obs)
+    views = np.bincount(obs.track)
+    assert len(views) > 400
+    assert views.min() == 2
+    assert np.count_nonzero(views > 2) > 50
+    assert np.mean(error < 1) > 0.99
+    assert np.median(error) < 0.1
+
+
+def test_images_that_do_not_overlap_share_no_tracks(panorama_found: Traverse) -> None:
+    obs = found_in(panorama_found)
+    for track in np.unique(obs.track):
+        frames = panorama_found.image_frame[obs.image[obs.track == track]]
+        assert not {0, 2} <= set(frames.tolist())
+
+
+def test_same_input_same_bytes_whatever_the_threads(panorama: tuple[Traverse, Scene]) -> None:
+    threads = cv2.getNumThreads()
+    found = []
+    try:
+        for number in (1, 2):
+            cv2.setNumThreads(number)
+            found.append(as_bytes(found_in(find_observations(panorama[0]))))
+    finally:
+        cv2.setNumThreads(threads)
+    assert found[0] == found[1]
+
+
+def test_disturbed_start_finds_the_same(panorama: tuple[Traverse, Scene], panorama_found: Traverse) -> None:
+    truth, scene = panorama
+    obs = found_in(find_observations(disturbed(truth, 0.5, seed=4)))
+    error = errors_px(truth, scene, obs)
+    assert len(obs) == pytest.approx(len(found_in(panorama_found)), rel=0.05)
+    assert np.mean(error < 1) > 0.99
+
+
+def test_sixteen_bits_give_as_much(tmp_path: Path, panorama_found: Traverse) -> None:
+    truth, scene = make_traverse(tmp_path, pans_deg=(0.0, 26.0), bits=16)
+    obs = found_in(find_observations(truth))
+    assert np.median(errors_px(truth, scene, obs)) < 0.1
+    assert len(obs) > 0.5 * len(found_in(panorama_found))
+
+
+def test_between_stops_terrain_is_tied_and_the_deck_is_not(tmp_path: Path) -> None:
+    second = gtsam.Pose3(gtsam.Rot3(rz(0.15)), np.array([0.3, 0.5, 0.0]))
+    truth, scene = make_traverse(
+        tmp_path, pans_deg=(-13.0, 13.0), tilt_deg=-18.0, stops=(gtsam.Pose3(), second), deck=True
+    )
+    obs = found_in(find_observations(truth))
+    on_deck = np.zeros(len(obs), dtype=bool)
+    for row in range(len(truth.images)):
+        k = obs.image == row
+        on_deck[k] = scene.points_m(truth, row, obs.uv_px[k])[1]
+    stop = truth.image_stop[obs.image]
+    linking = np.array([len(set(stop[obs.track == t].tolist())) > 1 for t in range(int(obs.track.max()) + 1)])
+    assert np.count_nonzero(linking) > 40
+    assert np.count_nonzero(on_deck & ~linking[obs.track]) > 40
+    assert np.mean(on_deck[linking[obs.track]]) < 0.02
+
+
+def test_points_that_start_beyond_infinity_are_kept(tmp_path: Path) -> None:
+    # Frames turned apart by 3 mrad too little see what is 50 m away as if it were beyond infinity.
+    truth, _ = make_traverse(tmp_path, pans_deg=(0.0, 26.0))
+    frames = (truth.frames[0], replace(truth.frames[1], pan_rad=truth.frames[1].pan_rad + 0.012))
+    sigma = 0.006
+    frames = tuple(replace(f, sigma_pan_rad=sigma, sigma_tilt_rad=sigma) for f in frames)
+    reference, moved = (
+        found_in(find_observations(truth)),
+        found_in(find_observations(replace(truth, frames=frames))),
+    )
+    assert len(moved) == pytest.approx(len(reference), rel=0.1)
+
+
+def links(*rows: tuple[int, int, int, int, float]) -> Links:
+    table = np.array(rows)
+    columns = [table[:, i].astype(np.int64) for i in range(4)]
+    return Links(
+        image_a=columns[0],
+        feature_a=columns[1],
+        image_b=columns[2],
+        feature_b=columns[3],
+        distance=table[:, 4],
+    )
+
+
+def as_tracks(found: tuple[np.ndarray, ...]) -> list[list[tuple[int, int]]]:
+    image, feature, track = (c.tolist() for c in found)
+    out: list[list[tuple[int, int]]] = [[] for _ in range(max(track, default=-1) + 1)]
+    for i, f, t in zip(image, feature, track, strict=True):
+        out[t].append((i, f))
+    return out
+
+
+def test_links_join_to_tracks_numbered_by_their_first_feature() -> None:
+    found = join_tracks(links((0, 7, 1, 3, 0.2), (1, 3, 2, 5, 0.1), (0, 2, 1, 9, 0.3)))
+    assert as_tracks(found) == [[(0, 2), (1, 9)], [(0, 7), (1, 3), (2, 5)]]
+
+
+def test_of_two_features_of_an_image_only_the_worse_leaves_the_track() -> None:
+    found = join_tracks(links((0, 1, 1, 1, 0.1), (0, 1, 2, 1, 0.1), (1, 1, 2, 2, 0.4)))
+    assert as_tracks(found) == [[(0, 1), (1, 1), (2, 1)]]
+
+
+def test_what_hangs_on_the_worse_feature_leaves_with_it() -> None:
+    found = join_tracks(
+        links((0, 1, 1, 1, 0.1), (0, 1, 2, 1, 0.1), (1, 1, 2, 2, 0.4), (2, 2, 3, 8, 0.2), (2, 1, 3, 6, 0.1))
+    )
+    assert as_tracks(found) == [[(0, 1), (1, 1), (2, 1), (3, 6)], [(2, 2), (3, 8)]]
+
+
+def test_order_of_links_does_not_matter() -> None:
+    rng = np.random.default_rng(5)
+    rows = [
+        (a, int(rng.integers(12)), b, int(rng.integers(12)), float(rng.integers(4)))
+        for a, b in rng.integers(4, size=(60, 2)).tolist()
+        if a < b
+    ]
+    rows = sorted(set(rows))
+    reference = as_tracks(join_tracks(links(*rows)))
+    for _ in range(5):
+        shuffled = [rows[i] for i in rng.permutation(len(rows))]
+        assert as_tracks(join_tracks(links(*shuffled))) == reference
+    for track in reference:
+        assert len({image for image, _ in track}) == len(track) > 1
+
+
+def test_no_links_no_tracks() -> None:
+    assert as_tracks(join_tracks(Links.concatenate([]))) == []
+
+
+def test_blank_image_is_warned_of(tmp_path: Path) -> None:
+    truth, _ = make_traverse(tmp_path)
+    for eye in ("left", "right"):
+        cv2.imwrite(str(tmp_path / f"s0-f2-{eye}.png"), np.full((SIZE_PX, SIZE_PX), 90, np.uint8))
+    warnings = find_observations(truth).warnings
+    assert "image s0-f2-left: no observations were found in it" in warnings
+    assert any("s0-f2-left and s0-f2-right: no matches, although they overlap" in w for w in warnings)
+
+
+def test_image_without_a_file_is_warned_of(tmp_path: Path) -> None:
+    truth, _ = make_traverse(tmp_path)
+    images = (*truth.images[:-1], replace(truth.images[-1], file=None))
+    found = find_observations(replace(truth, images=images))
+    assert found.warnings == ("image s0-f2-right: it has no file",)
+
+
+def test_image_of_another_size_is_refused(tmp_path: Path) -> None:
+    truth, _ = make_traverse(tmp_path)
+    cv2.imwrite(str(tmp_path / "s0-f1-left.png"), np.zeros((200, 240), np.uint8))
+    with pytest.raises(
+        ImageError, match=r"s0-f1-left\.png: expected 240 x 240 .* camera left; found 240 x 200"
+    ):
+        find_observations(truth)
+
+
+def test_missing_file_is_refused(tmp_path: Path) -> None:
+    truth, _ = make_traverse(tmp_path)
+    (tmp_path / "s0-f0-right.png").unlink()
+    with pytest.raises(ImageError, match=r"s0-f0-right\.png"):
+        find_observations(truth)
+
+
+def test_no_files_and_nothing_found_are_refused(tmp_path: Path) -> None:
+    truth, _ = make_traverse(tmp_path)
+    without = replace(truth, images=tuple(replace(i, file=None) for i in truth.images))
+    with pytest.raises(InputError, match="expected observations or image files, found neither"):
+        find_observations(without)
+    for image in truth.images:
+        cv2.imwrite(str(tmp_path / str(image.file)), np.zeros((SIZE_PX, SIZE_PX), np.uint8))
+    with pytest.raises(InputError, match="expected features that several images share, found none"):
+        find_observations(truth)
+
+
+def test_options_out_of_range_are_refused() -> None:
+    with pytest.raises(InputError, match="min_depth_m: expected a number above 0, found 0"):
+        FrontEndOptions(min_depth_m=0.0)
+    with pytest.raises(InputError, match=r"ratio: expected a number below 1, found 1\.5"):
+        FrontEndOptions(ratio=1.5)
+
+
+def test_progress_counts_every_stage(panorama: tuple[Traverse, Scene]) -> None:
+    seen: dict[str, list[tuple[int, int]]] = {}
+    find_observations(panorama[0], progress=lambda stage, n, of: seen.setdefault(stage, []).append((n, of)))
+    assert set(seen) == {"overlaps", "features", "matches"}
+    for counts in seen.values():
+        assert counts == [(k + 1, len(counts)) for k in range(len(counts))]
+
+
+@pytest.mark.slow
+def test_opportunity(opportunity_folder: Path) -> None:
+    traverse = read_pds(opportunity_folder)
+    found = find_observations(traverse)
+    obs = found_in(found)
+    pairs = {tuple(obs.image[obs.track == t].tolist()) for t in np.unique(obs.track)}
+    assert pairs == {(0, 1), (2, 3), (3, 4)}
+    assert len(np.unique(obs.track)) > 3000
+    assert np.mean(obs.sigma_px == FrontEndOptions().refined_sigma_px) > 0.85
+    again = found_in(find_observations(disturbed(traverse, 0.5, seed=0)))
+    assert len(again) == pytest.approx(len(obs), rel=0.02)
