@@ -16,6 +16,7 @@ from pancam_graph.landmarks import (
     Landmarks,
     Measurements,
     evaluate,
+    free_derivatives,
     refine,
     residual_cofactor,
     triangulate,
@@ -76,6 +77,7 @@ def screen(
     for sweep in range(_SWEEPS):
         landmarks = refine(landmarks, measurements, views, accepted.astype(float))
         residual, b, in_front = evaluate(landmarks, measurements, views)
+        b = free_derivatives(b, landmarks, measurements)
         cofactor = residual_cofactor(b, measurements, accepted.astype(float))
         test, dof = _normalised(residual, cofactor)
         if sweep == 0:

@@ -92,7 +92,9 @@ def so3_right_jacobian_inverse(w: FloatArray) -> FloatArray:
 
 def wrap_angle(angle_rad: ArrayLike) -> FloatArray:
     """Angles to [-pi, pi)."""
-    return np.asarray((np.asarray(angle_rad, dtype=float) + np.pi) % (2 * np.pi) - np.pi)
+    wrapped = (np.asarray(angle_rad, dtype=float) + np.pi) % (2 * np.pi) - np.pi
+    # The remainder of an angle a rounding error below -pi is rounded up to the whole turn.
+    return np.where(wrapped >= np.pi, -np.pi, wrapped)
 
 
 def rotation_from_wxyz(wxyz: Sequence[float] | FloatArray) -> FloatArray:
@@ -161,7 +163,10 @@ def d_pan_tilt_rotation(tilt_rad: float) -> FloatArray:
 def pan_tilt_from_rotation(mast_R_head: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Pan and tilt (...,) of the head's x axis, (..., 3, 3); a twist about it is left out.
 
-    Looking straight up or down, pan is undefined and 0 is returned for it.
+    Tilt is in [-pi/2, pi/2]. Looking straight up or down, where the x axis has no pan, the y axis gives
+    it as if there were no twist.
     """
-    x = mast_R_head[..., :, 0]
-    return np.arctan2(x[..., 1], x[..., 0]), np.arctan2(x[..., 2], np.hypot(x[..., 0], x[..., 1]))
+    x, y = mast_R_head[..., :, 0], mast_R_head[..., :, 1]
+    level = np.hypot(x[..., 0], x[..., 1])
+    pan = np.where(level > 1e-9, np.arctan2(x[..., 1], x[..., 0]), np.arctan2(-y[..., 0], y[..., 1]))
+    return pan, np.arctan2(x[..., 2], level)

@@ -15,12 +15,14 @@ from pancam_graph.losses import SQUARED, Loss
 
 _BEHIND_COST = 1e12
 _REFINE_STEPS = 15
+_NO_BASELINE_M = 1e-9
 
 __all__ = [
     "CameraViews",
     "Landmarks",
     "Measurements",
     "evaluate",
+    "free_derivatives",
     "point_sigma_m",
     "refine",
     "residual_cofactor",
@@ -93,10 +95,10 @@ class Landmarks:
     def points_m(self, furthest_m: FloatArray) -> FloatArray:
         """World points (landmarks, 3); those further than `furthest_m` (landmarks,) are brought to it.
 
-        A landmark beyond infinity is placed at that distance too.
+        A landmark beyond infinity is placed at that distance too; one without a direction at its origin.
         """
         x, w = self.vector[:, :3], self.vector[:, 3]
-        depth = np.maximum(w, np.linalg.norm(x, axis=1) / furthest_m)
+        depth = np.maximum(w, np.linalg.norm(x, axis=1) / furthest_m).clip(1e-300)
         return np.asarray(self.origin_m + x / depth[:, None])
 
     def moved_to(self, points_m: FloatArray) -> "Landmarks":
@@ -111,25 +113,33 @@ def triangulate(
     """Linear triangulation in homogeneous coordinates from n rays sorted by landmark.
 
     Ray centres (n, 3), unit directions (n, 3), landmark rows (n,) ascending without gaps, weights (n,).
-    Minimises the weighted squared distances |(I - d d')(X - w c)|^2 over unit (X, w), then once more with
-    weights divided by the squared ranges so that angles count, not metres. One ray alone, or parallel
-    rays, leave a direction free: the smallest eigenvector is then one of many, and lies on the first ray.
+    Minimises the weighted squared distances |(I - d d')(X - w c)|^2 over unit (X, w), w in units of the
+    baseline across the rays so that the answer is the same in any unit of length; then once more with
+    weights divided by the squared ranges so that angles count, not metres. One ray alone, or rays along
+    one line, show no parallax: the landmark then lies on them at infinity. Where all weights of a landmark
+    are 0, all its rays count alike.
     """
     starts = np.searchsorted(landmark, np.arange(landmark[-1] + 1))
+    weight = np.where((np.add.reduceat(weight, starts) > 0)[landmark], weight, 1.0)
     total = np.add.reduceat(weight, starts)
-    mean = np.add.reduceat(weight[:, None] * centre_m, starts) / np.maximum(total, 1e-300)[:, None]
-    origin = np.where(total[:, None] > 0, mean, centre_m[starts])
+    origin = np.add.reduceat(weight[:, None] * centre_m, starts) / total[:, None]
     across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
     arm = np.einsum("nij,nj->ni", across, centre_m - origin[landmark])
+    baseline = np.sqrt(np.add.reduceat(weight * np.einsum("ni,ni->n", arm, arm), starts) / total)
+    parallax = baseline > _NO_BASELINE_M
+    baseline = np.where(parallax, baseline, 1.0)
+    arm = np.where(parallax[landmark, None], arm / baseline[landmark, None], 0.0)
     form = np.empty((len(landmark), 4, 4))
     form[:, :3, :3] = across
     form[:, :3, 3] = form[:, 3, :3] = -arm
-    form[:, 3, 3] = np.einsum("ni,ni->n", arm, arm)
+    form[:, 3, 3] = np.where(parallax[landmark], np.einsum("ni,ni->n", arm, arm), 1.0)
     vector = np.empty((len(origin), 4))
     ray_weight = weight
     for _ in range(2):
         _, vectors = np.linalg.eigh(np.add.reduceat(ray_weight[:, None, None] * form, starts))
         vector = vectors[:, :, 0]
+        vector[:, 3] /= baseline
+        vector /= np.linalg.norm(vector, axis=1, keepdims=True)
         towards = vector[landmark, :3] - vector[landmark, 3:] * (centre_m - origin[landmark])
         ray_weight = weight / np.maximum(np.einsum("ni,ni->n", towards, towards), 1e-12)
     sight = np.add.reduceat(weight * np.sign(np.einsum("ni,ni->n", towards, direction)), starts)
@@ -160,6 +170,18 @@ def evaluate(
     return residual, d_vector @ _tangent_basis(landmarks.vector)[k], in_front
 
 
+def free_derivatives(b: FloatArray, landmarks: Landmarks, measurements: Measurements) -> FloatArray:
+    """`evaluate`'s derivatives (n, 2, 3) along those directions that `refine` leaves free.
+
+    A landmark that `refine` holds at infinity (w is 0) does not follow its observations beyond it: its
+    derivatives lose their part along w.
+    """
+    at_infinity = landmarks.vector[:, 3] == 0
+    along_w = np.where(at_infinity[:, None], _tangent_basis(landmarks.vector)[:, 3, :], 0.0)
+    along_w = along_w[measurements.landmark]
+    return np.asarray(b - np.einsum("nij,nj->ni", b, along_w)[:, :, None] * along_w[:, None, :])
+
+
 def _tangent_basis(vector: FloatArray) -> FloatArray:
     """Orthonormal bases (landmarks, 4, 3) of the tangent spaces, by Householder reflections."""
     v = vector.copy()
@@ -184,10 +206,12 @@ def refine(
     Landmarks whose rays diverge end at infinity, or beyond it where that is allowed.
     """
     free = _refine(landmarks, measurements, views, weight, loss, held_at_infinity=False)
-    beyond = np.flatnonzero(free.vector[:, 3] < 0)
+    # One whose vector is its origin alone has no direction in which infinity could be.
+    is_beyond = (free.vector[:, 3] < 0) & (np.linalg.norm(free.vector[:, :3], axis=1) > 1e-9)
+    beyond = np.flatnonzero(is_beyond)
     if beyond_infinity or len(beyond) == 0:
         return free
-    rows = np.flatnonzero((free.vector[:, 3] < 0)[measurements.landmark])
+    rows = np.flatnonzero(is_beyond[measurements.landmark])
     flat = free.vector[beyond] * [1.0, 1.0, 1.0, 0.0]
     flat /= np.linalg.norm(flat, axis=1, keepdims=True)
     bound = _refine(
@@ -221,10 +245,8 @@ def _refine(
         now = replace(landmarks, vector=vector[active], origin_m=landmarks.origin_m[active])
         residual, b, in_front = evaluate(now, part, views)
         cost = _landmark_cost(residual, in_front, own, part.starts, loss)
-        if held_at_infinity:  # no step along w
-            w = _tangent_basis(now.vector)[:, 3, :]
-            w /= np.linalg.norm(w, axis=1, keepdims=True)
-            b = b - np.einsum("nij,nj->ni", b, w[part.landmark])[:, :, None] * w[part.landmark][:, None, :]
+        if held_at_infinity:
+            b = free_derivatives(b, now, part)
         wb = (own * loss.weight(residual))[:, None, None] * b
         v = np.add.reduceat(b.transpose(0, 2, 1) @ wb, part.starts)
         g = np.add.reduceat(np.einsum("nij,ni->nj", wb, residual), part.starts)
@@ -235,6 +257,8 @@ def _refine(
         length = np.linalg.norm(step, axis=1)
         step *= np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))[:, None]
         moved = now.vector + np.einsum("lij,lj->li", _tangent_basis(now.vector), step)
+        if held_at_infinity:
+            moved[:, 3] = 0.0
         trial = replace(now, vector=moved / np.linalg.norm(moved, axis=1, keepdims=True))
         trial_residual, _, trial_front = evaluate(trial, part, views)
         trial_cost = _landmark_cost(trial_residual, trial_front, own, part.starts, loss)
