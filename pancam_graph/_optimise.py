@@ -8,7 +8,7 @@ import gtsam
 
 from pancam_graph.errors import SolveError
 
-__all__ = ["Iteration", "Outcome", "StopRule", "linear_step", "optimise"]
+__all__ = ["Elimination", "Iteration", "Outcome", "StopRule", "optimise"]
 
 _LOG = logging.getLogger(__name__)
 _INDETERMINATE = "ndeterminate"
@@ -62,7 +62,7 @@ def optimise(
     """
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setlambdaUpperBound(1e10)
-    _set_elimination(parameters, graph, values, by_qr=by_qr)
+    Elimination(graph, values, by_qr=by_qr).set_up(parameters)
     try:
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
         costs = [optimizer.error()]
@@ -88,39 +88,42 @@ def optimise(
     return Outcome(values=optimizer.values(), converged=converged, reason=reason, costs=tuple(costs))
 
 
-def linear_step(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.VectorValues:
-    """The Gauss-Newton step of the graph at the values. Raises SolveError where it is not determined."""
-    for by_qr in (False, True):
-        parameters = gtsam.GaussNewtonParams()
-        _set_elimination(parameters, graph, values, by_qr=by_qr)
-        try:
-            optimizer = gtsam.GaussNewtonOptimizer(graph, values, parameters)
-            optimizer.iterate()
-        except RuntimeError as error:
-            if by_qr or _INDETERMINATE not in str(error):
-                raise _explained(error) from error
-        else:
-            break
-    return values.localCoordinates(optimizer.values())
-
-
-def _set_elimination(
-    parameters: gtsam.NonlinearOptimizerParams,
-    graph: gtsam.NonlinearFactorGraph,
-    values: gtsam.Values,
-    *,
-    by_qr: bool,
-) -> None:
-    """Choose the factorisation and the order of elimination.
+class Elimination:
+    """Factorisation and order of elimination for graphs of one structure.
 
     GTSAM's Cholesky refuses a variable of which one direction is known 4096 times better than another: the
     range of a far landmark, or a camera pose that a tight tie holds once its angles are eliminated. So angles
     and masts come last; and QR, three times slower, minds less.
     """
-    parameters.setLinearSolverType("MULTIFRONTAL_QR" if by_qr else "MULTIFRONTAL_CHOLESKY")
-    last = [key for key in values.keys() if chr(gtsam.symbolChr(key)) in "AMR"]  # noqa: SIM118  gtsam.Values
-    ordering = gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(graph, last, False)
-    parameters.setOrdering(ordering)
+
+    def __init__(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, *, by_qr: bool = False
+    ) -> None:
+        last = [key for key in values.keys() if chr(gtsam.symbolChr(key)) in "AMR"]  # noqa: SIM118  gtsam.Values
+        self.ordering = gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(graph, last, False)
+        self.by_qr = by_qr
+
+    def set_up(self, parameters: gtsam.NonlinearOptimizerParams) -> None:
+        """Make an optimiser use it."""
+        parameters.setLinearSolverType("MULTIFRONTAL_QR" if self.by_qr else "MULTIFRONTAL_CHOLESKY")
+        parameters.setOrdering(self.ordering)
+
+    def step(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.VectorValues:
+        """The Gauss-Newton step of the graph at the values; by QR from where Cholesky first fails.
+
+        Raises SolveError where the step is not determined.
+        """
+        parameters = gtsam.GaussNewtonParams()
+        self.set_up(parameters)
+        try:
+            optimizer = gtsam.GaussNewtonOptimizer(graph, values, parameters)
+            optimizer.iterate()
+        except RuntimeError as error:
+            if self.by_qr or _INDETERMINATE not in str(error):
+                raise _explained(error) from error
+            self.by_qr = True
+            return self.step(graph, values)
+        return values.localCoordinates(optimizer.values())
 
 
 def _explained(error: RuntimeError) -> Exception:

@@ -265,9 +265,9 @@ def _refine(
         better = trial_cost < cost
         vector[active[better]] = trial.vector[better]
         damping[active] = np.where(better, damping[active] * 0.1, damping[active] * 100.0).clip(1e-12, 1e9)
-        # A landmark stays where a step promises no more than rounding, or where no damping makes one gain.
+        # A landmark stays where a step promises next to nothing, or where no damping makes one gain.
         promised = -0.5 * np.einsum("li,li->l", step, g)
-        settled = (promised <= 1e-12 * cost) | (~better & (damping[active] > 1e6))
+        settled = (promised <= 1e-9 * cost) | (~better & (damping[active] > 1e6))
         keep = np.zeros(len(vector), dtype=bool)
         keep[active[~settled]] = True
         rows, active = np.flatnonzero(keep[measurements.landmark]), np.flatnonzero(keep)

@@ -11,7 +11,7 @@ import numpy as np
 
 from pancam_graph._covariance import covariances
 from pancam_graph._diagnose import connection_warnings
-from pancam_graph._optimise import Iteration, Outcome, StopRule, linear_step, optimise
+from pancam_graph._optimise import Elimination, Iteration, Outcome, StopRule, optimise
 from pancam_graph._rejection import rays_of, screen
 from pancam_graph.cameras import carry_to_pinhole
 from pancam_graph.errors import InputError, SolveError
@@ -35,7 +35,7 @@ __all__ = ["SolveOptions", "solve"]
 
 _LOG = logging.getLogger(__name__)
 
-_SCREENING_ROUNDS = 8
+_SCREENING_ROUNDS = 12
 _FINAL_ROUNDS = 6
 _TYPICAL_RANGE_M = 10.0
 _FURTHEST_PARALLAX_SIGMAS = 0.01
@@ -264,7 +264,7 @@ class _Adjustment:
             views,
             self.accepted,
             cutoff_sigma=self.options.outlier_sigma,
-            min_scale=0.5,
+            min_scale=1.0,  # errors of telemetry are common to a frame: a small median must not exclude one
         )
         self.landmarks, self.accepted = screening.landmarks, screening.accepted
 
@@ -275,7 +275,9 @@ class _Adjustment:
         scale = 1.0
         for number in range(_SCREENING_ROUNDS):
             loss = loss_of(self.options.loss, scale)
-            self._approach(StopRule(max_iterations=10, relative_decrease=1e-3), loss, stage="screening")
+            # Roughly at first; in the end exactly, so that what is kept does not depend on the start.
+            rule = StopRule(max_iterations=15, relative_decrease=1e-3 if number == 0 else 1e-6)
+            self._approach(rule, loss, stage="screening")
             before = self.accepted
             screening = screen(
                 self.landmarks,
@@ -286,7 +288,7 @@ class _Adjustment:
                 min_scale=min_scale,
             )
             self.landmarks, self.accepted = screening.landmarks, screening.accepted
-            settled = abs(screening.scale - scale) < 0.05 * scale
+            settled = abs(screening.scale - scale) < 1e-3 * scale
             scale = screening.scale
             changed = int(np.sum(before != self.accepted))
             _LOG.info(
@@ -297,7 +299,7 @@ class _Adjustment:
                 changed,
                 scale,
             )
-            if settled and changed <= 1e-3 * len(before):
+            if settled and changed == 0:
                 break
 
     def _final_rounds(self) -> Outcome:
@@ -345,11 +347,13 @@ class _Adjustment:
         observed = gtsam.NonlinearFactorGraph(self.factors)
         observed.push_back(explicit.factors(self.accepted & present[self.measurements.landmark], loss))
         cost = self._cost(observed, explicit, present)
+        start = explicit.with_landmarks(self.values, self.points_m, present)
+        elimination = Elimination(observed, start)
         for number in range(1, rule.max_iterations + 1):
             weak = self._weak(present)
             graph = gtsam.NonlinearFactorGraph(observed)
             graph.push_back(explicit.proximal_factors(self.points_m, weak.bearable_m, weak.stretched))
-            step = linear_step(graph, explicit.with_landmarks(self.values, self.points_m, present))
+            step = elimination.step(graph, explicit.with_landmarks(self.values, self.points_m, present))
             before, landmarks_before, points_before = self.values, self.landmarks, self.points_m
             for shrink in (1.0, 0.25, 0.0625, 0.0156):
                 self.values = self.template.retract(before, step, shrink)
