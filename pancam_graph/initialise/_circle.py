@@ -10,6 +10,8 @@ from pancam_graph.geometry import FloatArray
 __all__ = ["CircleFit", "fit_circle"]
 
 _SHORT_ARC_RAD = np.pi / 2
+_LINE = 1e5
+"""A radius so many times the spread of the centres is a line: they bend by less than a millionth of it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -42,8 +44,8 @@ def fit_circle(centres_m: FloatArray, up: FloatArray | None = None) -> CircleFit
     `up` (3,) chooses the normal's sign; default: the sense in which the points follow each other is
     anticlockwise. Geometric fit (Gauss-Newton from the algebraic one, Gander et al. 1994).
 
-    Raises GeometryError for fewer than three centres, for centres that coincide, and for collinear ones,
-    where no circle is determined.
+    Raises GeometryError for fewer than three centres, for centres that coincide, and for collinear ones or
+    those that a line fits as well as any circle, where no circle is determined.
     """
     points = np.asarray(centres_m, dtype=float)
     n = len(points)
@@ -75,8 +77,12 @@ def fit_circle(centres_m: FloatArray, up: FloatArray | None = None) -> CircleFit
         jacobian = np.column_stack([-arm / distance[:, None], -np.ones(n)])
         step, *_ = np.linalg.lstsq(jacobian, -(distance - radius), rcond=None)
         centre, radius = centre + step[:2], radius + float(step[2])
-        if np.linalg.norm(step) < 1e-14 * (1 + radius):
+        if np.linalg.norm(step) < 1e-14 * (1 + radius) or radius > _LINE * spread[0]:
             break
+    if radius > _LINE * spread[0]:
+        raise GeometryError(
+            f"circle: a line fits the {n} centres as well as any circle; no circle is determined"
+        )
     arm = flat - centre
     distance = np.linalg.norm(arm, axis=1)
     phi = np.unwrap(np.arctan2(arm[:, 1], arm[:, 0]))

@@ -8,11 +8,15 @@ import numpy as np
 
 from pancam_graph.cameras import decompose_projection
 from pancam_graph.errors import GeometryError, InputError
-from pancam_graph.geometry import FloatArray, pan_tilt_from_rotation, pose_arrays, wrap_angle
+from pancam_graph.geometry import FloatArray, IntArray, pose_arrays, wrap_angle
 from pancam_graph.initialise._circle import fit_circle
+from pancam_graph.rigs import Rig
 from pancam_graph.traverse import Traverse
 
 __all__ = ["Start", "start_from_cameras", "start_from_odometry", "start_from_telemetry"]
+
+_ONE_TILT_RAD = 0.01
+"""Frames whose tilts differ by less share a circle: encoders repeat to a tenth of that."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,10 +56,11 @@ def start_from_odometry(traverse: Traverse, mast_T_next: Sequence[gtsam.Pose3]) 
 def start_from_cameras(traverse: Traverse, projections: FloatArray) -> Start:
     """Masts and angles from the projection matrices (images, 3, 4) of all images.
 
-    Each stop's centres, eye by eye, give a circle (thesis 4.6): its normal is the pan axis, its centre
-    lies on it. The rig says how high above the mast's origin; telemetry's pan only where the angle
-    counts from. A stop whose centres determine no circle (fewer than three, collinear), or cover less
-    than a quarter of it, gets its pose from the cameras' rotations and telemetry's angles; a warning says so.
+    Each stop's centres, eye by eye and tilt by tilt, give a circle (thesis 4.6): its normal is the pan
+    axis, its centre lies on it. The rig says how high above the mast's origin; telemetry says which frames
+    share a tilt, and where the pan counts from. A stop whose centres determine no circle (fewer than three,
+    collinear), or cover less than a quarter of it, gets its pose from the cameras' rotations and
+    telemetry's angles; a warning says so.
 
     Raises CameraError for a matrix that is no camera, InputError for a wrong number of matrices.
     """
@@ -88,8 +93,8 @@ def start_from_cameras(traverse: Traverse, projections: FloatArray) -> Start:
             first = int(rows[0])
             eye = int(traverse.image_eye[first])
             mast_R_head = masts_R[traverse.frame_stop[f]].T @ world_R_camera[first] @ mounts_R[eye].T
-            pan, tilt = pan_tilt_from_rotation(mast_R_head)
-            angles[f] = angles[f] + wrap_angle(np.array([pan, tilt]) - angles[f])
+            found = np.array([_pan(traverse.rig, mast_R_head[:, 1]), _tilt(traverse.rig, mast_R_head[2])])
+            angles[f] = angles[f] + wrap_angle(found - angles[f])
     return Start(world_T_mast=tuple(masts), pan_tilt_rad=angles, warnings=tuple(warnings))
 
 
@@ -111,30 +116,32 @@ def _mast_by_circles(
     traverse: Traverse, rows: np.ndarray, world_R_camera: FloatArray, centres: FloatArray, near: gtsam.Pose3
 ) -> gtsam.Pose3:
     """Mast pose whose z axis is the normal of the eyes' circles, and whose origin the rig places on it."""
-    up = near.rotation().matrix()[:, 2]
+    rig, up = traverse.rig, near.rotation().matrix()[:, 2]
+    mounts_R, _ = pose_arrays([e.head_T_camera for e in rig.eyes])
     normals, origins, weights = [], [], []
-    reasons = []
+    reasons: list[tuple[int, str]] = []
     for eye in np.unique(traverse.image_eye[rows]):
-        own = rows[traverse.image_eye[rows] == eye]
-        tilts = traverse.pan_tilt_rad[traverse.image_frame[own], 1]
-        level = tilts[0]
-        own = own[np.abs(tilts - level) < 0.01]  # one circle is one tilt
-        try:
-            fit = fit_circle(centres[own], up)
-        except GeometryError as error:
-            reasons.append(str(error))
-            continue
-        if fit.short_arc:
-            reasons.append(
-                f"circle: the centres cover {np.rad2deg(fit.arc_rad):.0f} degrees only; 90 or more are needed"
-            )
-            continue
-        _, _, height = traverse.rig.circle(int(eye), float(level))
-        normals.append(fit.rotation[:, 2])
-        origins.append(fit.centre_m - height * fit.rotation[:, 2])
-        weights.append(len(own))
+        of_eye = rows[traverse.image_eye[rows] == eye]
+        for own in _same_tilt(of_eye, traverse.pan_tilt_rad[traverse.image_frame[of_eye], 1]):
+            try:
+                fit = fit_circle(centres[own], up)
+            except GeometryError as error:
+                reasons.append((len(own), str(error)))
+                continue
+            if fit.short_arc:
+                degrees = np.rad2deg(fit.arc_rad)
+                reasons.append(
+                    (len(own), f"circle: the centres cover {degrees:.0f} degrees only; 90 or more are needed")
+                )
+                continue
+            z = fit.rotation[:, 2]
+            tilts = [_tilt(rig, mounts_R[eye] @ world_R_camera[i].T @ z) for i in own]
+            _, _, height = rig.circle(int(eye), float(np.mean(tilts)))
+            normals.append(z)
+            origins.append(fit.centre_m - height * z)
+            weights.append(len(own))
     if not normals:
-        raise GeometryError(reasons[0] if reasons else "circle: no eye has one")
+        raise GeometryError(max(reasons, key=lambda reason: reason[0])[1])
     z = np.average(normals, axis=0, weights=weights)
     z /= np.linalg.norm(z)
     x = near.rotation().matrix()[:, 0]
@@ -142,3 +149,27 @@ def _mast_by_circles(
     x /= np.linalg.norm(x)
     rotation = np.column_stack([x, np.cross(z, x), z])
     return gtsam.Pose3(gtsam.Rot3(rotation), np.average(origins, axis=0, weights=weights))
+
+
+def _same_tilt(rows: IntArray, tilt_rad: FloatArray) -> list[IntArray]:
+    """Rows (n,) in groups whose tilts (n,) differ by less than `_ONE_TILT_RAD`, each in the order given."""
+    group = np.empty(len(rows), dtype=np.int64)
+    first = -np.inf
+    number = -1
+    for i in np.argsort(tilt_rad, kind="stable"):
+        if tilt_rad[i] - first > _ONE_TILT_RAD:
+            first, number = tilt_rad[i], number + 1
+        group[i] = number
+    return [rows[group == g] for g in range(number + 1)]
+
+
+def _tilt(rig: Rig, head_up: FloatArray) -> float:
+    """Tilt from the mast's z axis (3,) in the head frame, which pan does not turn."""
+    axis_up = rig.pan_T_tilt.rotation().matrix()[2]
+    return float(np.arctan2(head_up[0], head_up[2]) - np.arctan2(axis_up[0], axis_up[2]))
+
+
+def _pan(rig: Rig, mast_left: FloatArray) -> float:
+    """Pan from the head's y axis (3,) in the mast frame, which tilt does not turn."""
+    axis_left = rig.pan_T_tilt.rotation().matrix()[:, 1]
+    return float(np.arctan2(mast_left[1], mast_left[0]) - np.arctan2(axis_left[1], axis_left[0]))
