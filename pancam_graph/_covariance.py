@@ -76,7 +76,7 @@ def _inverse(information: FloatArray) -> FloatArray:
     scale = 1 / np.sqrt(np.diag(information).clip(1e-300))
     try:
         half = cho_factor(information * scale[:, None] * scale, lower=True)
-    except np.linalg.LinAlgError as error:
+    except (np.linalg.LinAlgError, ValueError) as error:  # not positive, not finite
         raise SolveError(f"covariances: nothing holds a direction of the solution: {error}") from error
     return np.asarray(cho_solve(half, np.diag(scale)) * scale[:, None])
 
@@ -114,6 +114,6 @@ def _inverse_of_blocks(matrix: bsr_array) -> bsr_array:
     """
     matrix.sort_indices()
     values, vectors = np.linalg.eigh(matrix.data)
-    values = values.clip(1e-15 * values[:, -1:])
+    values = values.clip(1e-15 * values[:, -1:] + 1e-300)
     inverse = vectors @ (vectors.transpose(0, 2, 1) / values[:, :, None])
     return bsr_array((inverse, matrix.indices, matrix.indptr), shape=matrix.shape)

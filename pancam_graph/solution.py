@@ -79,7 +79,9 @@ class Solution:
     sigma_px: FloatArray
     """(observations,) standard deviation each was weighted with in the end."""
     stop_covariance: FloatArray
-    """(stops, 6, 6) rotation first, body frame, landmarks marginalised; formal. 0 for a held stop."""
+    """(stops, 6, 6) rotation first, body frame, landmarks marginalised; formal. 0 for a held stop.
+
+    NaN, as the angles' sigmas, where the solution leaves a direction free; a warning says so."""
     angle_sigma_rad: FloatArray
     """(frames, 2) formal standard deviation of pan and tilt, landmarks marginalised."""
     warnings: tuple[str, ...] = ()

@@ -493,7 +493,12 @@ class _Adjustment:
 
         final = self.template.state(self.values, np.where(present[:, None], self.points_m, np.nan))
         initial = self.template.state(self.initial_values, initial_points)
-        stop_covariance, angle_sigma = covariances(self.template, self.graph, self.graph_values, final)
+        try:
+            stop_covariance, angle_sigma = covariances(self.template, self.graph, self.graph_values, final)
+        except SolveError as error:
+            self.warnings.append(f"no uncertainties: {error}")
+            stop_covariance = np.full((len(t.stops), 6, 6), np.nan)
+            angle_sigma = np.full((len(t.frames), 2), np.nan)
         return Solution(
             traverse=t,
             model=self.options.model,

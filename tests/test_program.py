@@ -1,0 +1,153 @@
+"""The programs as users run them: exit status, one sentence for bad input, nothing half-written."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pancam_graph import SimulationOptions, simulate, solve, write_traverse
+from pancam_graph.io import read_solution_json
+from pancam_graph.rigs import mer_navcam
+
+SMALL = SimulationOptions(stops=2, pans=2, sweep_rad=0.8, points_per_image=10, outliers=0.02)
+Run = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture
+def run(scripts_folder: Path, tmp_path: Path) -> Run:
+    def call(script: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, str(scripts_folder / script), *arguments],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONWARNINGS": "ignore"},
+            text=True,
+            capture_output=True,
+            check=False,
+        )
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def older_results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("older") / "out"
+    solve(simulate(mer_navcam(), SMALL, seed=0).traverse).save(out, report=False)
+    return out
+
+
+@pytest.fixture
+def traverse_folder(tmp_path: Path) -> Path:
+    simulation = simulate(mer_navcam(), SMALL, seed=0)
+    write_traverse(simulation.traverse, tmp_path / "traverse")
+    return tmp_path / "traverse"
+
+
+def test_solves_and_writes_the_contract(run: Run, traverse_folder: Path, tmp_path: Path) -> None:
+    done = run("optimize_traverse.py", "traverse", "--out", "out")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert done.stdout.count("\n") == 1
+    out = tmp_path / "out"
+    assert {p.name for p in out.iterdir()} == {"solution.json", "points.ply", "residuals.csv", "report.html"}
+    solution = read_solution_json(out / "solution.json")
+    assert solution.model == "mast"
+    assert solution.landmarks == "explicit"
+    raw = json.loads((out / "solution.json").read_text())
+    n = len(json.loads((traverse_folder / "traverse.json").read_text())["images"])
+    assert len(raw["images"]) == n
+    assert np.array(raw["stops"][1]["covariance"]).shape == (6, 6)
+    assert raw["observations"]["used"] + raw["observations"]["rejected"] > 100
+
+
+@pytest.mark.parametrize("model", ["circle", "free"])
+def test_models_and_no_report(run: Run, traverse_folder: Path, tmp_path: Path, model: str) -> None:
+    done = run("optimize_traverse.py", "traverse", "--out", "out", "--model", model, "--no-report")
+    assert done.returncode == 0, done.stderr
+    assert not (tmp_path / "out" / "report.html").exists()
+    assert read_solution_json(tmp_path / "out" / "solution.json").model == model
+
+
+BAD: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
+    "truncated json": (
+        lambda t: (t / "traverse.json").write_text((t / "traverse.json").read_text()[:200]) and None,
+        ("traverse.json", "expected JSON"),
+    ),
+    "unknown template": (
+        lambda t: edit(t, rig={"template": "lunokhod"}),
+        ("traverse.json", "template", "mer-navcam", "lunokhod"),
+    ),
+    "no observations file": (
+        lambda t: (t / "observations.npz").unlink(),
+        ("observations.npz", "expected a file"),
+    ),
+    "path that leaves": (lambda t: edit(t, observations="../x.npz"), ("observations", "inside", "../x.npz")),
+    "no such folder": (lambda t: t.rename(t.with_name("elsewhere")) and None, ("traverse", "expected")),
+}
+
+
+def edit(folder: Path, **entries: object) -> None:
+    path = folder / "traverse.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **entries}))
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_one_sentence_and_status_2(
+    run: Run, traverse_folder: Path, older_results: Path, tmp_path: Path, case: str
+) -> None:
+    spoil, words = BAD[case]
+    shutil.copytree(older_results, tmp_path / "out")
+    before = {p.name: p.read_bytes() for p in (tmp_path / "out").iterdir()}
+    spoil(traverse_folder)
+    done = run("optimize_traverse.py", "traverse", "--out", "out")
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.count("\n") == 1
+    assert "Traceback" not in done.stderr
+    for word in words:
+        assert word in done.stderr
+    assert {p.name: p.read_bytes() for p in (tmp_path / "out").iterdir()} == before
+    assert {p.name for p in tmp_path.iterdir()} <= {"out", "traverse", "elsewhere"}
+
+
+def test_out_that_is_not_ours_is_left_alone(run: Run, traverse_folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "chapter.tex").write_text("years of work")
+    done = run("optimize_traverse.py", "traverse", "--out", "thesis")
+    assert done.returncode == 2
+    assert "thesis" in done.stderr
+    assert [p.name for p in (tmp_path / "thesis").iterdir()] == ["chapter.tex"]
+
+
+def test_wrong_option_is_one_line(run: Run, traverse_folder: Path) -> None:
+    done = run("optimize_traverse.py", "traverse", "--out", "out", "--model", "ring")
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "'ring'" in done.stderr
+
+
+def test_no_observation_twice_is_bad_input(run: Run, tmp_path: Path) -> None:
+    simulation = simulate(mer_navcam(), SMALL, seed=0)
+    t = simulation.traverse
+    assert t.observations is not None
+    lonely = replace(t.observations.select(np.arange(5)), track=np.arange(5))
+    write_traverse(t.with_observations(lonely), tmp_path / "traverse")
+    done = run("optimize_traverse.py", "traverse", "--out", "out")
+    assert done.returncode == 2
+    assert "two or more images" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_simulate_then_optimize(run: Run, tmp_path: Path) -> None:
+    options = ("--stops", "1", "--pans", "2", "--sweep-deg", "45", "--seed", "3")
+    assert run("simulate_traverse.py", "made", *options).returncode == 0
+    assert run("optimize_traverse.py", "made", "--out", "out", "--no-report").returncode == 0
+    again = run("simulate_traverse.py", "made", *options)
+    assert again.returncode == 2
+    assert "made" in again.stderr
