@@ -18,6 +18,7 @@ from pancam_graph import (
     simulate,
     solve,
 )
+from pancam_graph._adjustment import Adjustment
 from pancam_graph.cameras import CAHVORE
 from pancam_graph.errors import InputError, SolveError
 from pancam_graph.graph import Tie
@@ -116,13 +117,12 @@ def test_errors_have_the_variance_that_the_covariance_says(name: str, model: str
 
 def test_covariances_agree_with_gtsam_marginals() -> None:
     """Landmarks marginalised by blocks here, by GTSAM's Bayes tree there (which refuses far landmarks)."""
-    solve_module = sys.modules["pancam_graph.solve"]
     simulation = simulate(mer_navcam(), SMALL, seed=2)
     t = simulation.traverse
     assert t.observations is not None
     distance = np.linalg.norm(simulation.truth.landmarks_m, axis=1)
     near = t.with_observations(t.observations.select((distance < 20.0)[t.observations.track]))
-    adjustment = solve_module._Adjustment(near, SolveOptions(loss="none"), None, None)
+    adjustment = Adjustment(near, SolveOptions(loss="none"), None, None)
     solution = adjustment.run()
     marginals = gtsam.Marginals(adjustment.graph, adjustment.graph_values)
     assert solution.stop_covariance[0].tolist() == np.zeros((6, 6)).tolist()
