@@ -7,6 +7,7 @@ infinity (w below 0) can come back.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -40,6 +41,11 @@ class CameraViews:
     """(images, 3) metres"""
     calibration: FloatArray
     """(images, 3, 3) upper-triangular K"""
+
+    @cached_property
+    def to_pixel(self) -> FloatArray:
+        """(images, 3, 3) K camera_R_world: takes world directions to homogeneous pixels."""
+        return np.asarray(self.calibration @ self.world_R_camera.transpose(0, 2, 1))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -154,11 +160,11 @@ def evaluate(
 
     Residuals of landmarks behind a camera are those of the mirrored point and mean nothing.
     """
-    k, r, image = measurements.landmark, views.world_R_camera, measurements.image
+    k, image = measurements.landmark, measurements.image
     offset = views.world_t_camera[image] - landmarks.origin_m[k]
     vector = landmarks.vector[k]
     world_ray = vector[:, :3] - vector[:, 3:] * offset
-    to_pixel = views.calibration[image] @ r[image].transpose(0, 2, 1)
+    to_pixel = views.to_pixel[image]
     p = np.einsum("nij,nj->ni", to_pixel, world_ray)
     in_front = p[:, 2] > 1e-12
     depth = np.where(np.abs(p[:, 2]) > 1e-12, p[:, 2], 1e-12)
@@ -267,7 +273,7 @@ def _refine(
         damping[active] = np.where(better, damping[active] * 0.1, damping[active] * 100.0).clip(1e-12, 1e9)
         # A landmark stays where a step promises next to nothing, or where no damping makes one gain.
         promised = -0.5 * np.einsum("li,li->l", step, g)
-        settled = (promised <= 1e-9 * cost) | (~better & (damping[active] > 1e6))
+        settled = (promised <= 1e-9 * cost + 1e-12) | (~better & (damping[active] > 1e6))
         keep = np.zeros(len(vector), dtype=bool)
         keep[active[~settled]] = True
         rows, active = np.flatnonzero(keep[measurements.landmark]), np.flatnonzero(keep)
@@ -309,8 +315,7 @@ def point_sigma_m(
     fewer than two accepted observations see.
     """
     image, k = measurements.image, measurements.landmark
-    camera_R_world = views.world_R_camera[image].transpose(0, 2, 1)
-    to_pixel = views.calibration[image] @ camera_R_world
+    to_pixel = views.to_pixel[image]
     p = np.einsum("nij,nj->ni", to_pixel, points_m[k] - views.world_t_camera[image])
     depth = np.where(np.abs(p[:, 2]) > 1e-12, p[:, 2], 1e-12)
     uv = p[:, :2] / depth[:, None]
