@@ -249,13 +249,12 @@ class Adjustment:
         rescale = options.rescale_noise
         if rescale is None:
             rescale = self.observations.origin == "images"
-        costs: list[float] = []
-        self._approach(StopRule(max_iterations=20, relative_decrease=1e-4), SQUARED, stage="approach")
+        costs = self._approach(StopRule(max_iterations=20, relative_decrease=1e-4), SQUARED, stage="approach")
         self._set_aside_behind()
         for _ in range(_FINAL_ROUNDS):
             outcome = self._adjust(rule)
-            gained = costs[-1] - outcome.costs[-1] if costs else np.inf
-            costs += outcome.costs if not costs else outcome.costs[1:]
+            gained = costs[-1] - outcome.costs[-1]
+            costs += outcome.costs[1:]
             moved = self._recarry()
             if rescale:
                 factor = self._noise_factor()
@@ -269,8 +268,8 @@ class Adjustment:
                 break
         return replace(outcome, costs=tuple(costs))
 
-    def _approach(self, rule: StopRule, loss: Loss, *, stage: str) -> None:
-        """Gauss-Newton on everything, landmarks placed anew after every step.
+    def _approach(self, rule: StopRule, loss: Loss, *, stage: str) -> list[float]:
+        """Gauss-Newton on everything, landmarks placed anew after every step; returns the costs.
 
         Far from the optimum a landmark's linear prediction goes astray (behind a camera, beyond infinity)
         and would hold back all others; its best place for the cameras found is what counts.
@@ -282,7 +281,7 @@ class Adjustment:
             raise SolveError("observations: expected tracks that agree in two or more images, found none")
         observed = gtsam.NonlinearFactorGraph(self.factors)
         observed.push_back(explicit.factors(self.accepted & present[self.measurements.landmark], loss))
-        cost = self._cost(observed, explicit, present)
+        costs = [self._cost(observed, explicit, present)]
         start = explicit.with_landmarks(self.values, self.points_m, present)
         elimination = Elimination(observed, start)
         for number in range(1, rule.max_iterations + 1):
@@ -295,16 +294,17 @@ class Adjustment:
                 self.values = self.template.retract(before, step, shrink)
                 self._place(loss)
                 trial = self._cost(observed, explicit, present)
-                if trial < cost:
+                if trial < costs[-1]:
                     break
                 self.values, self.landmarks, self.points_m = before, landmarks_before, points_before
             else:
                 break
-            decrease, cost = cost - trial, trial
+            costs.append(trial)
             if self.on_iteration is not None:
-                self.on_iteration(Iteration(stage=stage, number=number, cost=cost))
-            if decrease <= rule.relative_decrease * cost:
+                self.on_iteration(Iteration(stage=stage, number=number, cost=trial))
+            if costs[-2] - trial <= rule.relative_decrease * trial:
                 break
+        return costs
 
     def _cost(
         self, graph: gtsam.NonlinearFactorGraph, explicit: ExplicitLandmarks, present: BoolArray

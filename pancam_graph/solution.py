@@ -59,7 +59,9 @@ class Solution:
     """Why the iterations ended, in words."""
     iterations: int
     cost_history: tuple[float, ...]
-    """Cost after each iteration of the final least-squares stage, its start first."""
+    """Cost after each iteration of the final least-squares stage, its start first.
+
+    It starts where screening for outliers ended; without a loss, at the telemetry."""
     cost_initial: float
     """Half the sum of squares of whitened residuals at the start, priors included."""
     cost_final: float
