@@ -24,6 +24,10 @@ class FrontEndOptions:
     """The strongest features kept per image, evenly over a grid of cells."""
     min_depth_m: float = 0.5
     """Nothing nearer than this is matched."""
+    min_overlap: float = 0.05
+    """Images of one stop of which less can overlap, as a share of either, are not compared."""
+    min_overlap_between_stops: float = 0.25
+    """The same for images of two stops, whose terrain may lie at any depth: most that can overlap do not."""
     max_stop_distance_m: float = 20.0
     """Images of stops further apart are not compared."""
     search_sigmas: float = 4.0

@@ -8,7 +8,7 @@ import numpy as np
 from pancam_graph.cameras import Camera
 from pancam_graph.geometry import BoolArray, FloatArray
 from pancam_graph.images._options import FrontEndOptions
-from pancam_graph.images._pairs import PairGeometry, inspected_depths_m
+from pancam_graph.images._pairs import MAX_TURN_RAD, MAX_ZOOM, PairGeometry, inspected_depths_m
 from pancam_graph.traverse import Traverse
 
 __all__ = ["overlap_cells", "overlapping_pairs"]
@@ -26,11 +26,22 @@ def overlapping_pairs(
     for k, (a, b) in enumerate(candidates.tolist()):
         pair = PairGeometry(traverse, a, b, options.mount_sigma_rad)
         # Both ways: a narrow eye's whole field can lie between the corners of a wide one's pieces.
-        if any(p.overlap(options, widened=True).any() for p in (pair, replace(pair, a=b, b=a))):
+        if any(_share(p, options) > 0 for p in (pair, replace(pair, a=b, b=a))):
             pairs.append(pair)
         if progress is not None:
             progress(k + 1, len(candidates))
     return pairs
+
+
+def _share(pair: PairGeometry, options: FrontEndOptions) -> float:
+    """Share of image a that can lie on b; 0 where it is too small to be worth a comparison.
+
+    Within a stop the search window counts, so that a small overlap is found wherever the pointing errs.
+    Between stops it would let nearly all pairs through: there the pointing is taken as telemetry has it.
+    """
+    share = float(np.mean(pair.overlap(options, widened=pair.same_stop)))
+    least = options.min_overlap if pair.same_stop else options.min_overlap_between_stops
+    return share if share > least else 0.0
 
 
 def _cones_meet(traverse: Traverse, options: FrontEndOptions) -> BoolArray:
@@ -53,13 +64,17 @@ def _cones_meet(traverse: Traverse, options: FrontEndOptions) -> BoolArray:
         u, v = np.meshgrid(*np.linspace(0, size - 1, _GRID).T)
         direction = camera.unproject(np.column_stack([u.ravel(), v.ravel()])).direction @ R[a].T
         points = (centre[a] + depths[:, None, None] * direction).reshape(-1, 3)
+        gap = half[a] / (_GRID - 1)
+        close = np.linalg.norm(place - place[a], axis=1) <= options.max_stop_distance_m
         to_point = points[:, None] - centre
         range_m = np.maximum(np.linalg.norm(to_point, axis=2), 1e-6)
         angle = np.arccos(np.clip(np.einsum("kni,ni->kn", to_point, axis) / range_m, -1.0, 1.0))
-        gap = half[a] / (_GRID - 1)
         spread = slack + slack[a] + np.sqrt(3) * np.where(stop == stop[a], 0.0, shift + shift[a]) / range_m
-        close = np.linalg.norm(place - place[a], axis=1) <= options.max_stop_distance_m
-        meet[a] = close & np.any(angle < half + gap + options.search_sigmas * spread, axis=0)
+        inside = angle < half + gap + options.search_sigmas * spread
+        turned = np.einsum("kni,ki->kn", to_point, to_point[:, a]) / (range_m * range_m[:, [a]])
+        zoom = range_m / range_m[:, [a]]
+        alike = (turned > np.cos(MAX_TURN_RAD + gap)) & (np.abs(np.log(zoom)) < np.log(2 * MAX_ZOOM))
+        meet[a] = close & np.any(inside & alike, axis=0)
     return np.asarray(meet | meet.T)
 
 

@@ -12,7 +12,16 @@ from pancam_graph.geometry import BoolArray, FloatArray, IntArray, compose, pose
 from pancam_graph.images._options import FrontEndOptions
 from pancam_graph.traverse import Traverse
 
-__all__ = ["FAR_M", "PairGeometry", "Relative", "Segments", "inspected_depths_m", "move_pixels"]
+__all__ = [
+    "FAR_M",
+    "MAX_TURN_RAD",
+    "MAX_ZOOM",
+    "PairGeometry",
+    "Relative",
+    "Segments",
+    "inspected_depths_m",
+    "move_pixels",
+]
 
 FAR_M = 1e7
 """Stands for infinity: a baseline of 100 m is 1e-5 rad there."""
@@ -20,8 +29,10 @@ FAR_M = 1e7
 _DEPTHS = 16
 _COARSE_FARTHEST_M = 200.0
 _DIFFERENCE = 1e-2
-_MAX_TURN_RAD = np.deg2rad(45.0)
-_MAX_ZOOM = 2.5
+MAX_TURN_RAD = float(np.deg2rad(30.0))
+"""Terrain seen from further around looks too different for its descriptors."""
+MAX_ZOOM = 2.5
+"""And so from so many times the distance."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -288,8 +299,8 @@ def _alike(points_m: FloatArray, b_T_a: Relative) -> BoolArray:
     from_a = from_b - b_T_a.t
     range_a, range_b = np.linalg.norm(from_a, axis=1), np.linalg.norm(from_b, axis=1)
     cosine = np.einsum("ni,ni->n", from_a, from_b) / np.maximum(range_a * range_b, 1e-12)
-    near = (range_a < _MAX_ZOOM * range_b) & (range_b < _MAX_ZOOM * range_a)
-    return np.asarray(near & (cosine > np.cos(_MAX_TURN_RAD)))
+    near = (range_a < MAX_ZOOM * range_b) & (range_b < MAX_ZOOM * range_a)
+    return np.asarray(near & (cosine > np.cos(MAX_TURN_RAD)))
 
 
 def inspected_depths_m(min_depth_m: float) -> FloatArray:
