@@ -35,6 +35,10 @@ __all__ = ["Adjustment"]
 _LOG = logging.getLogger(__name__)
 
 _SCREENING_ROUNDS = 12
+_ABOUT = 0.002
+"""The first pass of screening ends when no more than this share of the observations changes."""
+_GROSS = 3.0
+"""The second begins with what is within this many times the cutoff."""
 _FINAL_ROUNDS = 6
 _TYPICAL_RANGE_M = 10.0
 _FURTHEST_PARALLAX_SIGMAS = 0.01
@@ -205,38 +209,55 @@ class Adjustment:
         self.landmarks, self.accepted = screening.landmarks, screening.accepted
 
     def _screening_rounds(self) -> None:
-        """Robust adjustment and screening in turn, until the same observations stay."""
-        given = self.observations.origin == "given"
-        min_scale = 1.0 if given else 0.05
+        """Robust adjustment and screening in turn, until the same observations stay.
+
+        Twice: what is kept should depend on the images, not on the way from the start. So the first pass only
+        finds about where the cameras are; the second begins there with all but the grossest outliers.
+        """
+        cutoff = self.options.outlier_sigma
         scale = 1.0
-        for number in range(_SCREENING_ROUNDS):
-            loss = loss_of(self.options.loss, scale)
-            # Roughly at first; in the end exactly, so that what is kept does not depend on the start.
-            rule = StopRule(max_iterations=15, relative_decrease=1e-3 if number == 0 else 1e-6)
-            self._approach(rule, loss, stage="screening")
-            before = self.accepted
-            screening = screen(
-                self.landmarks,
-                self.measurements,
-                self._views(self.values),
-                before,
-                cutoff_sigma=self.options.outlier_sigma,
-                min_scale=min_scale,
-            )
-            self.landmarks, self.accepted = screening.landmarks, screening.accepted
-            settled = abs(screening.scale - scale) < 1e-3 * scale
-            scale = screening.scale
-            changed = int(np.sum(before != self.accepted))
-            _LOG.info(
-                "screening %d: %d of %d observations kept, %d changed, noise %.2f sigma",
-                number + 1,
-                int(self.accepted.sum()),
-                len(self.accepted),
-                changed,
-                scale,
-            )
-            if settled and changed == 0:
+        for _ in range(_SCREENING_ROUNDS):
+            scale, changed = self._screening_round(scale, cutoff, relative_decrease=1e-3)
+            if changed <= _ABOUT * len(self.accepted):
                 break
+        self.accepted = np.ones_like(self.accepted)
+        self._screen(_GROSS * cutoff)
+        for _ in range(_SCREENING_ROUNDS):
+            before = scale
+            scale, changed = self._screening_round(scale, cutoff, relative_decrease=1e-6)
+            if changed == 0 and abs(scale - before) < 1e-3 * scale:
+                break
+
+    def _screening_round(
+        self, scale: float, cutoff_sigma: float, *, relative_decrease: float
+    ) -> tuple[float, int]:
+        """One robust adjustment and screening: the noise scale, and how many observations came or went."""
+        rule = StopRule(max_iterations=20, relative_decrease=relative_decrease)
+        self._approach(rule, loss_of(self.options.loss, scale), stage="screening")
+        before = self.accepted
+        scale = self._screen(cutoff_sigma)
+        changed = int(np.sum(before != self.accepted))
+        _LOG.info(
+            "screening: %d of %d observations kept, %d changed, noise %.2f sigma",
+            int(self.accepted.sum()),
+            len(self.accepted),
+            changed,
+            scale,
+        )
+        return scale, changed
+
+    def _screen(self, cutoff_sigma: float) -> float:
+        """Screen with the cameras as they are; returns the noise scale."""
+        screening = screen(
+            self.landmarks,
+            self.measurements,
+            self._views(self.values),
+            self.accepted,
+            cutoff_sigma=cutoff_sigma,
+            min_scale=1.0 if self.observations.origin == "given" else 0.05,
+        )
+        self.landmarks, self.accepted = screening.landmarks, screening.accepted
+        return screening.scale
 
     def _final_rounds(self) -> Outcome:
         """Least squares over what was kept, until neither noise scale nor weak landmarks move any more."""
