@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from published_cameras import MODEL_A, MODEL_B, MODEL_C
 
 from pancam_graph.cameras import (
     CAHV,
-    CAHVOR,
     CAHVORE,
     Brown,
     Camera,
@@ -19,39 +19,7 @@ from pancam_graph.cameras import (
 from pancam_graph.errors import CameraError
 from pancam_graph.geometry import HEAD_R_FORWARD_CAMERA, FloatArray
 
-# Vectors and pixels from published calibrations; the pixels were computed by two independent programs.
-MODEL_A = CAHVOR(
-    width_px=1024,
-    height_px=1024,
-    C=np.array([3.451904, 3.258335, 1.254338]),
-    A=np.array([-0.698217, -0.681994, -0.217661]),
-    H=np.array([-1378.872803, 894.719666, -106.732689]),
-    V=np.array([86.414558, 49.038635, -1620.883789]),
-    O=np.array([-0.695858, -0.679843, -0.231508]),
-    R=np.array([0.0002, -0.108075, 0.086320]),
-)
-MODEL_B = CAHVOR(
-    width_px=1024,
-    height_px=1024,
-    C=np.array([0.953083, 0.737269, -1.83989]),
-    A=np.array([0.61802, -0.158336, 0.770042]),
-    H=np.array([622.069, 1100.35, 388.444]),
-    V=np.array([-588.816, 157.005, 1176.66]),
-    O=np.array([0.615108, -0.158211, 0.772395]),
-    R=np.array([1.35787e-5, 0.00183074, -0.0057552]),
-)
-MODEL_C = CAHVORE(
-    width_px=5120,
-    height_px=3840,
-    C=np.array([0.12848, -0.214947, -0.056891]),
-    A=np.array([0.999943, -0.005833, 0.00885]),
-    H=np.array([2612.926691, 2943.39557, 14.632299]),
-    V=np.array([1916.489292, -3.389678, 2975.009835]),
-    O=np.array([0.99995, -0.004409, 0.008967]),
-    R=np.array([2e-6, 0.049535, -0.015973]),
-    E=np.array([-0.003612, 0.013016, -0.023961]),
-    linearity=0.37,
-)
+# Their pixels in the tests were computed by two independent programs.
 PINHOLE = Pinhole(
     width_px=640, height_px=480, fx_px=500.0, fy_px=510.0, cx_px=321.0, cy_px=237.0, skew_px=2.0
 )

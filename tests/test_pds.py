@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from published_cameras import MODEL_B, MODEL_C
 from scipy.spatial.transform import Rotation
 
 from pancam_graph.cameras import CAHV, CAHVOR, CAHVORE
@@ -82,29 +83,9 @@ def mars2020_mast(*, as_designed: bool) -> Mast:
     )
 
 
-NAVCAM_B = CAHVOR(  # Curiosity, right Navcam, vectors as published in the rover frame
-    width_px=8,
-    height_px=6,
-    C=np.array([0.953083, 0.737269, -1.83989]),
-    A=np.array([0.61802, -0.158336, 0.770042]),
-    H=np.array([622.069, 1100.35, 388.444]),
-    V=np.array([-588.816, 157.005, 1176.66]),
-    O=np.array([0.615108, -0.158211, 0.772395]),
-    R=np.array([1.35787e-5, 0.00183074, -0.0057552]),
-)
+NAVCAM_B = replace(MODEL_B, width_px=8, height_px=6)
 NAVCAM_B_JOINTS = (2.91281, 0.715421)
-MARS2020_NAVCAM = CAHVORE(  # left Navcam in the head frame
-    width_px=8,
-    height_px=6,
-    C=np.array([0.12848, -0.214947, -0.056891]),
-    A=np.array([0.999943, -0.005833, 0.00885]),
-    H=np.array([2612.926691, 2943.39557, 14.632299]),
-    V=np.array([1916.489292, -3.389678, 2975.009835]),
-    O=np.array([0.99995, -0.004409, 0.008967]),
-    R=np.array([2e-6, 0.049535, -0.015973]),
-    E=np.array([-0.003612, 0.013016, -0.023961]),
-    linearity=0.37,
-)
+MARS2020_NAVCAM = replace(MODEL_C, width_px=8, height_px=6)
 
 
 def turned(model: CAHV, rotation: FloatArray, shift: FloatArray) -> CAHV:
