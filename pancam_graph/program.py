@@ -37,7 +37,7 @@ def run(main: Callable[[], int]) -> NoReturn:
     """Run a program: bad input ends it with one sentence on standard error and status 2."""
     try:
         sys.exit(main())
-    except PancamGraphError as error:
+    except (PancamGraphError, OSError) as error:
         sys.stderr.write(f"{str(error).strip()}\n")
         sys.exit(BAD_INPUT)
     except KeyboardInterrupt:

@@ -1,18 +1,19 @@
-#!/usr/bin/env python3
 """Simulate a rover traverse with known truth and write it as a traverse folder.
 
 OUT gets traverse.json and observations.npz, which scripts/optimize_traverse.py reads, and truth.npz, which
 no solver reads: world_T_mast (stops,4,4), pan_tilt_rad (frames,2), landmarks_m (tracks,3), and per
 observation uv_px without noise and outlier. Metres, radians, z up. Same options, same numbers.
+
+Exit status: 0 written, 2 bad input (nothing is written).
 """
 
-import argparse
 from pathlib import Path
 
 import numpy as np
 
 from pancam_graph.errors import InputError
 from pancam_graph.io import write_traverse
+from pancam_graph.program import Parser, run, show_log
 from pancam_graph.rigs import TEMPLATES, rig_template
 from pancam_graph.simulate import SimulationOptions, simulate
 
@@ -21,11 +22,10 @@ def _degrees(text: str) -> float:
     return float(np.deg2rad(float(text)))
 
 
-def main() -> None:
-    """Run the program; exits with 2 for input that cannot be used."""
-    d, raw = SimulationOptions(), argparse.RawDescriptionHelpFormatter
-    p = argparse.ArgumentParser(description=__doc__, usage="%(prog)s OUT [options]", formatter_class=raw)
-    add = p.add_argument
+def main() -> int:
+    """Simulate and write."""
+    d, parser = SimulationOptions(), Parser(__doc__ or "")
+    add = parser.add_argument
     add("out", metavar="OUT", type=Path, help="folder to write; must be new or empty")
     add("--rig", choices=TEMPLATES, default="mer-navcam", help="cameras (%(default)s)")
     add("--seed", type=int, default=0, help="another seed, another traverse (%(default)s)")
@@ -40,21 +40,20 @@ def main() -> None:
     add("--pointing-scale", type=float, default=1.0, help="errors of pan and tilt, times the rig's (1)")
     add("--sigma-stop-m", type=float, default=d.sigma_stop_m, help="odometry's, per axis (%(default)s)")
     add("--sigma-stop-deg", dest="sigma_stop_rad", type=_degrees, default=d.sigma_stop_rad, help="(0.57)")
-    a = vars(p.parse_args())
-    out, rig, seed = (a.pop(k) for k in ("out", "rig", "seed"))
-    try:
-        if out.exists() and not (out.is_dir() and not any(out.iterdir())):
-            p.exit(2, f"{p.prog}: {out}: expected a new or empty folder, found files\n")
-        options = SimulationOptions(**{**a, "tilts_rad": a["tilts_rad"] and tuple(a["tilts_rad"])})
-        s = simulate(rig_template(rig), options, seed=seed)
-        write_traverse(s.traverse, out)
-        arrays = {k: getattr(s.truth, k) for k in ("pan_tilt_rad", "landmarks_m", "uv_px", "outlier")}
-        np.savez(out / "truth.npz", world_T_mast=[m.matrix() for m in s.truth.world_T_mast], **arrays)
-    except (InputError, OSError) as error:
-        p.exit(2, f"{p.prog}: {error}\n")
+    a = vars(parser.parse_args())
+    out, rig, seed, verbose = (a.pop(k) for k in ("out", "rig", "seed", "verbose"))
+    show_log(verbose=verbose)
+    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
+        raise InputError(f"{out}: expected a new or empty folder, found files")
+    options = SimulationOptions(**{**a, "tilts_rad": a["tilts_rad"] and tuple(a["tilts_rad"])})
+    s = simulate(rig_template(rig), options, seed=seed)
+    write_traverse(s.traverse, out)
+    arrays = {k: getattr(s.truth, k) for k in ("pan_tilt_rad", "landmarks_m", "uv_px", "outlier")}
+    np.savez(out / "truth.npz", world_T_mast=[m.matrix() for m in s.truth.world_T_mast], **arrays)
     counts = f"{len(s.traverse.stops)} stops, {len(s.traverse.images)} images"
     print(f"{out}: {counts}, {len(s.truth.landmarks_m)} tracks, {len(s.truth.uv_px)} observations")
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -22,7 +22,6 @@ from pancam_graph.rigs import TEMPLATES, Eye, Rig, rig_template
 from pancam_graph.simulate import Simulation, SimulationOptions, simulate
 from pancam_graph.traverse import Observations
 
-SCRIPT = Path(__file__).parents[1] / "scripts" / "simulate_traverse.py"
 SMALL = SimulationOptions(stops=2, pans=3, sweep_rad=1.5)
 
 
@@ -296,14 +295,12 @@ def test_a_view_of_nothing_but_sky_is_refused() -> None:
         simulate(rig, seed=-1)
 
 
-def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, str(SCRIPT), *(str(a) for a in arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
-
-
-def test_program_writes_a_traverse_with_the_truth_beside(tmp_path: Path) -> None:
+def test_program_writes_a_traverse_with_the_truth_beside(scripts_folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    done = run(out, "--stops", 2, "--pans", 3, "--sweep-deg", 90, "--tilts-deg", -5, -30, "--outliers", 0.1)
+    numbers = ["--stops", "2", "--pans", "3", "--sweep-deg", "90", "--tilts-deg", "-5", "-30"]
+    command = [sys.executable, str(scripts_folder / "simulate_traverse.py"), str(out), *numbers]
+    command += ["--outliers", "0.1"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.count("\n") == 1
     options = SimulationOptions(
@@ -335,6 +332,7 @@ def test_program_writes_a_traverse_with_the_truth_beside(tmp_path: Path) -> None
 def test_program_refuses_in_one_sentence_and_writes_nothing(
     arguments: list[str],
     sentence: str,
+    scripts_folder: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -344,7 +342,7 @@ def test_program_refuses_in_one_sentence_and_writes_nothing(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["simulate_traverse.py", *arguments])
     with pytest.raises(SystemExit, match="2"):
-        runpy.run_path(str(SCRIPT), run_name="__main__")
+        runpy.run_path(str(scripts_folder / "simulate_traverse.py"), run_name="__main__")
     said = capsys.readouterr()
     assert said.out == ""
     assert said.err.count("\n") == 1
