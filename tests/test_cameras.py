@@ -1,4 +1,4 @@
-"""Camera models: RIGS.md's test vectors, round trips, Jacobians, domains, P to K, R, C."""
+"""Camera models: published test vectors, round trips, Jacobians, domains, P to K, R, C."""
 
 import gtsam
 import numpy as np

@@ -54,7 +54,7 @@ class PointingSigma:
 class Rig:
     """A pan-tilt mast with one or more eyes.
 
-    `mast_T_camera = Rz(pan) . pan_T_tilt . Ry(-tilt) . head_T_camera` (DESIGN: section 3). At constant
+    `mast_T_camera = Rz(pan) . pan_T_tilt . Ry(-tilt) . head_T_camera` (docs/conventions.md). At constant
     tilt an eye's centre runs on a circle about the pan axis: thesis eq. 4.8.
     """
 
