@@ -373,7 +373,7 @@ class Adjustment:
             bearable_m=2 * _STRETCHED * sideways,
         )
 
-    # --- helpers ---
+    # --- what the rounds share ---
 
     def _present(self) -> BoolArray:
         """(landmarks,) which have two accepted observations or more."""
@@ -434,14 +434,15 @@ class Adjustment:
         for row, reason in ((m.row[self.accepted & ~kept], "single"), (m.row[~self.accepted], "outlier")):
             self.reason[row] = np.where(self.reason[row] == "", reason, self.reason[row])
 
+        initial_views = self._views(self.initial_values)
         initial_landmarks = refine(
             self._triangulate(self.initial_values, kept.astype(float)),
             m,
-            self._views(self.initial_values),
+            initial_views,
             kept.astype(float),
             beyond_infinity=True,
         )
-        initial_points = self._points(initial_landmarks, self._views(self.initial_values))
+        initial_points = self._points(initial_landmarks, initial_views)
         initial_points = np.where(present[:, None], initial_points, np.nan)
         base = gtsam.NonlinearFactorGraph(self.factors)
         explicit = ExplicitLandmarks(self.template, m)
@@ -471,9 +472,7 @@ class Adjustment:
             landmark_track=self.landmark_track,
             used=used,
             reason=tuple(str(r) for r in self.reason),
-            residual_initial_px=self._raw_residuals(
-                initial_landmarks, self._views(self.initial_values), present
-            ),
+            residual_initial_px=self._raw_residuals(initial_landmarks, initial_views, present),
             residual_final_px=self._raw_residuals(self.landmarks, self._views(self.values), present),
             sigma_px=self.sigma_px,
             stop_covariance=stop_covariance,

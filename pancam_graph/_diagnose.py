@@ -9,18 +9,22 @@ from scipy.sparse.csgraph import connected_components
 from pancam_graph.geometry import BoolArray, IntArray
 from pancam_graph.traverse import Traverse
 
-__all__ = ["connection_warnings", "image_components"]
+__all__ = ["components", "connection_warnings"]
 
 _NAMED = 6
 
 
-def image_components(n_images: int, image: IntArray, landmark: IntArray) -> tuple[int, IntArray]:
-    """Groups of images joined by common landmarks: their number, and the group of each image (images,)."""
+def components(n_members: int, member: IntArray, landmark: IntArray) -> tuple[int, IntArray]:
+    """Groups of members (images, frames or stops) joined by common landmarks.
+
+    `member` and `landmark` (n,) are the observations. Returns the number of groups, and the group of each
+    member (members,).
+    """
     n_landmarks = int(landmark.max()) + 1 if len(landmark) else 0
-    n = n_images + n_landmarks
-    links = coo_array((np.ones(len(image)), (image, n_images + landmark)), shape=(n, n))
+    n = n_members + n_landmarks
+    links = coo_array((np.ones(len(member)), (member, n_members + landmark)), shape=(n, n))
     _, label = connected_components(links, directed=False)
-    names, group = np.unique(label[:n_images], return_inverse=True)
+    names, group = np.unique(label[:n_members], return_inverse=True)
     return len(names), group
 
 
@@ -40,7 +44,7 @@ def connection_warnings(traverse: Traverse, used: BoolArray) -> list[str]:
 
     # Eyes of one frame hang together by the rig, so groups are of frames.
     frame_of = traverse.image_frame
-    n, group = image_components(len(traverse.frames), frame_of[image], track)
+    n, group = components(len(traverse.frames), frame_of[image], track)
     seen = np.bincount(frame_of[image], minlength=len(traverse.frames)) > 0
     groups = [np.flatnonzero((group == g) & seen) for g in range(n)]
     groups = sorted((g for g in groups if len(g)), key=lambda g: int(g[0]))
@@ -56,7 +60,7 @@ def connection_warnings(traverse: Traverse, used: BoolArray) -> list[str]:
         )
     if len(traverse.stops) > 1:
         stop_of = traverse.image_stop
-        _, stop_group = image_components(len(traverse.stops), stop_of[image], track)
+        _, stop_group = components(len(traverse.stops), stop_of[image], track)
         size = np.bincount(stop_group)
         alone = [traverse.stops[s].id for s in np.flatnonzero(size[stop_group] == 1)]
         if alone:

@@ -88,7 +88,9 @@ def screen(
         excess = np.where(accepted, np.maximum(excess, length / scale**2 - limit[2]), excess)
         excess = np.where(in_front, excess, np.inf)
         bad = accepted & (excess > 0)
-        goes = bad & (excess >= _segment_max(np.where(accepted, excess, -np.inf), k)[k])
+        goes = bad & (
+            excess >= np.maximum.reduceat(np.where(accepted, excess, -np.inf), measurements.starts)[k]
+        )
         goes |= bad & (_count(accepted, k) <= 2)[k]
         comes = ~accepted & in_front & (excess < 0) & (dof > 0) if sweep == 0 else np.zeros_like(bad)
         comes &= (_count(accepted & ~goes, k) >= 2)[k]
@@ -108,10 +110,6 @@ def _count(mask: BoolArray, landmark: IntArray) -> IntArray:
 def _revive(accepted: BoolArray, landmark: IntArray) -> BoolArray:
     """Give landmarks that lost their observations all of them back, to be judged anew."""
     return np.asarray(accepted | (_count(accepted, landmark) < 2)[landmark])
-
-
-def _segment_max(value: FloatArray, landmark: IntArray) -> FloatArray:
-    return np.asarray(np.maximum.reduceat(value, np.searchsorted(landmark, np.arange(landmark[-1] + 1))))
 
 
 def _retriangulate(

@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from pancam_graph._diagnose import connection_warnings, image_components
+from pancam_graph._diagnose import components, connection_warnings
 from pancam_graph.rigs import mer_navcam
 from pancam_graph.traverse import Frame, Image, Observations, Stop, Traverse
 
@@ -118,9 +118,9 @@ def test_long_lists_are_cut_short_and_counted(n) -> None:
 
 def test_components_number_images_that_share_landmarks() -> None:
     image, landmark = np.array([0, 2, 2, 4, 1]), np.array([0, 0, 1, 1, 2])
-    n, group = image_components(5, image, landmark)
+    n, group = components(5, image, landmark)
     assert n == 3
     assert group[0] == group[2] == group[4]
     assert len({group[0], group[1], group[3]}) == 3
     empty = np.zeros(0, dtype=np.int64)
-    assert image_components(3, empty, empty)[0] == 3
+    assert components(3, empty, empty)[0] == 3

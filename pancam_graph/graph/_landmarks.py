@@ -1,7 +1,7 @@
 """Landmarks as variables of the graph, with GTSAM's own projection factors.
 
-Another way to treat landmarks has the same two methods: it adds its factors, and reads its landmarks
-back from the values that the optimiser found.
+Another way to treat landmarks stands beside it: it too adds its factors to the template's, and reads its
+landmarks back from the values that the optimiser found.
 """
 
 import gtsam
@@ -26,7 +26,10 @@ class ExplicitLandmarks:
     def __init__(self, template: FactorTemplate, measurements: Measurements) -> None:
         self.template = template
         self.measurements = measurements
-        self._calibration = [gtsam.Cal3_S2(*_five_numbers(p)) for p in template.traverse.rig.pinholes]
+        self._calibration = [
+            gtsam.Cal3_S2(p.fx_px, p.fy_px, p.skew_px, p.cx_px, p.cy_px)
+            for p in template.traverse.rig.pinholes
+        ]
 
     @staticmethod
     def key(landmark: int) -> int:
@@ -87,7 +90,3 @@ class ExplicitLandmarks:
         for j in np.flatnonzero(present):
             points[j] = values.atPoint3(self.key(int(j)))
         return points
-
-
-def _five_numbers(pinhole: object) -> tuple[float, ...]:
-    return tuple(getattr(pinhole, n) for n in ("fx_px", "fy_px", "skew_px", "cx_px", "cy_px"))

@@ -175,10 +175,6 @@ class PdsLabel:
     top: LabelGroup
     """Entries outside any group."""
 
-    def has(self, *names: str) -> bool:
-        """Whether there is a group of one of these names."""
-        return any(isinstance(self.top.items.get(name), Mapping) for name in names)
-
     def group(self, *names: str) -> LabelGroup:
         """The first group there is of these names. Raises InputError if there is none."""
         for name in names:
