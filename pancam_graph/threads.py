@@ -1,0 +1,58 @@
+"""Ranges of items over all cores, for compiled loops that release the interpreter's lock."""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+
+from pancam_graph.errors import InputError
+
+__all__ = ["in_parallel", "n_workers"]
+
+_VARIABLE = "PANCAM_GRAPH_THREADS"
+
+
+def n_workers() -> int:
+    """How many threads work at once: PANCAM_GRAPH_THREADS, or as many as there are cores to run on.
+
+    Raises InputError where the variable is no positive whole number.
+    """
+    text = os.environ.get(_VARIABLE, "")
+    if text:
+        if not (text.isascii() and text.isdigit() and int(text) > 0):
+            raise InputError(f"{_VARIABLE}: expected a positive whole number, found {text!r}")
+        return int(text)
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def in_parallel(function: Callable[[int, int], None], n: int, *, grain: int) -> None:
+    """Call function(begin, end) over consecutive ranges of 0 to n, of about `grain` items each.
+
+    The ranges depend on n and the grain alone, never on the number of threads; each item is in one of them.
+    Where there is one range, or one thread, everything runs in the caller's. The function must not call this
+    one. Raises the exception of the first range that failed, when no range runs any more.
+    """
+    n_ranges = max(min(n, 1), round(n / grain))
+    ranges = [(n * i // n_ranges, n * (i + 1) // n_ranges) for i in range(n_ranges)]
+    workers = n_workers()
+    if len(ranges) <= 1 or workers == 1:
+        for begin, end in ranges:
+            function(begin, end)
+        return
+    futures = [_pool(workers).submit(function, begin, end) for begin, end in ranges]
+    for error in [future.exception() for future in futures]:
+        if error is not None:
+            raise error
+
+
+@cache
+def _pool(workers: int) -> ThreadPoolExecutor:
+    """One for the life of the process: starting threads would cost as much as a small range."""
+    return ThreadPoolExecutor(workers, thread_name_prefix="pancam-graph")
+
+
+if hasattr(os, "register_at_fork"):
+    # A forked child inherits the pool without its threads, and would wait for them for ever.
+    os.register_at_fork(after_in_child=_pool.cache_clear)

@@ -1,0 +1,75 @@
+"""Ranges over threads: all of them once, the same for any number of threads, and errors that come through."""
+
+import multiprocessing
+import threading
+
+import numpy as np
+import pytest
+
+from pancam_graph.errors import InputError
+from pancam_graph.threads import in_parallel, n_workers
+
+
+def ranges_of(n: int, grain: int) -> list[tuple[int, int]]:
+    seen = []
+    in_parallel(lambda begin, end: seen.append((begin, end)), n, grain=grain)
+    return sorted(seen)
+
+
+@pytest.mark.parametrize("threads", ["1", "2", "3"])
+@pytest.mark.parametrize(("n", "grain"), [(0, 10), (1, 10), (9, 10), (14, 10), (16, 10), (1000, 7), (3, 1)])
+def test_ranges_follow_each_other_and_do_not_depend_on_the_threads(monkeypatch, threads, n, grain) -> None:
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", "1")
+    alone = ranges_of(n, grain)
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", threads)
+    assert ranges_of(n, grain) == alone
+    assert [i for begin, end in alone for i in range(begin, end)] == list(range(n))
+    lengths = [end - begin for begin, end in alone]
+    assert not lengths or max(lengths) - min(lengths) <= 1
+    assert len(lengths) <= 1 or 0.6 * grain < np.mean(lengths) < 1.5 * grain
+
+
+def test_two_threads_work_at_once(monkeypatch) -> None:
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", "2")
+    both = threading.Barrier(2, timeout=10)
+    in_parallel(lambda begin, end: both.wait() and None, 2, grain=1)
+
+
+def test_one_range_runs_in_the_thread_of_the_caller(monkeypatch) -> None:
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", "2")
+    names = []
+    in_parallel(lambda begin, end: names.append(threading.current_thread()), 5, grain=10)
+    assert names == [threading.current_thread()]
+
+
+@pytest.mark.parametrize("threads", ["1", "2"])
+def test_the_first_error_comes_through(monkeypatch, threads) -> None:
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", threads)
+
+    def fails(begin: int, end: int) -> None:
+        if begin >= 2:
+            raise ValueError(begin)
+
+    with pytest.raises(ValueError, match="2"):
+        in_parallel(fails, 10, grain=1)
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "two", "1.5", "²"])
+def test_a_number_of_threads_that_is_none_is_named(monkeypatch, text) -> None:
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", text)
+    with pytest.raises(InputError, match=r"PANCAM_GRAPH_THREADS: expected .* found"):
+        n_workers()
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork on this system")
+@pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
+def test_a_forked_process_starts_threads_of_its_own(monkeypatch) -> None:
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", "2")
+    assert len(ranges_of(10, 1)) == 10
+    child = multiprocessing.get_context("fork").Process(target=ranges_of, args=(10, 1))
+    child.start()
+    child.join(20)
+    hangs = child.is_alive()
+    child.kill()
+    assert not hangs
+    assert child.exitcode == 0
