@@ -112,15 +112,18 @@ class Terrain:
         out[far] = height * np.exp(-(((distance[far] - crest) / (_RIDGE_WIDTH * crest)) ** 2))
         return out
 
-    def cast(self, origin_m: FloatArray, direction: FloatArray) -> tuple[FloatArray, BoolArray]:
+    def cast(
+        self, origin_m: FloatArray, direction: FloatArray, *, farthest_m: float = np.inf
+    ) -> tuple[FloatArray, BoolArray]:
         """Where rays from origins (n, 3) along unit directions (n, 3) meet the surface.
 
         Returns points (n, 3), whose z is the surface's at their x and y, and which rays hit (n,): not
-        those that end in the sky or start below ground. Features smaller than 4 % of their distance may
-        be passed by.
+        those that end in the sky, start below ground or meet it farther than `farthest_m` from their
+        origin. Features smaller than 4 % of their distance may be passed by.
         """
         n = len(origin_m)
         highest = float(self.wave_height_m.sum()) + _ROCK_HEIGHT_M + 2.5 * _RIDGE_SIZE * self.ridge_distance_m
+        end_m = min(farthest_m, _FARTHEST * self.ridge_distance_m)
         before, after = np.zeros(n), np.full(n, _NEAREST_M)
         hit = np.zeros(n, dtype=bool)
         active = np.arange(n)
@@ -133,7 +136,7 @@ class Terrain:
             below = clearance < 0
             hit[active[below]] = before[active[below]] > 0
             lost = (at[:, 2] > highest) & (direction[active, 2] > 0)
-            onward = ~below & ~lost & (after[active] < _FARTHEST * self.ridge_distance_m)
+            onward = ~below & ~lost & (after[active] < end_m)
             active = active[onward]
             before[active] = after[active]
             # Well above ground, no slope up to 1 can be reached within half the height over its rocks.
@@ -149,6 +152,7 @@ class Terrain:
         points = origin_m + np.zeros((n, 1))
         points[rows] = origin_m[rows] + low[:, None] * direction[rows]
         points[rows, 2] = self.height_m(points[rows, :2])
+        hit[rows] = np.linalg.norm(points[rows] - origin_m[rows], axis=1) <= farthest_m
         return points, hit
 
 

@@ -22,8 +22,6 @@ __all__ = ["Simulation", "SimulationOptions", "TelemetryStart", "Truth", "simula
 _OVERLAP = 0.28  # of neighbouring frames, as a share of the widest eye's field
 _HORIZON = 0.2  # how far the upper row looks below the horizon, as a share of the field
 _BORDER_PX = 5.0  # nothing is matched nearer to an image's edge than this, or 2 % of a small image
-_MAX_TURN_RAD = np.deg2rad(40.0)  # a point looks too different when seen from farther around
-_MAX_ZOOM = 2.0  # or from so many times the distance
 _ROUNDS = 3  # lines of sight that end in the sky are drawn anew so often
 _NOMINAL_SIGMA_PX = 0.3  # what observations without noise are said to have
 
@@ -56,6 +54,12 @@ class SimulationOptions:
     """Chance that an image that sees a point yields an observation of it."""
     link_stops: int = 3
     """How many stops before and after the one that found a point look for it again."""
+    reach_m: float = np.inf
+    """Points farther than this from a camera are not matched in its images; infinite: out to the ridge."""
+    max_turn_rad: float = float(np.deg2rad(40.0))
+    """A point is not matched in images that see it from farther around than this from where it was found."""
+    max_zoom: float = 2.0
+    """Nor in those that see it from more than so many times nearer or farther."""
     min_views: int = 2
     """Tracks with fewer observations are dropped."""
     noise_px: float = 0.3
@@ -103,6 +107,9 @@ class SimulationOptions:
         self._require("rocks", 0 <= self.rocks <= 1, "a share from 0 to 1")
         self._require("ridge_m", 100 <= self.ridge_m <= 1e5, "a distance from 100 m to 100 km")
         self._require("sweep_rad", 0 < self.sweep_rad <= 2 * np.pi, "an angle above 0, up to 2 pi")
+        self._require("reach_m", self.reach_m >= 1, "a distance of 1 m or more, or infinity")
+        self._require("max_turn_rad", 0 < self.max_turn_rad <= np.pi, "an angle above 0, up to pi")
+        self._require("max_zoom", 1 <= self.max_zoom < np.inf, "a number of 1 or above")
         self._require("detection", 0 < self.detection <= 1, "a chance above 0, up to 1")
         self._require("outliers", 0 <= self.outliers < 1, "a share of 0 or above, below 1")
         self._require("prior", self.prior in {"telemetry", "truth"}, "'telemetry' or 'truth'")
@@ -184,7 +191,7 @@ def simulate(rig: Rig, options: SimulationOptions | None = None, *, seed: int = 
     if not kept.any():
         raise InputError(
             f"simulation of {rig.name}: expected terrain points seen by {options.min_views} images or more, "
-            "found none; do all rows of the panorama look into the sky?"
+            "found none; do all rows of the panorama look into the sky, or past reach_m?"
         )
     rows = kept[point]
     image, uv = image[rows], uv[rows]
@@ -295,7 +302,7 @@ def _find_points(
             origin[of_eye] = centre[of_eye, None] + offset
             usable[of_eye] = rays.valid.reshape(len(of_eye), -1)
         rows = wanted & usable
-        points, hit = terrain.cast(origin[rows], direction[rows])
+        points, hit = terrain.cast(origin[rows], direction[rows], farthest_m=options.reach_m)
         image = np.nonzero(rows)[0][hit]
         found_points.append(points[hit])
         found_image.append(image)
@@ -323,26 +330,42 @@ def _look(
     first = np.searchsorted(image_stop[finder], np.arange(options.stops + 1))
     cones = [_cone(e.camera) for e in rig.eyes]
     image, point, pixel = [], [], []
-    for i, (eye, stop) in enumerate(zip(image_eye, image_stop, strict=True)):
-        camera = rig.eyes[eye].camera
+    for stop in range(options.stops):
         low, high = max(0, stop - options.link_stops), min(options.stops, stop + options.link_stops + 1)
-        near = slice(first[low], first[high])
-        d = points_m[near] - centre[i]
-        distance_m = np.linalg.norm(d, axis=1)
-        axis, cosine = cones[eye]
-        ok = d @ (rotation[i] @ axis) >= cosine * distance_m
-        ok &= np.einsum("ni,ni->n", d, line[near]) >= np.cos(_MAX_TURN_RAD) * distance_m
-        ok &= (distance_m <= _MAX_ZOOM * found_at_m[near]) & (found_at_m[near] <= _MAX_ZOOM * distance_m)
-        rows = np.flatnonzero(ok)
-        uv, valid = camera.project(d[rows] @ rotation[i])
-        border = min(_BORDER_PX, 0.02 * camera.width_px, 0.02 * camera.height_px)
-        inside = camera.contains(uv - border) & camera.contains(uv + border)
-        seen = np.flatnonzero(valid & inside)
-        seen = seen[rng.random(len(seen)) < options.detection]
-        image.append(np.full(len(seen), i))
-        point.append(near.start + rows[seen])
-        pixel.append(uv[seen])
+        linked = np.arange(first[low], first[high])
+        images = np.flatnonzero(image_stop == stop)
+        near = linked[_within(options, points_m[linked], found_at_m[linked], centre[images])]
+        points, lines, found_at = points_m[near], line[near], found_at_m[near]
+        for i in images:
+            camera = rig.eyes[image_eye[i]].camera
+            d = points - centre[i]
+            axis, cosine = cones[image_eye[i]]
+            rows = np.flatnonzero(d @ (rotation[i] @ axis) >= cosine * np.linalg.norm(d, axis=1))
+            d, distance_m = d[rows], np.linalg.norm(d[rows], axis=1)
+            ok = np.einsum("ni,ni->n", d, lines[rows]) >= np.cos(options.max_turn_rad) * distance_m
+            ok &= distance_m <= np.minimum(options.max_zoom * found_at[rows], options.reach_m)
+            ok &= found_at[rows] <= options.max_zoom * distance_m
+            rows, d = rows[ok], d[ok]
+            uv, valid = camera.project(d @ rotation[i])
+            border = min(_BORDER_PX, 0.02 * camera.width_px, 0.02 * camera.height_px)
+            inside = camera.contains(uv - border) & camera.contains(uv + border)
+            seen = np.flatnonzero(valid & inside)
+            seen = seen[rng.random(len(seen)) < options.detection]
+            image.append(np.full(len(seen), i))
+            point.append(near[rows[seen]])
+            pixel.append(uv[seen])
     return np.concatenate(image), np.concatenate(point), np.concatenate(pixel)
+
+
+def _within(
+    options: SimulationOptions, points_m: FloatArray, found_at_m: FloatArray, centres_m: FloatArray
+) -> BoolArray:
+    """Which points (n,) may be near enough to some camera of a stop, to sift quickly."""
+    middle = centres_m.mean(axis=0)
+    margin_m = float(np.linalg.norm(centres_m - middle, axis=1).max()) + 1e-6
+    distance_m = np.linalg.norm(points_m - middle, axis=1)
+    near = distance_m - margin_m <= np.minimum(options.max_zoom * found_at_m, options.reach_m)
+    return np.asarray(near & (found_at_m <= options.max_zoom * (distance_m + margin_m)))
 
 
 def _cone(camera: Camera) -> tuple[FloatArray, float]:

@@ -261,6 +261,43 @@ def test_observations_per_image_do_not_grow_with_the_length_of_the_drive() -> No
     assert mean[1] < 1.25 * mean[0]
 
 
+def lines_of_sight_m(simulation: Simulation) -> FloatArray:
+    """From the true camera to the true landmark (observations, 3)."""
+    traverse, truth, observations = simulation.traverse, simulation.truth, observed(simulation)
+    _, centres = traverse.camera_poses(truth.world_T_mast, truth.pan_tilt_rad)
+    return np.asarray(truth.landmarks_m[observations.track] - centres[observations.image])
+
+
+def test_nothing_is_matched_beyond_the_reach_and_lines_that_end_there_are_drawn_anew() -> None:
+    rig, options = rig_template("mer-navcam"), replace(SMALL, stops=3, tilts_rad=(-0.1,))
+    near, usual = simulate(rig, replace(options, reach_m=12.0), seed=3), simulate(rig, options, seed=3)
+    distance = np.linalg.norm(lines_of_sight_m(near), axis=1)
+    assert 11 < distance.max() <= 12
+    assert np.linalg.norm(lines_of_sight_m(usual), axis=1).max() > 100
+    assert len(near.truth.landmarks_m) > 0.7 * len(usual.truth.landmarks_m)
+
+
+def test_how_differently_a_point_may_look_is_an_option() -> None:
+    rig, options = rig_template("mer-navcam"), replace(SMALL, stops=3, detection=1.0, reach_m=15.0)
+    turns, zooms, stops_seeing = [], [], []
+    for max_turn_rad, max_zoom in ((0.3, 1.3), (float(np.pi), 10.0)):
+        wanted = replace(options, max_turn_rad=max_turn_rad, max_zoom=max_zoom)
+        simulation = simulate(rig, wanted, seed=3)
+        observations, lines = observed(simulation), lines_of_sight_m(simulation)
+        distance = np.linalg.norm(lines, axis=1)
+        # Some image of the track found it: no two are farther apart than twice the limit.
+        first = np.unique(observations.track, return_index=True)[1][observations.track]
+        cosine = np.sum(lines * lines[first], axis=1) / (distance * distance[first])
+        turns.append(np.arccos(np.clip(cosine, -1, 1)).max() / max_turn_rad)
+        zooms.append(np.maximum(distance / distance[first], distance[first] / distance).max())
+        stop = simulation.traverse.image_stop[observations.image]
+        stops_seeing.append(len(np.unique(observations.track * 3 + stop)) / (observations.track.max() + 1))
+    assert turns[0] <= 2
+    assert zooms[0] <= 1.3**2 + 1e-9
+    assert zooms[1] > 2
+    assert stops_seeing[1] > 1.3 * stops_seeing[0]
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [
@@ -279,6 +316,12 @@ def test_observations_per_image_do_not_grow_with_the_length_of_the_drive() -> No
         ("sigma_stop_m", float("inf")),
         ("pointing_scale", -1.0),
         ("sweep_rad", 7.0),
+        ("reach_m", 0.5),
+        ("reach_m", float("nan")),
+        ("max_turn_rad", 0.0),
+        ("max_turn_rad", 4.0),
+        ("max_zoom", 0.9),
+        ("max_zoom", float("inf")),
         ("prior", "wish"),
     ],
 )
@@ -291,6 +334,8 @@ def test_a_view_of_nothing_but_sky_is_refused() -> None:
     rig = rig_template("mer-pancam")
     with pytest.raises(InputError, match="sky"):
         simulate(rig, SimulationOptions(stops=1, pans=2, tilts_rad=(1.0,)))
+    with pytest.raises(InputError, match="reach_m"):
+        simulate(rig, SimulationOptions(stops=1, pans=2, reach_m=1.0))
     with pytest.raises(InputError, match="seed"):
         simulate(rig, seed=-1)
 
@@ -326,7 +371,7 @@ def test_program_writes_a_traverse_with_the_truth_beside(scripts_folder: Path, t
     [
         (["old"], "old: expected a new or empty folder, found files"),
         (["new", "--noise-px", "-1"], "noise_px: expected a number of 0 or above, found -1.0"),
-        (["new", "--stops", "1", "--pans", "2", "--tilts-deg", "60"], "the sky?"),
+        (["new", "--stops", "1", "--pans", "2", "--tilts-deg", "60"], "the sky, "),
     ],
 )
 def test_program_refuses_in_one_sentence_and_writes_nothing(
