@@ -1,0 +1,68 @@
+"""Measure the solver against its peers on simulated drives, and against the committed baseline.
+
+Every engine solves each case in a process of its own. Prints a table for the README; writes all figures as
+JSON. Absolute times move between machines and hours; ratios within one run are what counts, and what
+scripts/benchmark_baseline.json keeps.
+
+Exit status: 0 as good as the baseline; 1 final costs differ, an engine failed, the time grows faster than
+the drive or a ratio got worse; 2 bad input.
+"""
+
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from benchmarks.cases import CASES, DEFAULT_CASES, chosen_cases
+from benchmarks.engines import ENGINES
+from benchmarks.report import against_baseline, read_baseline, write_baseline
+from benchmarks.running import prepare, run_cases
+from pancam_graph.errors import InputError
+from pancam_graph.program import Parser, run, show_log
+
+BASELINE = Path(__file__).with_name("benchmark_baseline.json")
+
+
+def main() -> int:
+    """Make the cases, measure, compare, write."""
+    parser = Parser(__doc__ or "")
+    add = parser.add_argument
+    add("--cases", nargs="+", choices=CASES, default=DEFAULT_CASES, metavar="CASE", help=", ".join(CASES))
+    add(
+        "--engines",
+        nargs="+",
+        choices=ENGINES,
+        metavar="ENGINE",
+        help=f"{', '.join(ENGINES)} (each case's own)",
+    )
+    add("--repeats", type=int, help="warm solves, of which the fastest counts (each case's own)")
+    add("--ceres", type=Path, help="compiled program (compiled from ../shared/bench where that is possible)")
+    add("--json", type=Path, help="file to write; must be new (out/benchmark-TIME.json)")
+    add("--tolerance", type=float, default=0.25, help="how much worse a ratio may get (%(default)s)")
+    add("--write-baseline", action="store_true", help=f"renew the measured ratios in {BASELINE.name}")
+    a = parser.parse_args()
+    show_log(verbose=a.verbose)
+    path = a.json or Path("out") / f"benchmark-{time.strftime('%Y%m%d-%H%M%S')}.json"
+    if path.exists():
+        raise InputError(f"{path}: expected a new file, found one that is there")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cases, baseline = chosen_cases(a.cases, engines=a.engines, repeats=a.repeats), read_baseline(BASELINE)
+
+    with tempfile.TemporaryDirectory(prefix="pancam-graph-benchmark-") as work:
+        setting = prepare(cases, Path(work), a.ceres)
+        report = run_cases(
+            cases, setting, Path(work) / "cases", say=lambda text: print(text, file=sys.stderr)
+        )
+    faults = report.complaints()
+    if a.write_baseline and not faults:
+        changes = write_baseline(BASELINE, report.ratios())
+    else:
+        worse, changes = against_baseline(report.ratios(), baseline, a.tolerance)
+        faults += worse
+    path.write_text(report.to_json(), encoding="utf-8")
+    print(report.text([*changes, f"all figures: {path}"], faults))
+    return 1 if faults else 0
+
+
+if __name__ == "__main__":
+    run(main)

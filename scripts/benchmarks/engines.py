@@ -1,0 +1,209 @@
+"""Who solves: the engines, whether each can run here, and the processes that measure them."""
+
+import importlib.util
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from benchmarks.cases import Files
+
+__all__ = [
+    "ENGINES",
+    "Engine",
+    "Measured",
+    "NotRun",
+    "Setting",
+    "ceres_program",
+    "measure",
+    "solve_first_ever",
+]
+
+THREADS = 2
+"""Of Ceres and COLMAP. Ours are as many as the machine has for BLAS, and what the solver itself chooses."""
+
+_SLOWS_BLAS = ("OPENBLAS_CORETYPE", "OPENBLAS_L2_SIZE")
+"""Variables that hold OpenBLAS back where they are set; no engine runs with them."""
+_SCRIPTS = Path(__file__).resolve().parents[1]
+_CERES_HEADER = "ceres/ceres.h"
+_INCLUDE = (Path("/usr/include"), Path("/usr/local/include"))
+_EIGEN = "eigen3"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """What an engine took for one case."""
+
+    seconds: tuple[float, ...]
+    """Wall-clock time of the solve alone, warm, each repeat."""
+    iterations: int
+    cost_final: float
+    """Half the sum of squared whitened residuals, priors included."""
+    memory_mb: float
+    """Peak of the process that read the problem and solved it once, megabytes."""
+    rms_px: float | None = None
+    first_s: float | None = None
+    """First solve of a process, preparation and loading of compiled code included."""
+    initialise_s: float | None = None
+    """Preparation before the solve, warm: triangulation and what else is not counted in `seconds`."""
+    read_s: float | None = None
+    detail: str = ""
+
+    @property
+    def best_s(self) -> float:
+        """The fastest solve."""
+        return min(self.seconds)
+
+    @property
+    def median_s(self) -> float:
+        """The middle solve, of an even number the slower of two."""
+        return sorted(self.seconds)[len(self.seconds) // 2]
+
+
+@dataclass(frozen=True, kw_only=True)
+class NotRun:
+    """Why there are no figures."""
+
+    reason: str
+    failed: bool
+    """True where the engine was there and did not do it; False where it is not installed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setting:
+    """What processes of the engines need to know."""
+
+    ceres: Path | NotRun
+    """The compiled Ceres program."""
+    numba_cache: Path
+    """Where compiled code is kept; empty before the first solve ever."""
+    environment: Mapping[str, str] = field(default_factory=lambda: dict(os.environ))
+    """Variables that the engines' processes start from."""
+
+    def child_environment(self) -> dict[str, str]:
+        """Variables of the engines' processes."""
+        kept = {k: v for k, v in self.environment.items() if k not in _SLOWS_BLAS}
+        paths = [str(_SCRIPTS), *filter(None, [kept.get("PYTHONPATH")])]
+        return {**kept, "PYTHONPATH": os.pathsep.join(paths), "NUMBA_CACHE_DIR": str(self.numba_cache)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Engine:
+    """One way to solve."""
+
+    name: str
+    title: str
+    """For the table."""
+    command: Callable[[Files, Setting, int], list[str] | NotRun]
+    """Module of this package and its arguments, for a case, a setting and a number of repeats."""
+    same_problem: bool = True
+    """Whether its final cost must be that of the others."""
+
+
+def _ours(landmarks: str) -> Callable[[Files, Setting, int], list[str] | NotRun]:
+    def command(files: Files, setting: Setting, repeats: int) -> list[str] | NotRun:
+        return [
+            "benchmarks.solve_with_us",
+            str(files.traverse),
+            f"--landmarks={landmarks}",
+            f"--repeats={repeats}",
+        ]
+
+    return command
+
+
+def _ceres(files: Files, setting: Setting, repeats: int) -> list[str] | NotRun:
+    if isinstance(setting.ceres, NotRun):
+        return setting.ceres
+    options = ["--solvers", "dense", "sparse", "iterative", f"--threads={THREADS}", f"--repeats={repeats}"]
+    return ["benchmarks.solve_with_ceres", str(setting.ceres), str(files.peer), *options]
+
+
+def _pycolmap(files: Files, setting: Setting, repeats: int) -> list[str] | NotRun:
+    if importlib.util.find_spec("pycolmap") is None:
+        return NotRun(reason="pycolmap is not installed (pip install 'pancam-graph[bench]')", failed=False)
+    arguments = [str(files.traverse), str(files.start_m), f"--threads={THREADS}", f"--repeats={repeats}"]
+    return ["benchmarks.solve_with_pycolmap", *arguments]
+
+
+ENGINES = {
+    engine.name: engine
+    for engine in (
+        Engine(name="eliminated", title="pancam_graph", command=_ours("eliminated")),
+        Engine(name="explicit", title="pancam_graph, explicit landmarks", command=_ours("explicit")),
+        Engine(name="ceres", title="Ceres, C++", command=_ceres),
+        Engine(name="pycolmap", title="COLMAP, rig", command=_pycolmap, same_problem=False),
+    )
+}
+"""The engines by name."""
+
+
+def measure(engine: Engine, files: Files, setting: Setting, repeats: int) -> Measured | NotRun:
+    """Solve a case in a process of its own."""
+    command = engine.command(files, setting, repeats)
+    if isinstance(command, NotRun):
+        return command
+    found = _run(command, setting)
+    if isinstance(found, NotRun):
+        return found
+    return Measured(**{**found, "seconds": tuple(found["seconds"])})
+
+
+def solve_first_ever(engine: Engine, files: Files, setting: Setting) -> float | NotRun:
+    """Seconds of the very first solve: nothing compiled yet. Leaves the compiled code behind.
+
+    Raises ValueError where the cache of compiled code is not empty.
+    """
+    if setting.numba_cache.exists() and any(setting.numba_cache.iterdir()):
+        raise ValueError(f"{setting.numba_cache}: expected an empty folder for compiled code, found files")
+    found = measure(engine, files, setting, 1)
+    if isinstance(found, NotRun):
+        return found
+    return found.first_s if found.first_s is not None else NotRun(reason="not measured", failed=False)
+
+
+def _run(command: list[str], setting: Setting) -> dict[str, Any] | NotRun:
+    done = subprocess.run(
+        [sys.executable, "-m", *command],
+        env=setting.child_environment(),
+        text=True,
+        capture_output=True,
+        check=False,
+    )
+    if done.returncode != 0:
+        lines = done.stderr.strip().splitlines() or ["no message"]
+        return NotRun(reason=f"{lines[-1]} (status {done.returncode})", failed=True)
+    result: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
+    return result
+
+
+def ceres_program(given: Path | None, source: Path | None, folder: Path) -> Path | NotRun:
+    """The Ceres program: as given, or compiled from `source` into `folder`, or why there is none."""
+    if given is not None:
+        if given.is_file() and os.access(given, os.X_OK):
+            return given.resolve()
+        return NotRun(reason=f"{given}: expected a program, found none", failed=True)
+    if source is None or not source.is_file():
+        return NotRun(
+            reason="no source of the Ceres program beside the repository; see --ceres", failed=False
+        )
+    compiler = shutil.which("g++")
+    if compiler is None:
+        return NotRun(reason="no g++ to compile the Ceres program with; see --ceres", failed=False)
+    include = next((i for i in _INCLUDE if (i / _CERES_HEADER).is_file()), None)
+    if include is None:
+        return NotRun(reason="the headers of Ceres Solver are not installed; see --ceres", failed=False)
+    program = folder / source.stem
+    folder.mkdir(parents=True, exist_ok=True)
+    flags = ["-O3", "-march=native", f"-I{include}", f"-I{include / _EIGEN}"]
+    command = [compiler, *flags, str(source), "-o", str(program), "-lceres", "-lglog"]
+    done = subprocess.run(command, text=True, capture_output=True, check=False)
+    if done.returncode != 0:
+        first = next((line for line in done.stderr.splitlines() if "error" in line), "no message")
+        return NotRun(reason=f"{source.name} does not compile: {first}", failed=True)
+    return program

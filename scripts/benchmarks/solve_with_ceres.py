@@ -1,0 +1,57 @@
+"""Solve a problem file with the Ceres program and print what it took, as JSON. Run in a process of its own.
+
+This process imports next to nothing: the peak memory of a child that Linux reports counts, besides the
+child's own, what its starter held when it started it.
+"""
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+
+
+def solve(program: str, peer: str, solver: str, threads: int) -> tuple[dict[str, float], float]:
+    """Run the program once: what it printed, and the most memory it took in megabytes."""
+    with tempfile.TemporaryFile() as output:
+        command = [program, peer, solver, str(threads)]
+        out = [(os.POSIX_SPAWN_DUP2, output.fileno(), 1)]
+        child = os.posix_spawn(program, command, os.environ, file_actions=out)
+        _, status, usage = os.wait4(child, 0)
+        output.seek(0)
+        text = output.read().decode()
+    if status != 0:
+        sys.stderr.write(f"{program}: ended with status {os.waitstatus_to_exitcode(status)}\n")
+        sys.exit(2)
+    return json.loads(text), usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e6
+
+
+def main() -> None:
+    """Try each solver once, then repeat the fastest."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("program")
+    parser.add_argument("peer")
+    parser.add_argument("--solvers", nargs="+", required=True)
+    parser.add_argument("--threads", type=int, required=True)
+    parser.add_argument(
+        "--repeats", type=int, required=True, help="solves with the fastest solver, first one included"
+    )
+    arguments = parser.parse_args()
+    program = os.path.abspath(arguments.program)  # noqa: PTH100  pathlib would enlarge this process
+    tried = {s: solve(program, arguments.peer, s, arguments.threads) for s in arguments.solvers}
+    best = min(tried, key=lambda s: tried[s][0]["seconds"])
+    found, memory_mb = tried[best]
+    again = [solve(program, arguments.peer, best, arguments.threads)[0] for _ in range(arguments.repeats - 1)]
+    others = ", ".join(f"{s} {r['seconds']:.3g} s" for s, (r, _) in tried.items() if s != best)
+    measured = {
+        "seconds": [found["seconds"], *(r["seconds"] for r in again)],
+        "iterations": found["iterations"],
+        "cost_final": found["final_cost"],
+        "memory_mb": memory_mb,
+        "detail": f"{best} Schur, {arguments.threads} threads" + (f"; {others}" if others else ""),
+    }
+    sys.stdout.write(json.dumps(measured) + "\n")
+
+
+if __name__ == "__main__":
+    main()
