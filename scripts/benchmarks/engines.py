@@ -127,8 +127,8 @@ def _ceres(files: Files, setting: Setting, repeats: int) -> list[str] | NotRun:
 def _pycolmap(files: Files, setting: Setting, repeats: int) -> list[str] | NotRun:
     if importlib.util.find_spec("pycolmap") is None:
         return NotRun(reason="pycolmap is not installed (pip install 'pancam-graph[bench]')", failed=False)
-    arguments = [str(files.traverse), str(files.start_m), f"--threads={THREADS}", f"--repeats={repeats}"]
-    return ["benchmarks.solve_with_pycolmap", *arguments]
+    options = ["--solvers", "auto", "SPARSE_SCHUR", f"--threads={THREADS}", f"--repeats={repeats}"]
+    return ["benchmarks.solve_with_pycolmap", str(files.traverse), str(files.start_m), *options]
 
 
 ENGINES = {
