@@ -10,5 +10,6 @@ from pancam_graph.factors._slots import Slot as Slot
 from pancam_graph.factors.circle import CircleOffset as CircleOffset
 from pancam_graph.factors.circle import circle_factor as circle_factor
 from pancam_graph.factors.circle import circle_residual as circle_residual
+from pancam_graph.factors.landmark_blocks import LandmarkBlocks as LandmarkBlocks
 from pancam_graph.factors.mast import mast_factor as mast_factor
 from pancam_graph.factors.mast import mast_residual as mast_residual

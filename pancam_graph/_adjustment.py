@@ -2,30 +2,24 @@
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-import gtsam
 import numpy as np
 
-from pancam_graph._covariance import covariances
-from pancam_graph._diagnose import connection_warnings
-from pancam_graph._optimise import Elimination, Iteration, Outcome, StopRule, optimise
+from pancam_graph._covariance import Uncertainty, uncertainty
+from pancam_graph._diagnose import connection_warnings, listed
+from pancam_graph._eliminated import EliminatedSolver
+from pancam_graph._explicit import ExplicitSolver
+from pancam_graph._optimise import Iteration, Outcome, StopRule
+from pancam_graph._problem import Problem, Solver, reach_m
 from pancam_graph._rejection import rays_of, screen
 from pancam_graph.cameras import carry_to_pinhole
 from pancam_graph.errors import InputError, SolveError
 from pancam_graph.geometry import BoolArray, FloatArray
-from pancam_graph.graph import DEFAULT_TIES, ExplicitLandmarks, FactorTemplate
+from pancam_graph.graph import RIGID, FactorTemplate, HardTemplate, SoftTemplate
 from pancam_graph.initialise import Start, start_from_telemetry
-from pancam_graph.landmarks import (
-    CameraViews,
-    Landmarks,
-    Measurements,
-    evaluate,
-    point_sigma_m,
-    refine,
-    triangulate,
-)
-from pancam_graph.losses import SQUARED, Loss, loss_of
+from pancam_graph.landmarks import Landmarks, Measurements, evaluate, refine, triangulate
+from pancam_graph.losses import loss_of
 from pancam_graph.options import SolveOptions
 from pancam_graph.solution import Solution, State
 from pancam_graph.traverse import Observations, Traverse
@@ -41,28 +35,8 @@ _GROSS = 3.0
 """The second begins with what is within this many times the cutoff."""
 _FINAL_ROUNDS = 6
 _TYPICAL_RANGE_M = 10.0
-_FURTHEST_PARALLAX_SIGMAS = 0.01
-"""Points are placed no further out than where their parallax is this many sigmas of a pixel."""
-_WEAK_RANGE_SIGMA = 0.3
-"""A landmark whose range is known to no better than this share of it gets the weak prior."""
 _CARRIED_PX = 1e-6
 """Pixels of CAHVORE cameras are carried anew until none moves by more."""
-_STRETCHED = 500.0
-"""A landmark this many times less certain in range than sideways is too much for GTSAM's Cholesky."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Weak:
-    """Landmarks whose range is all but free."""
-
-    needs_prior: BoolArray
-    """(landmarks,) whether the weak prior keeps the system regular"""
-    prior_m: FloatArray
-    """(landmarks,) its sigma: ten times the distance, so that it says nothing"""
-    stretched: BoolArray
-    """(landmarks,) which are too long in range for GTSAM's Cholesky"""
-    bearable_m: FloatArray
-    """(landmarks,) sigma of a prior that it bears, for steps whose landmarks are placed anew anyway"""
 
 
 class Adjustment:
@@ -79,32 +53,39 @@ class Adjustment:
             raise InputError(
                 "observations: expected some, found none; find them in the images first (find_observations)"
             )
-        self.traverse, self.options, self.on_iteration = traverse, options, on_iteration
+        self.traverse, self.options = traverse, options
         self.observations: Observations = traverse.observations
-        self.template = FactorTemplate(traverse, options.model, options.tie or DEFAULT_TIES[options.model])
         self.start = start or start_from_telemetry(traverse)
         self.warnings = [*traverse.warnings, *self.start.warnings]
-        self.factors = self.template.factors()
-        self.initial_values = self._first_values()
-        self.values = self.initial_values
         self.sigma_px = self.observations.sigma_px.copy()
         self.reason = np.full(len(self.observations), "", dtype=object)
-        self.measurements = self._measure()
-        self.landmarks = self._triangulate(self.values, np.ones(len(self.measurements.row)))
-        self.points_m = self._points(self.landmarks, self._views(self.values))
-        self.accepted = np.ones(len(self.measurements.row), dtype=bool)
+        solvers: dict[str, type[Solver]] = {"eliminated": EliminatedSolver, "explicit": ExplicitSolver}
+        self.solver = solvers[options.landmarks](on_iteration)
+        self.problem = self._first_problem(_template(traverse, options))
+        self.first = self.problem
 
     # --- preparation ---
 
-    def _first_values(self) -> gtsam.Values:
+    def _first_problem(self, template: FactorTemplate) -> Problem:
+        """Cameras where the start has them, all landmarks triangulated from there."""
         rotations, centres = self.traverse.camera_poses(self.start.world_T_mast, self.start.pan_tilt_rad)
-        return self.template.values(
-            State(
-                world_T_mast=self.start.world_T_mast,
-                pan_tilt_rad=self.start.pan_tilt_rad,
-                world_R_camera=rotations,
-                world_t_camera=centres,
-                landmarks_m=np.zeros((0, 3)),
+        state = State(
+            world_T_mast=self.start.world_T_mast,
+            pan_tilt_rad=self.start.pan_tilt_rad,
+            world_R_camera=rotations,
+            world_t_camera=centres,
+            landmarks_m=np.zeros((0, 3)),
+        )
+        measurements = self._measure()
+        n = measurements.n_landmarks
+        return _triangulated(
+            Problem(
+                template=template,
+                factors=template.factors(),
+                measurements=measurements,
+                accepted=np.ones(len(measurements.row), dtype=bool),
+                values=template.values(state),
+                landmarks=Landmarks(vector=np.zeros((n, 4)), origin_m=np.zeros((n, 3))),
             )
         )
 
@@ -147,26 +128,6 @@ class Adjustment:
             uv[own], turn[own], valid[own] = carry_to_pinhole(entry.camera, obs.uv_px[own], range_m[own])
         return uv, turn, valid
 
-    def _views(self, values: gtsam.Values) -> CameraViews:
-        state = self.template.state(values, np.zeros((0, 3)))
-        calibration = np.array([p.calibration_matrix for p in self.traverse.rig.pinholes])
-        return CameraViews(
-            world_R_camera=state.world_R_camera,
-            world_t_camera=state.world_t_camera,
-            calibration=calibration[self.traverse.image_eye],
-        )
-
-    def _triangulate(self, values: gtsam.Values, weight: FloatArray) -> Landmarks:
-        """Linear triangulation; a landmark behind a camera starts far off where its cameras look instead."""
-        m, views = self.measurements, self._views(values)
-        centre, direction = rays_of(m, views)
-        landmarks = triangulate(centre, direction, m.landmark, weight)
-        _, _, in_front = evaluate(landmarks, m, views)
-        behind = np.bincount(m.landmark, ~in_front & (weight > 0), minlength=m.n_landmarks) > 0
-        mean = np.add.reduceat(weight[:, None] * direction, m.starts)
-        ahead = landmarks.moved_to(landmarks.origin_m + self._reach_m(landmarks, views)[:, None] * mean)
-        return replace(landmarks, vector=np.where(behind[:, None], ahead.vector, landmarks.vector))
-
     # --- the rounds ---
 
     def run(self) -> Solution:
@@ -177,36 +138,27 @@ class Adjustment:
         outcome = self._final_rounds()
         return self._collect(outcome)
 
-    def _set_aside_behind(self) -> None:
-        """Leave out for good what is behind its camera although all else is in place."""
-        _, _, in_front = evaluate(self.landmarks, self.measurements, self._views(self.values))
-        behind = self.accepted & ~in_front
-        self.accepted = self.accepted & ~behind
-        self.reason[self.measurements.row[behind]] = "behind"
-
     def _screen_at_start(self) -> None:
         """Gross outliers, judged with what telemetry may be wrong by added to the noise."""
-        m, t = self.measurements, self.traverse
-        views = self._views(self.values)
+        p, t = self.problem, self.traverse
+        m, views = p.measurements, p.views
         frame = np.array([max(f.sigma_pan_rad, f.sigma_tilt_rad) for f in t.frames])[t.image_frame[m.image]]
         stop_rad = np.array([s.sigma_rotation_rad for s in t.stops])[t.image_stop[m.image]]
         stop_m = np.array([s.sigma_translation_m for s in t.stops])[t.image_stop[m.image]]
-        first = refine(self.landmarks, m, views, self.accepted.astype(float))
-        distance = np.linalg.norm(
-            self._points(first, views)[m.landmark] - views.world_t_camera[m.image], axis=1
-        )
+        first = p.at(p.values, refine(p.landmarks, m, views, p.accepted.astype(float)))
+        distance = np.linalg.norm(first.points_m()[m.landmark] - views.world_t_camera[m.image], axis=1)
         focal = views.calibration[m.image, 0, 0]
         telemetry_px = focal * np.sqrt(frame**2 + stop_rad**2 + (stop_m / distance.clip(1.0)) ** 2)
         sigma = self.observations.sigma_px[m.row]
         screening = screen(
-            self.landmarks,
+            p.landmarks,
             m.scaled(np.hypot(sigma, telemetry_px) / sigma),
             views,
-            self.accepted,
+            p.accepted,
             cutoff_sigma=self.options.outlier_sigma,
             min_scale=1.0,  # errors of telemetry are common to a frame: a small median must not exclude one
         )
-        self.landmarks, self.accepted = screening.landmarks, screening.accepted
+        self.problem = replace(p, landmarks=screening.landmarks, accepted=screening.accepted)
 
     def _screening_rounds(self) -> None:
         """Robust adjustment and screening in turn, until the same observations stay.
@@ -218,9 +170,9 @@ class Adjustment:
         scale = 1.0
         for _ in range(_SCREENING_ROUNDS):
             scale, changed = self._screening_round(scale, cutoff, relative_decrease=1e-3)
-            if changed <= _ABOUT * len(self.accepted):
+            if changed <= _ABOUT * len(self.problem.accepted):
                 break
-        self.accepted = np.ones_like(self.accepted)
+        self.problem = replace(self.problem, accepted=np.ones_like(self.problem.accepted))
         self._screen(_GROSS * cutoff)
         for _ in range(_SCREENING_ROUNDS):
             before = scale
@@ -233,14 +185,17 @@ class Adjustment:
     ) -> tuple[float, int]:
         """One robust adjustment and screening: the noise scale, and how many observations came or went."""
         rule = StopRule(max_iterations=20, relative_decrease=relative_decrease)
-        self._approach(rule, loss_of(self.options.loss, scale), stage="screening")
-        before = self.accepted
+        self.problem = self.solver.approach(
+            self.problem, rule, loss_of(self.options.loss, scale), "screening"
+        )
+        before = self.problem.accepted
         scale = self._screen(cutoff_sigma)
-        changed = int(np.sum(before != self.accepted))
+        accepted = self.problem.accepted
+        changed = int(np.sum(before != accepted))
         _LOG.info(
             "screening: %d of %d observations kept, %d changed, noise %.2f sigma",
-            int(self.accepted.sum()),
-            len(self.accepted),
+            int(accepted.sum()),
+            len(accepted),
             changed,
             scale,
         )
@@ -248,155 +203,57 @@ class Adjustment:
 
     def _screen(self, cutoff_sigma: float) -> float:
         """Screen with the cameras as they are; returns the noise scale."""
+        p = self.problem
         screening = screen(
-            self.landmarks,
-            self.measurements,
-            self._views(self.values),
-            self.accepted,
+            p.landmarks,
+            p.measurements,
+            p.views,
+            p.accepted,
             cutoff_sigma=cutoff_sigma,
             min_scale=1.0 if self.observations.origin == "given" else 0.05,
         )
-        self.landmarks, self.accepted = screening.landmarks, screening.accepted
+        self.problem = replace(p, landmarks=screening.landmarks, accepted=screening.accepted)
         return screening.scale
 
     def _final_rounds(self) -> Outcome:
-        """Least squares over what was kept, until neither noise scale nor weak landmarks move any more."""
+        """Least squares over what was kept, until neither noise scale nor carried pixels move any more."""
         options = self.options
         rule = StopRule(
             max_iterations=options.max_iterations,
             relative_decrease=options.relative_decrease,
-            absolute_cost=1e-16 * len(self.measurements.row),
+            absolute_cost=1e-16 * len(self.problem.measurements.row),
         )
         rescale = options.rescale_noise
         if rescale is None:
             rescale = self.observations.origin == "images"
-        costs = self._approach(StopRule(max_iterations=20, relative_decrease=1e-4), SQUARED, stage="approach")
-        self._set_aside_behind()
+        costs: list[float] = []
         for _ in range(_FINAL_ROUNDS):
-            outcome = self._adjust(rule)
-            gained = costs[-1] - outcome.costs[-1]
-            costs += outcome.costs[1:]
+            before = self.problem.accepted
+            self.problem, outcome = self.solver.adjust(self.problem, rule)
+            self._note_behind(before & ~self.problem.accepted)
+            costs += outcome.costs[1:] if costs else outcome.costs
             moved = self._recarry()
             if rescale:
                 factor = self._noise_factor()
                 self.sigma_px *= factor
-                self.measurements = self.measurements.scaled(factor)
+                self.problem = replace(self.problem, measurements=self.problem.measurements.scaled(factor))
                 moved |= abs(factor - 1) > 1e-3
-            # Landmarks that the weak prior held back may have further to go.
-            if not moved and (
-                gained <= 1e-6 * costs[-1] or not self._weak(self._present()).needs_prior.any()
-            ):
+            if not moved:
                 break
         return replace(outcome, costs=tuple(costs))
 
-    def _approach(self, rule: StopRule, loss: Loss, *, stage: str) -> list[float]:
-        """Gauss-Newton on everything, landmarks placed anew after every step; returns the costs.
-
-        Far from the optimum a landmark's linear prediction goes astray (behind a camera, beyond infinity)
-        and would hold back all others; its best place for the cameras found is what counts.
-        """
-        self._place(loss)
-        explicit = ExplicitLandmarks(self.template, self.measurements)
-        present = self._present()
-        if not present.any():
-            raise SolveError("observations: expected tracks that agree in two or more images, found none")
-        observed = gtsam.NonlinearFactorGraph(self.factors)
-        observed.push_back(explicit.factors(self.accepted & present[self.measurements.landmark], loss))
-        costs = [self._cost(observed, explicit, present)]
-        start = explicit.with_landmarks(self.values, self.points_m, present)
-        elimination = Elimination(observed, start)
-        for number in range(1, rule.max_iterations + 1):
-            weak = self._weak(present)
-            graph = gtsam.NonlinearFactorGraph(observed)
-            graph.push_back(explicit.proximal_factors(self.points_m, weak.bearable_m, weak.stretched))
-            step = elimination.step(graph, explicit.with_landmarks(self.values, self.points_m, present))
-            before, landmarks_before, points_before = self.values, self.landmarks, self.points_m
-            for shrink in (1.0, 0.25, 0.0625, 0.0156):
-                self.values = self.template.retract(before, step, shrink)
-                self._place(loss)
-                trial = self._cost(observed, explicit, present)
-                if trial < costs[-1]:
-                    break
-                self.values, self.landmarks, self.points_m = before, landmarks_before, points_before
-            else:
-                break
-            costs.append(trial)
-            if self.on_iteration is not None:
-                self.on_iteration(Iteration(stage=stage, number=number, cost=trial))
-            if costs[-2] - trial <= rule.relative_decrease * trial:
-                break
-        return costs
-
-    def _cost(
-        self, graph: gtsam.NonlinearFactorGraph, explicit: ExplicitLandmarks, present: BoolArray
-    ) -> float:
-        return float(graph.error(explicit.with_landmarks(self.values, self.points_m, present)))
-
-    def _adjust(self, rule: StopRule) -> Outcome:
-        """Levenberg-Marquardt over the accepted observations, from the current values."""
-        self._place(SQUARED)
-        explicit = ExplicitLandmarks(self.template, self.measurements)
-        present = self._present()
-        kept = self.accepted & present[self.measurements.landmark]
-        self.graph = gtsam.NonlinearFactorGraph(self.factors)
-        self.graph.push_back(explicit.factors(kept))
-        weak = self._weak(present)
-        self.graph.push_back(explicit.proximal_factors(self.points_m, weak.prior_m, weak.needs_prior))
-        values = explicit.with_landmarks(self.values, self.points_m, present)
-        outcome = optimise(
-            self.graph, values, rule, by_qr=bool(weak.stretched.any()), on_iteration=self.on_iteration
-        )
-        self.graph_values = outcome.values
-        self.values = self.template.only_cameras(outcome.values)
-        found = explicit.points_m(outcome.values, present)
-        self.points_m = np.where(present[:, None], found, self.points_m)
-        self.landmarks = self.landmarks.moved_to(self.points_m)
-        return outcome
-
-    def _place(self, loss: Loss) -> None:
-        """Landmarks where they fit best with the cameras as they are."""
-        views = self._views(self.values)
-        m = self.measurements
-        self.landmarks = refine(self.landmarks, m, views, self.accepted.astype(float), loss)
-        self.points_m = self._points(self.landmarks, views)
-
-    def _weak(self, present: BoolArray) -> _Weak:
-        """Which landmarks are hard to hold in range, and for which the weak prior must help."""
-        views, m = self._views(self.values), self.measurements
-        distance = np.linalg.norm(self.points_m - self.landmarks.origin_m, axis=1)
-        sigma = point_sigma_m(self.points_m, m, views, self.accepted)
-        sideways = distance * float(np.median(self.sigma_px)) / float(np.median(views.calibration[:, 0, 0]))
-        return _Weak(
-            needs_prior=present & (sigma > _WEAK_RANGE_SIGMA * distance),
-            prior_m=10 * distance,
-            stretched=present & (sigma > _STRETCHED * sideways),
-            bearable_m=2 * _STRETCHED * sideways,
-        )
+    def _note_behind(self, behind: BoolArray) -> None:
+        self.reason[self.problem.measurements.row[behind]] = "behind"
 
     # --- what the rounds share ---
 
-    def _present(self) -> BoolArray:
-        """(landmarks,) which have two accepted observations or more."""
-        m = self.measurements
-        return np.asarray(np.bincount(m.landmark, self.accepted, minlength=m.n_landmarks) >= 2)
-
-    def _points(self, landmarks: Landmarks, views: CameraViews) -> FloatArray:
-        """World points, none further than where parallax tells nothing, be it beyond infinity."""
-        return landmarks.points_m(self._reach_m(landmarks, views) / _FURTHEST_PARALLAX_SIGMAS)
-
-    def _reach_m(self, landmarks: Landmarks, views: CameraViews) -> FloatArray:
-        """Distance (landmarks,) where the parallax over a landmark's cameras is one sigma of a pixel."""
-        m = self.measurements
-        arm = np.linalg.norm(views.world_t_camera[m.image] - landmarks.origin_m[m.landmark], axis=1)
-        baseline = 2 * np.maximum.reduceat(arm, m.starts).clip(1e-3)
-        focal = float(np.median(views.calibration[:, 0, 0]))
-        return np.asarray(baseline * focal / float(np.median(self.observations.sigma_px)))
-
     def _recarry(self) -> bool:
         """Carry pixels again where that depends on the range; whether any moved."""
-        m = self.measurements
-        centre = self._views(self.values).world_t_camera[m.image]
-        found = np.linalg.norm(self.points_m[m.landmark] - centre, axis=1)
+        if not any(eye.camera.pupil_moves for eye in self.traverse.rig.eyes):
+            return False
+        m = self.problem.measurements
+        centre = self.problem.views.world_t_camera[m.image]
+        found = np.linalg.norm(self.problem.points_m()[m.landmark] - centre, axis=1)
         range_m = np.full(len(self.observations), _TYPICAL_RANGE_M)
         range_m[m.row] = np.where(np.isfinite(found), found, _TYPICAL_RANGE_M)
         uv, turn, valid = self._carry(range_m)
@@ -405,20 +262,21 @@ class Adjustment:
             return False
         keep = valid[m.row, None]
         whitening = turn[m.row] / self.sigma_px[m.row, None, None]
-        self.measurements = replace(
+        carried = replace(
             m,
             uv_px=np.where(keep, uv[m.row], m.uv_px),
             whitening=np.where(keep[:, :, None], whitening, m.whitening),
         )
+        self.problem = replace(self.problem, measurements=carried)
         return True
 
     def _noise_factor(self) -> float:
         """By how much the residuals' spread exceeds the sigmas: the square root of the variance factor."""
-        m, present = self.measurements, self._present()
-        rows = self.accepted & present[m.landmark]
-        residual, _, _ = evaluate(self.landmarks, m, self._views(self.values))
+        p = self.problem
+        rows = p.kept
+        residual, _, _ = evaluate(p.landmarks, p.measurements, p.views)
         # Priors add as many equations as they have unknowns, but for what observations say on top of them.
-        freedom = 2 * int(rows.sum()) - 3 * int(present.sum())
+        freedom = 2 * int(rows.sum()) - 3 * int(p.present.sum())
         if freedom < 1:
             return 1.0
         return float(np.sqrt(np.sum(residual[rows] ** 2) / freedom).clip(1e-3))
@@ -426,37 +284,21 @@ class Adjustment:
     # --- results ---
 
     def _collect(self, outcome: Outcome) -> Solution:
-        t, obs, m = self.traverse, self.observations, self.measurements
-        present = self._present()
-        kept = self.accepted & present[m.landmark]
-        used = np.zeros(len(obs), dtype=bool)
+        t, p, m = self.traverse, self.problem, self.problem.measurements
+        present, kept = p.present, p.kept
+        used = np.zeros(len(self.observations), dtype=bool)
         used[m.row[kept]] = True
-        for row, reason in ((m.row[self.accepted & ~kept], "single"), (m.row[~self.accepted], "outlier")):
+        for row, reason in ((m.row[p.accepted & ~kept], "single"), (m.row[~p.accepted], "outlier")):
             self.reason[row] = np.where(self.reason[row] == "", reason, self.reason[row])
 
-        initial_views = self._views(self.initial_values)
-        initial_landmarks = refine(
-            self._triangulate(self.initial_values, kept.astype(float)),
-            m,
-            initial_views,
-            kept.astype(float),
-            beyond_infinity=True,
+        # The start again, with the landmarks that fit it best: what is gained is then due to the cameras.
+        first = _triangulated(replace(self.first, measurements=m, accepted=p.accepted))
+        first = first.at(
+            first.values,
+            refine(first.landmarks, m, first.views, kept.astype(float), beyond_infinity=True),
         )
-        initial_points = self._points(initial_landmarks, initial_views)
-        initial_points = np.where(present[:, None], initial_points, np.nan)
-        base = gtsam.NonlinearFactorGraph(self.factors)
-        explicit = ExplicitLandmarks(self.template, m)
-        base.push_back(explicit.factors(kept))
-        initial_values = explicit.with_landmarks(self.initial_values, initial_points, present)
-
-        final = self.template.state(self.values, np.where(present[:, None], self.points_m, np.nan))
-        initial = self.template.state(self.initial_values, initial_points)
-        try:
-            stop_covariance, angle_sigma = covariances(self.template, self.graph, self.graph_values, final)
-        except SolveError as error:
-            self.warnings.append(f"no uncertainties: {error}")
-            stop_covariance = np.full((len(t.stops), 6, 6), np.nan)
-            angle_sigma = np.full((len(t.frames), 2), np.nan)
+        final = _state(p)
+        found = self._uncertainty(final)
         return Solution(
             traverse=t,
             model=self.options.model,
@@ -465,25 +307,50 @@ class Adjustment:
             stop_reason=outcome.reason,
             iterations=len(outcome.costs) - 1,
             cost_history=outcome.costs,
-            cost_initial=float(base.error(initial_values)),
-            cost_final=float(base.error(self.graph_values)),
-            initial=initial,
+            cost_initial=first.cost(),
+            cost_final=p.cost(),
+            initial=_state(first),
             final=final,
             landmark_track=self.landmark_track,
             used=used,
-            reason=tuple(str(r) for r in self.reason),
-            residual_initial_px=self._raw_residuals(initial_landmarks, initial_views, present),
-            residual_final_px=self._raw_residuals(self.landmarks, self._views(self.values), present),
+            reason=tuple(self.reason.tolist()),
+            residual_initial_px=self._raw_residuals(first, present),
+            residual_final_px=self._raw_residuals(p, present),
             sigma_px=self.sigma_px,
-            stop_covariance=stop_covariance,
-            angle_sigma_rad=angle_sigma,
+            stop_covariance=found.stop_covariance,
+            angle_sigma_rad=found.angle_sigma_rad,
+            landmark_covariance_m2=found.landmark_covariance_m2,
             warnings=(*self.warnings, *self._late_warnings(used), *connection_warnings(t, used)),
         )
 
-    def _raw_residuals(self, landmarks: Landmarks, views: CameraViews, present: BoolArray) -> FloatArray:
+    def _uncertainty(self, final: State) -> Uncertainty:
+        """Covariances; NaN and a warning where a direction is free. Warns of landmarks without a place."""
+        t = self.traverse
+        try:
+            found = uncertainty(self.problem, final, landmarks=self.options.landmark_covariances)
+        except SolveError as error:
+            self.warnings.append(f"no uncertainties: {error}")
+            n = len(self.landmark_track)
+            return Uncertainty(
+                stop_covariance=np.full((len(t.stops), 6, 6), np.nan),
+                angle_sigma_rad=np.full((len(t.frames), 2), np.nan),
+                landmark_covariance_m2=np.full((n, 3, 3), np.nan)
+                if self.options.landmark_covariances
+                else None,
+                undetermined=np.zeros(n, dtype=bool),
+            )
+        tracks = [str(track) for track in self.landmark_track[found.undetermined]]
+        if tracks:
+            self.warnings.append(
+                f"{listed(tracks, 'track')}: their rays leave the place of the point open; "
+                "they tell where cameras point, and a weak prior holds the point"
+            )
+        return found
+
+    def _raw_residuals(self, problem: Problem, present: BoolArray) -> FloatArray:
         """Projected minus measured (observations, 2) in raw pixels; NaN where there is no landmark."""
-        m = self.measurements
-        whitened, _, in_front = evaluate(landmarks, m, views)
+        m = problem.measurements
+        whitened, _, in_front = evaluate(problem.landmarks, m, problem.views)
         out = np.full((len(self.observations), 2), np.nan)
         known = present[m.landmark] & in_front
         out[m.row[known]] = whitened[known] * self.sigma_px[m.row[known], None]
@@ -500,3 +367,35 @@ class Adjustment:
                 f"{share:.0%} of the observations were rejected; check matches, rig and telemetry sigmas"
             )
         return warnings
+
+
+def _template(traverse: Traverse, options: SolveOptions) -> FactorTemplate:
+    """The rig as variables and factors, as the options have it."""
+    if options.firm_tie == "soft":
+        return SoftTemplate(traverse, options.model, options.firm_flex)
+    if options.landmarks == "eliminated":
+        return HardTemplate(traverse)
+    # GTSAM's projections want camera poses: a tie far below what images can tell makes them rigid.
+    return SoftTemplate(traverse, options.model, RIGID)
+
+
+def _triangulated(problem: Problem) -> Problem:
+    """Landmarks by linear triangulation; one behind a camera starts far off, where its cameras look."""
+    m, views, weight = problem.measurements, problem.views, problem.accepted.astype(float)
+    centre, direction = rays_of(m, views)
+    landmarks = triangulate(centre, direction, m.landmark, weight)
+    _, _, in_front = evaluate(landmarks, m, views)
+    behind = np.bincount(m.landmark, ~in_front & (weight > 0), minlength=m.n_landmarks) > 0
+    problem = replace(problem, landmarks=landmarks)
+    if not behind.any():
+        return problem
+    mean = np.add.reduceat(weight[:, None] * direction, m.starts)
+    ahead = landmarks.moved_to(landmarks.origin_m + reach_m(problem)[:, None] * mean)
+    vector = np.where(behind[:, None], ahead.vector, landmarks.vector)
+    return replace(problem, landmarks=replace(landmarks, vector=vector))
+
+
+def _state(problem: Problem) -> State:
+    """What a solution says of a problem; points that take no part are NaN."""
+    points = np.where(problem.present[:, None], problem.points_m(), np.nan)
+    return problem.template.state(problem.values, points)

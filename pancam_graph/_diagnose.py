@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 from pancam_graph.geometry import BoolArray, IntArray
 from pancam_graph.traverse import Traverse
 
-__all__ = ["components", "connection_warnings"]
+__all__ = ["components", "connection_warnings", "listed"]
 
 _NAMED = 6
 
@@ -69,6 +69,11 @@ def connection_warnings(traverse: Traverse, used: BoolArray) -> list[str]:
                 "their place is what odometry says"
             )
     return warnings
+
+
+def listed(names: Sequence[str], what: str) -> str:
+    """How many, and which, of these the first few: "2 tracks (4, 7)"."""
+    return f"{_number(names, what)} ({_names(names)})"
 
 
 def _number(names: Sequence[str], what: str) -> str:

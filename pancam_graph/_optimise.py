@@ -1,14 +1,14 @@
 """GTSAM's Levenberg-Marquardt, iteration by iteration, with a reason for stopping."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import gtsam
 
 from pancam_graph.errors import SolveError
 
-__all__ = ["Elimination", "Iteration", "Outcome", "StopRule", "optimise"]
+__all__ = ["Elimination", "InOrder", "Iteration", "Outcome", "StopRule", "optimise"]
 
 _LOG = logging.getLogger(__name__)
 _INDETERMINATE = "ndeterminate"
@@ -31,7 +31,7 @@ class StopRule:
 
     max_iterations: int
     relative_decrease: float
-    """An iteration that lowers the cost by less than this share of it is the last."""
+    """The iterations end where those to come would lower the cost by less than this share of it."""
     absolute_cost: float = 0.0
     """A cost below this is as good as none."""
 
@@ -51,8 +51,9 @@ def optimise(
     graph: gtsam.NonlinearFactorGraph,
     values: gtsam.Values,
     rule: StopRule,
+    elimination: "Elimination | InOrder",
     *,
-    by_qr: bool = False,
+    stage: str = "solve",
     on_iteration: Callable[[Iteration], None] | None = None,
 ) -> Outcome:
     """Minimise the graph's error from the given values.
@@ -62,7 +63,7 @@ def optimise(
     """
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setlambdaUpperBound(1e10)
-    Elimination(graph, values, by_qr=by_qr).set_up(parameters)
+    elimination.set_up(parameters)
     try:
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
         costs = [optimizer.error()]
@@ -75,17 +76,43 @@ def optimise(
             costs.append(optimizer.error())
             _LOG.debug("iteration %d: cost %.9g, lambda %.1e", number, costs[-1], optimizer.lambda_())
             if on_iteration is not None:
-                on_iteration(Iteration(stage="solve", number=number, cost=costs[-1]))
-            decrease = costs[-2] - costs[-1]
+                on_iteration(Iteration(stage=stage, number=number, cost=costs[-1]))
             if optimizer.lambda_() >= parameters.getlambdaUpperBound():
                 converged, reason = True, "no step lowers the cost"
                 break
-            if decrease <= rule.relative_decrease * costs[-2]:
+            if _still_to_gain(costs) <= rule.relative_decrease * costs[-1]:
                 converged, reason = True, f"relative decrease below {rule.relative_decrease:g}"
                 break
     except RuntimeError as error:
         raise _explained(error) from error
     return Outcome(values=optimizer.values(), converged=converged, reason=reason, costs=tuple(costs))
+
+
+def _still_to_gain(costs: list[float]) -> float:
+    """By how much further iterations would lower the cost, if their gains shrink as the last one did.
+
+    Gauss-Newton converges linearly where residuals are not zero, so gains shrink geometrically. Where the
+    last gain did not shrink, or there is but one, it stands for all to come.
+    """
+    gain = costs[-2] - costs[-1]
+    if len(costs) < 3 or gain <= 0:
+        return max(gain, 0.0)
+    rate = gain / max(costs[-3] - costs[-2], 1e-300)
+    return gain * rate / (1 - rate) if rate < 0.1 else gain
+
+
+class InOrder:
+    """Cholesky in a given order of elimination."""
+
+    def __init__(self, keys: Sequence[int]) -> None:
+        self.ordering = gtsam.Ordering()
+        for key in keys:
+            self.ordering.push_back(key)
+
+    def set_up(self, parameters: gtsam.NonlinearOptimizerParams) -> None:
+        """Make an optimiser use it."""
+        parameters.setLinearSolverType("MULTIFRONTAL_CHOLESKY")
+        parameters.setOrdering(self.ordering)
 
 
 class Elimination:

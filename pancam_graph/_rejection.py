@@ -10,24 +10,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2, norm
 
+from pancam_graph import _landmark_loops as loops
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray
-from pancam_graph.landmarks import (
-    CameraViews,
-    Landmarks,
-    Measurements,
-    evaluate,
-    free_derivatives,
-    refine,
-    residual_cofactor,
-    triangulate,
-)
+from pancam_graph.landmarks import CameraViews, Landmarks, Measurements, as_floats, seen_by
+from pancam_graph.losses import SQUARED
+from pancam_graph.threads import in_parallel
 
 __all__ = ["Screening", "rays_of", "screen"]
 
-_MIN_REDUNDANCY = 0.02
-"""Directions of a residual that keep less than this of the noise's variance cannot show an error."""
-
 _SWEEPS = 12
+_RAY_GRAIN = 16384
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -45,11 +37,16 @@ class Screening:
 
 def rays_of(measurements: Measurements, views: CameraViews) -> tuple[FloatArray, FloatArray]:
     """Centres (n, 3) and unit directions (n, 3) of the measurements' lines of sight, in the world."""
-    image = measurements.image
-    homogeneous = np.column_stack([measurements.uv_px, np.ones(len(image))])
-    in_camera = np.linalg.solve(views.calibration[image], homogeneous[..., None])
-    direction = (views.world_R_camera[image] @ in_camera)[..., 0]
-    return views.world_t_camera[image], direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    seen = seen_by(measurements, views)
+    n_images, direction = len(views.calibration), np.empty((len(seen.image), 3))
+    calibration = as_floats(views.calibration, (n_images, 3, 3))
+    rotation = as_floats(views.world_R_camera, (n_images, 3, 3))
+    in_parallel(
+        lambda first, last: loops.rays(seen.image, seen.uv_px, calibration, rotation, first, last, direction),
+        len(direction),
+        grain=_RAY_GRAIN,
+    )
+    return views.world_t_camera[seen.image], direction
 
 
 def screen(
@@ -67,76 +64,62 @@ def screen(
     that a Gaussian exceeds beyond `cutoff_sigma`, in units of a robust scale that is at least `min_scale`.
     Of a track with two observations that disagree both go, for nothing tells which is wrong.
     """
-    k = measurements.landmark
-    accepted = _revive(accepted, k)
-    revived = _count(accepted, k) == _count(np.ones_like(accepted), k)
-    landmarks = _retriangulate(landmarks, measurements, views, accepted, only=revived)
+    seen, n, n_landmarks = seen_by(measurements, views), len(measurements.image), measurements.n_landmarks
+    begin, starts = measurements.begin, measurements.starts
+    centre, direction = rays_of(measurements, views)
+    vector = as_floats(landmarks.vector, (n_landmarks, 4)).copy()
+    origin = as_floats(landmarks.origin_m, (n_landmarks, 3)).copy()
+    weight = as_floats(_revived(accepted, measurements), (n,))
+    residual, b, cofactor = np.empty((n, 2)), np.empty((n, 2, 3)), np.empty((n, 2, 2))
+    test, freedom, in_front = np.empty(n), np.empty(n, dtype=np.int64), np.empty(n, dtype=bool)
+    lost, changed = np.empty(n_landmarks, dtype=bool), np.empty(n_landmarks, dtype=bool)
     tail = 2 * norm.sf(cutoff_sigma)
     limit = np.array([np.inf, chi2.isf(tail, 1), chi2.isf(tail, 2)])
-    scale, in_front = min_scale, np.ones_like(accepted)
+    scale = min_scale
+    which = np.arange(n_landmarks)
+    fresh = np.flatnonzero(np.minimum.reduceat(weight, starts) > 0)
     for sweep in range(_SWEEPS):
-        landmarks = refine(landmarks, measurements, views, accepted.astype(float))
-        residual, b, in_front = evaluate(landmarks, measurements, views)
-        b = free_derivatives(b, landmarks, measurements)
-        cofactor = residual_cofactor(b, measurements, accepted.astype(float))
-        test, dof = _normalised(residual, cofactor)
+        loops.over(loops.triangulate, fresh, begin, centre, direction, weight, vector, origin)
+        loops.over(loops.refine, which, seen, origin, weight, SQUARED.kind, SQUARED.width, False, vector)
+        loops.over(loops.evaluate, which, seen, vector, origin, residual, b, in_front)
+        loops.over(loops.free_derivatives, which, begin, vector, b)
+        loops.over(loops.cofactors, which, begin, b, weight, cofactor)
+        loops.over(loops.tests, which, begin, residual, cofactor, test, freedom)
         if sweep == 0:
-            scale = max(min_scale, _robust_scale(test[accepted & in_front], dof[accepted & in_front]))
-        # What takes part may not exceed the noise itself, even where its cofactor shows no direction of it.
-        length = np.einsum("ni,ni->n", residual, residual)
-        excess = test / scale**2 - limit[dof]
-        excess = np.where(accepted, np.maximum(excess, length / scale**2 - limit[2]), excess)
-        excess = np.where(in_front, excess, np.inf)
-        bad = accepted & (excess > 0)
-        goes = bad & (
-            excess >= np.maximum.reduceat(np.where(accepted, excess, -np.inf), measurements.starts)[k]
+            counts = (weight > 0) & in_front
+            scale = max(min_scale, _robust_scale(test[counts], freedom[counts]))
+        loops.over(
+            loops.reject,
+            which,
+            begin,
+            residual,
+            test,
+            freedom,
+            in_front,
+            scale,
+            limit,
+            sweep == 0,
+            weight,
+            lost,
+            changed,
         )
-        goes |= bad & (_count(accepted, k) <= 2)[k]
-        comes = ~accepted & in_front & (excess < 0) & (dof > 0) if sweep == 0 else np.zeros_like(bad)
-        comes &= (_count(accepted & ~goes, k) >= 2)[k]
-        if not (goes.any() or comes.any()):
+        which = which[changed[which]]
+        if len(which) == 0:
             break
-        accepted = (accepted & ~goes) | comes
-        lost = np.zeros(measurements.n_landmarks, dtype=bool)
-        lost[k[goes]] = True
-        landmarks = _retriangulate(landmarks, measurements, views, accepted, only=lost)
-    return Screening(landmarks=landmarks, accepted=accepted, scale=scale, behind=~in_front)
-
-
-def _count(mask: BoolArray, landmark: IntArray) -> IntArray:
-    return np.bincount(landmark, mask, minlength=int(landmark[-1]) + 1).astype(np.int64)
-
-
-def _revive(accepted: BoolArray, landmark: IntArray) -> BoolArray:
-    """Give landmarks that lost their observations all of them back, to be judged anew."""
-    return np.asarray(accepted | (_count(accepted, landmark) < 2)[landmark])
-
-
-def _retriangulate(
-    landmarks: Landmarks,
-    measurements: Measurements,
-    views: CameraViews,
-    accepted: BoolArray,
-    *,
-    only: BoolArray,
-) -> Landmarks:
-    if not only.any():
-        return landmarks
-    centre, direction = rays_of(measurements, views)
-    fresh = triangulate(centre, direction, measurements.landmark, accepted.astype(float))
-    usable = only & (_count(accepted, measurements.landmark) > 0)
-    return Landmarks(
-        vector=np.where(usable[:, None], fresh.vector, landmarks.vector),
-        origin_m=np.where(usable[:, None], fresh.origin_m, landmarks.origin_m),
+        fresh = which[lost[which] & (np.add.reduceat(weight, starts)[which] > 0)]
+    return Screening(
+        landmarks=Landmarks(vector=vector, origin_m=origin),
+        accepted=weight > 0,
+        scale=scale,
+        behind=~in_front,
     )
 
 
-def _normalised(residual: FloatArray, cofactor: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Squared residuals in units of their own covariance, and over how many directions (0, 1 or 2)."""
-    values, vectors = np.linalg.eigh(cofactor)
-    shown = values > _MIN_REDUNDANCY
-    along = np.einsum("nij,ni->nj", vectors, residual) ** 2 / np.where(shown, values, 1.0)
-    return np.sum(along * shown, axis=1), shown.sum(axis=1)
+def _revived(accepted: BoolArray, measurements: Measurements) -> BoolArray:
+    """Give landmarks that lost their observations all of them back, to be judged anew."""
+    k = measurements.landmark
+    few = np.bincount(k, accepted, minlength=measurements.n_landmarks) < 2
+    return np.asarray(accepted | few[k])
 
 
 def _robust_scale(test: FloatArray, dof: IntArray) -> float:

@@ -4,15 +4,28 @@ Everything else of the package works on whole arrays or once per image, frame or
 """
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numba
 import numpy as np
 
+from pancam_graph.geometry import BoolArray, FloatArray, IntArray
+
 __all__ = [
+    "BEHIND_COST",
+    "WEAK_PRIOR",
+    "Bearings",
+    "Reduced",
+    "Sights",
+    "arrange",
+    "compiled",
+    "eliminate_calibrations",
+    "eliminate_poses",
+    "follow",
     "loss_cost",
     "loss_weight",
     "sight",
+    "spread",
     "tangent_basis",
 ]
 
@@ -30,7 +43,7 @@ NONE, HUBER, CAUCHY = 0, 1, 2
 
 @compiled
 def loss_cost(kind: int, width: float, squared: float) -> float:
-    """rho of a whitened residual's squared length; rho is half of it near zero."""
+    """Loss rho of a whitened residual's squared length; rho is half of it near zero."""
     if kind == HUBER and squared > width * width:
         return width * (np.sqrt(squared) - 0.5 * width)
     if kind == CAUCHY:
@@ -49,7 +62,7 @@ def loss_weight(kind: int, width: float, squared: float) -> float:
 
 
 @compiled
-def tangent_basis(vector, basis):
+def tangent_basis(vector: FloatArray, basis: FloatArray) -> None:
     """Orthonormal basis (4, 3) of the tangent space of S^3 at a unit vector, by a Householder reflection.
 
     The reflection takes the vector to the first axis (or its opposite); the images of the other three
@@ -65,7 +78,15 @@ def tangent_basis(vector, basis):
 
 
 @compiled
-def sight(to_pixel, offset, vector, uv_px, whitening, residual, d_ray):
+def sight(
+    to_pixel: FloatArray,
+    offset: FloatArray,
+    vector: FloatArray,
+    uv_px: FloatArray,
+    whitening: FloatArray,
+    residual: FloatArray,
+    d_ray: FloatArray,
+) -> bool:
     """Whitened residual (2,) of one observation and its derivative (2, 3) by the world ray; whether in front.
 
     The ray is X - w offset, the camera's centre being at `offset` from the landmark's origin. What is behind
@@ -89,3 +110,510 @@ def sight(to_pixel, offset, vector, uv_px, whitening, residual, d_ray):
         d_ray[0, k] = w00 * gu + w01 * gv
         d_ray[1, k] = w10 * gu + w11 * gv
     return in_front
+
+
+class Sights(NamedTuple):
+    """Observations of landmarks in the order of elimination; structure that no step changes.
+
+    An *occurrence* is one unit (images moved alike by all variables) that sees a landmark. A landmark touches
+    columns of its block's variables: its `column`s, ascending; `place` says where among them each segment of
+    an occurrence's chain begins.
+    """
+
+    image: IntArray
+    """(n,)"""
+    uv_px: FloatArray
+    """(n, 2)"""
+    whitening: FloatArray
+    """(n, 2, 2)"""
+    occurrence_begin: IntArray
+    """(occurrences + 1,) first observation of each"""
+    occurrence_unit: IntArray
+    """(occurrences,)"""
+    occurrence_row: IntArray
+    """(occurrences,) the unit's row among those of its block"""
+    place_begin: IntArray
+    """(occurrences + 1,) first entry in `place` of each"""
+    place: IntArray
+    landmark_begin: IntArray
+    """(landmarks + 1,) first occurrence of each"""
+    column_begin: IntArray
+    """(landmarks + 1,) first entry in `column` of each"""
+    column: IntArray
+
+
+class Bearings(NamedTuple):
+    """Cameras at one linearisation point, and how they move with the variables."""
+
+    to_pixel: FloatArray
+    """(images, 3, 3) world directions to homogeneous pixels"""
+    centre_m: FloatArray
+    """(images, 3)"""
+    calibration: FloatArray
+    """(images, 3, 3) K"""
+    unit_R: FloatArray
+    """(units, 3, 3) world_R_base: the body whose twist moves the unit's images"""
+    unit_t: FloatArray
+    """(units, 3)"""
+    segment_begin: IntArray
+    """(units + 1,)"""
+    segment_width: IntArray
+    """(segments,) columns of each"""
+    chain: FloatArray
+    """(segments, rows, widest): takes a variable's tangent to the base's twist (6 rows, rotation first), and
+    where calibrations are free to changes of fx, fy, skew, cx, cy (5 more)"""
+
+
+class Reduced(NamedTuple):
+    """What is left of landmarks after elimination, by landmark."""
+
+    factor: FloatArray
+    """(landmarks, 6) lower Cholesky factor of V by rows"""
+    gamma: FloatArray
+    """(landmarks, 3) L^-1 g"""
+    arms: FloatArray
+    """(3 len(column),) L^-1 E' of each landmark, three rows of its columns"""
+    cost: FloatArray
+    """(landmarks,) true robust cost"""
+    undetermined: BoolArray
+    """(landmarks,) whether the weak prior alone holds a direction"""
+
+
+WEAK_PRIOR = 1e-12
+"""Weak prior of a landmark: its information, over the trace of what the landmark's observations know."""
+_UNDETERMINED = 1e-9
+"""A pivot below this share of the trace is called undetermined."""
+BEHIND_COST = 1e30
+"""What an observation of a landmark behind its camera costs: no step that leads there is taken."""
+_SURPRISE, _SURPRISE_COST = 2.0, 10.0
+"""A step is shortened for a landmark whose cost more than doubles by more than this."""
+
+
+@compiled
+def _chain(
+    unit_H: FloatArray,
+    unit_s: FloatArray,
+    unit_of: IntArray,
+    bearings: Bearings,
+    segment_column: IntArray,
+    S: FloatArray,
+    s: FloatArray,
+) -> None:
+    """Add the units' own information, taken through their chains, to the upper triangle of S and to s."""
+    rows, widest = bearings.chain.shape[1], bearings.chain.shape[2]
+    half = np.empty((rows, widest))
+    for row in range(len(unit_of)):
+        unit = unit_of[row]
+        if unit < 0:
+            continue
+        for a in range(bearings.segment_begin[unit], bearings.segment_begin[unit + 1]):
+            chain_a, column_a, width_a = bearings.chain[a], segment_column[a], bearings.segment_width[a]
+            for p in range(rows):
+                for q in range(width_a):
+                    total = 0.0
+                    for k in range(rows):
+                        total += unit_H[row, p, k] * chain_a[k, q]
+                    half[p, q] = total
+            for q in range(width_a):
+                total = 0.0
+                for k in range(rows):
+                    total += unit_s[row, k] * chain_a[k, q]
+                s[column_a + q] += total
+            for b in range(bearings.segment_begin[unit], bearings.segment_begin[unit + 1]):
+                chain_b, column_b = bearings.chain[b], segment_column[b]
+                if column_b > column_a:
+                    continue
+                for p in range(bearings.segment_width[b]):
+                    for q in range(width_a):
+                        total = 0.0
+                        for k in range(rows):
+                            total += chain_b[k, p] * half[k, q]
+                        S[column_b + p, column_a + q] += total
+
+
+@compiled
+def _by_calibration(
+    bearings: Bearings, image: int, uv_px: FloatArray, whitening: FloatArray, root: float, jac: FloatArray
+) -> None:
+    """Columns 6 to 10 of an observation's Jacobian: by fx, fy, skew, cx and cy (thesis eq. 4.2)."""
+    K = bearings.calibration[image]
+    y = (uv_px[1] - K[1, 2]) / K[1, 1]
+    x = (uv_px[0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
+    for m in range(2):
+        wu, wv = root * whitening[m, 0], root * whitening[m, 1]
+        jac[m, 6], jac[m, 7], jac[m, 8], jac[m, 9], jac[m, 10] = wu * x, wv * y, wu * y, wu, wv
+
+
+def _eliminating(rows: int) -> Callable[..., None]:
+    """The elimination kernel for chains of 6 rows (poses) or 11 (poses and calibrations)."""
+
+    @compiled
+    def eliminate(
+        sights: Sights,
+        bearings: Bearings,
+        vector: FloatArray,
+        origin_m: FloatArray,
+        kind: int,
+        width: float,
+        begin: int,
+        end: int,
+        segment_column: IntArray,
+        n_units: int,
+        reduced: Reduced,
+        S: FloatArray,
+        s: FloatArray,
+    ) -> None:
+        unit_H = np.zeros((n_units, rows, rows))
+        unit_s = np.zeros((n_units, rows))
+        unit_of = np.full(n_units, -1)
+        basis, residual, d_ray = np.empty((4, 3)), np.empty(2), np.empty((2, 3))
+        b, jac = np.empty((2, 3)), np.empty((2, rows))
+        x, offset, uv = np.empty(3), np.empty(3), np.empty(2)
+        cross = np.empty((rows, 3))
+        for j in range(begin, end):
+            tangent_basis(vector[j], basis)
+            w = vector[j, 3]
+            v00 = v10 = v11 = v20 = v21 = v22 = g0 = g1 = g2 = 0.0
+            cost = 0.0
+            c0 = sights.column_begin[j]
+            n = sights.column_begin[j + 1] - c0
+            arms = reduced.arms[3 * c0 : 3 * (c0 + n)].reshape(3, n)
+            arms[:] = 0.0
+            column = sights.column[c0 : c0 + n]
+            for o in range(sights.landmark_begin[j], sights.landmark_begin[j + 1]):
+                unit = sights.occurrence_unit[o]
+                R = bearings.unit_R[unit]
+                for k in range(3):
+                    offset[k] = vector[j, k] - w * (bearings.unit_t[unit, k] - origin_m[j, k])
+                for k in range(3):
+                    x[k] = R[0, k] * offset[0] + R[1, k] * offset[1] + R[2, k] * offset[2]
+                cross[:] = 0.0
+                row = sights.occurrence_row[o]
+                unit_of[row] = unit
+                H, h = unit_H[row], unit_s[row]
+                for i in range(sights.occurrence_begin[o], sights.occurrence_begin[o + 1]):
+                    image = sights.image[i]
+                    for k in range(3):
+                        offset[k] = bearings.centre_m[image, k] - origin_m[j, k]
+                    in_front = sight(
+                        bearings.to_pixel[image],
+                        offset,
+                        vector[j],
+                        sights.uv_px[i],
+                        sights.whitening[i],
+                        residual,
+                        d_ray,
+                    )
+                    if not in_front:
+                        cost += BEHIND_COST
+                        continue
+                    squared = residual[0] * residual[0] + residual[1] * residual[1]
+                    cost += loss_cost(kind, width, squared)
+                    root = np.sqrt(loss_weight(kind, width, squared))
+                    for m in range(2):
+                        residual[m] *= root
+                        d0, d1, d2 = root * d_ray[m, 0], root * d_ray[m, 1], root * d_ray[m, 2]
+                        d3 = -(d0 * offset[0] + d1 * offset[1] + d2 * offset[2])
+                        for k in range(3):
+                            b[m, k] = (
+                                d0 * basis[0, k] + d1 * basis[1, k] + d2 * basis[2, k] + d3 * basis[3, k]
+                            )
+                        e0 = d0 * R[0, 0] + d1 * R[1, 0] + d2 * R[2, 0]
+                        e1 = d0 * R[0, 1] + d1 * R[1, 1] + d2 * R[2, 1]
+                        e2 = d0 * R[0, 2] + d1 * R[1, 2] + d2 * R[2, 2]
+                        jac[m, 0] = e1 * x[2] - e2 * x[1]
+                        jac[m, 1] = e2 * x[0] - e0 * x[2]
+                        jac[m, 2] = e0 * x[1] - e1 * x[0]
+                        jac[m, 3], jac[m, 4], jac[m, 5] = -w * e0, -w * e1, -w * e2
+                    if rows > 6:
+                        # The projection, from the whitened residual before the loss.
+                        wh = sights.whitening[i]
+                        det = (wh[0, 0] * wh[1, 1] - wh[0, 1] * wh[1, 0]) * root
+                        uv[0] = sights.uv_px[i, 0] + (wh[1, 1] * residual[0] - wh[0, 1] * residual[1]) / det
+                        uv[1] = sights.uv_px[i, 1] + (wh[0, 0] * residual[1] - wh[1, 0] * residual[0]) / det
+                        _by_calibration(bearings, image, uv, wh, root, jac)
+                    r0, r1 = residual[0], residual[1]
+                    v00 += b[0, 0] * b[0, 0] + b[1, 0] * b[1, 0]
+                    v10 += b[0, 1] * b[0, 0] + b[1, 1] * b[1, 0]
+                    v11 += b[0, 1] * b[0, 1] + b[1, 1] * b[1, 1]
+                    v20 += b[0, 2] * b[0, 0] + b[1, 2] * b[1, 0]
+                    v21 += b[0, 2] * b[0, 1] + b[1, 2] * b[1, 1]
+                    v22 += b[0, 2] * b[0, 2] + b[1, 2] * b[1, 2]
+                    g0 += b[0, 0] * r0 + b[1, 0] * r1
+                    g1 += b[0, 1] * r0 + b[1, 1] * r1
+                    g2 += b[0, 2] * r0 + b[1, 2] * r1
+                    for p in range(rows):
+                        ja, jb = jac[0, p], jac[1, p]
+                        h[p] += ja * r0 + jb * r1
+                        for k in range(3):
+                            cross[p, k] += ja * b[0, k] + jb * b[1, k]
+                        for q in range(rows):
+                            H[p, q] += ja * jac[0, q] + jb * jac[1, q]
+                place = sights.place_begin[o]
+                for segment in range(bearings.segment_begin[unit], bearings.segment_begin[unit + 1]):
+                    chain, first = bearings.chain[segment], sights.place[place]
+                    place += 1
+                    for q in range(bearings.segment_width[segment]):
+                        a0 = a1 = a2 = 0.0
+                        for p in range(rows):
+                            t = chain[p, q]
+                            a0 += t * cross[p, 0]
+                            a1 += t * cross[p, 1]
+                            a2 += t * cross[p, 2]
+                        arms[0, first + q] += a0
+                        arms[1, first + q] += a1
+                        arms[2, first + q] += a2
+            trace = v00 + v11 + v22
+            prior = WEAK_PRIOR * trace + 1e-300
+            l00 = np.sqrt(v00 + prior)
+            l10, l20 = v10 / l00, v20 / l00
+            p1 = max(v11 + prior - l10 * l10, prior)
+            l11 = np.sqrt(p1)
+            l21 = (v21 - l20 * l10) / l11
+            p2 = max(v22 + prior - l20 * l20 - l21 * l21, prior)
+            l22 = np.sqrt(p2)
+            reduced.undetermined[j] = min(v00, p1, p2) < _UNDETERMINED * trace
+            factor = reduced.factor[j]
+            factor[0], factor[1], factor[2], factor[3], factor[4], factor[5] = l00, l10, l11, l20, l21, l22
+            y0 = g0 / l00
+            y1 = (g1 - l10 * y0) / l11
+            y2 = (g2 - l20 * y0 - l21 * y1) / l22
+            reduced.gamma[j, 0], reduced.gamma[j, 1], reduced.gamma[j, 2] = y0, y1, y2
+            reduced.cost[j] = cost
+            for q in range(n):
+                a0 = arms[0, q] / l00
+                a1 = (arms[1, q] - l10 * a0) / l11
+                a2 = (arms[2, q] - l20 * a0 - l21 * a1) / l22
+                arms[0, q], arms[1, q], arms[2, q] = a0, a1, a2
+            for p in range(n):
+                a0, a1, a2 = arms[0, p], arms[1, p], arms[2, p]
+                line = S[column[p]]
+                s[column[p]] -= a0 * y0 + a1 * y1 + a2 * y2
+                for q in range(p, n):
+                    line[column[q]] -= a0 * arms[0, q] + a1 * arms[1, q] + a2 * arms[2, q]
+        _chain(unit_H, unit_s, unit_of, bearings, segment_column, S, s)
+
+    return eliminate
+
+
+eliminate_poses = _eliminating(6)
+"""Linearise and eliminate landmarks begin to end; adds to S (upper triangle) and s of their block.
+
+Exact Schur complement of the whitened, robustly weighted system: S = A'A - sum E V^-1 E' and
+s = A'r - sum E V^-1 g with E = A'B, V = B'B, g = B'r for the cameras' Jacobian A and each landmark's B.
+V gets the weak prior and no damping."""
+eliminate_calibrations = _eliminating(11)
+"""The same for chains with calibrations."""
+
+
+@compiled
+def follow(
+    sights: Sights,
+    bearings: Bearings,
+    vector: FloatArray,
+    origin_m: FloatArray,
+    kind: int,
+    width: float,
+    begin: int,
+    end: int,
+    reduced: Reduced,
+    dx: FloatArray,
+    moved: FloatArray,
+    cost: FloatArray,
+) -> None:
+    """Landmarks begin to end follow the step dx (columns of their block,) of the cameras; their true costs.
+
+    `bearings` are the cameras after the step. The step dp = -V^-1 (g + E' dx) is the landmark's part of the
+    joint step. Where it ends behind a camera or costs far more than before, a shorter one that costs least is
+    taken, or none: a landmark that its linear prediction leads astray does not hold back all others.
+    """
+    basis, step, trial = np.empty((4, 3)), np.empty(3), np.empty(4)
+    for j in range(begin, end):
+        c0, c1 = sights.column_begin[j], sights.column_begin[j + 1]
+        n = c1 - c0
+        arms = reduced.arms[3 * c0 : 3 * c1].reshape(3, n)
+        y0, y1, y2 = reduced.gamma[j, 0], reduced.gamma[j, 1], reduced.gamma[j, 2]
+        for q in range(n):
+            d = dx[sights.column[c0 + q]]
+            y0 += arms[0, q] * d
+            y1 += arms[1, q] * d
+            y2 += arms[2, q] * d
+        f = reduced.factor[j]
+        step[2] = -y2 / f[5]
+        step[1] = (-y1 - f[4] * step[2]) / f[2]
+        step[0] = (-y0 - f[1] * step[1] - f[3] * step[2]) / f[0]
+        tangent_basis(vector[j], basis)
+        limit = _SURPRISE * reduced.cost[j] + _SURPRISE_COST
+        cost[j] = np.inf
+        moved[j] = vector[j]
+        for share in (1.0, 0.5, 0.25, 0.0625, 0.0):
+            norm = 0.0
+            for k in range(4):
+                trial[k] = vector[j, k] + share * (
+                    basis[k, 0] * step[0] + basis[k, 1] * step[1] + basis[k, 2] * step[2]
+                )
+                norm += trial[k] * trial[k]
+            for k in range(4):
+                trial[k] /= np.sqrt(norm)
+            found = _landmark_cost(sights, bearings, trial, origin_m[j], kind, width, j)
+            if found < cost[j]:
+                cost[j] = found
+                moved[j] = trial
+            if found <= limit:
+                break
+
+
+@compiled
+def _landmark_cost(
+    sights: Sights,
+    bearings: Bearings,
+    vector: FloatArray,
+    origin_m: FloatArray,
+    kind: int,
+    width: float,
+    j: int,
+) -> float:
+    residual, d_ray, offset = np.empty(2), np.empty((2, 3)), np.empty(3)
+    cost = 0.0
+    first, last = sights.landmark_begin[j], sights.landmark_begin[j + 1]
+    for i in range(sights.occurrence_begin[first], sights.occurrence_begin[last]):
+        image = sights.image[i]
+        for k in range(3):
+            offset[k] = bearings.centre_m[image, k] - origin_m[k]
+        in_front = sight(
+            bearings.to_pixel[image], offset, vector, sights.uv_px[i], sights.whitening[i], residual, d_ray
+        )
+        if in_front:
+            squared = residual[0] * residual[0] + residual[1] * residual[1]
+            cost += loss_cost(kind, width, squared)
+        else:
+            cost += BEHIND_COST
+    return cost
+
+
+@compiled
+def arrange(
+    landmarks: IntArray,
+    begin: IntArray,
+    image: IntArray,
+    image_unit: IntArray,
+    segment_begin: IntArray,
+    segment_width: IntArray,
+    segment_column: IntArray,
+    n_columns: int,
+    first_landmark: int,
+    rows: IntArray,
+    sights: Sights,
+    cursor: IntArray,
+) -> int:
+    """Put a block's landmarks into the order of elimination; returns how many units see them.
+
+    `landmarks` (m,) are rows in measurements whose observations of landmark j are begin[j] to begin[j + 1].
+    Fills `rows` (n,), the measurement of each observation, and the structure of `sights` from where `cursor`
+    (observations, occurrences, places, columns) stands, and moves the cursor on.
+    """
+    unit_row = np.full(len(segment_begin) - 1, -1)
+    place_of = np.full(n_columns, -1)
+    starts = np.empty(n_columns, dtype=np.int64)
+    n_units = 0
+    n_obs, n_occurrences, n_places, n_column = cursor[0], cursor[1], cursor[2], cursor[3]
+    for m in range(len(landmarks)):
+        j, first_occurrence = landmarks[m], n_occurrences
+        first_obs, last_obs = n_obs, n_obs + begin[j + 1] - begin[j]
+        for i in range(begin[j], begin[j + 1]):  # sorted by unit as they come
+            unit, k = image_unit[image[i]], n_obs
+            while k > first_obs and image_unit[sights.image[k - 1]] > unit:
+                sights.image[k], rows[k] = sights.image[k - 1], rows[k - 1]
+                k -= 1
+            sights.image[k], rows[k] = image[i], i
+            n_obs += 1
+        n_starts, before = 0, -1
+        for i in range(first_obs, last_obs):
+            unit = image_unit[sights.image[i]]
+            if unit == before:
+                continue
+            before = unit
+            if unit_row[unit] < 0:
+                unit_row[unit] = n_units
+                n_units += 1
+            sights.occurrence_begin[n_occurrences] = i
+            sights.occurrence_unit[n_occurrences] = unit
+            sights.occurrence_row[n_occurrences] = unit_row[unit]
+            n_occurrences += 1
+            for segment in range(segment_begin[unit], segment_begin[unit + 1]):
+                column = segment_column[segment]
+                if place_of[column] < 0:
+                    place_of[column] = segment_width[segment]
+                    k = n_starts
+                    while k > 0 and starts[k - 1] > column:
+                        starts[k] = starts[k - 1]
+                        k -= 1
+                    starts[k] = column
+                    n_starts += 1
+        sights.landmark_begin[first_landmark + m] = first_occurrence
+        sights.column_begin[first_landmark + m] = n_column
+        place = 0
+        for k in range(n_starts):
+            wide = place_of[starts[k]]
+            place_of[starts[k]] = place
+            for q in range(wide):
+                sights.column[n_column] = starts[k] + q
+                n_column += 1
+            place += wide
+        for o in range(first_occurrence, n_occurrences):
+            sights.place_begin[o] = n_places
+            unit = sights.occurrence_unit[o]
+            for segment in range(segment_begin[unit], segment_begin[unit + 1]):
+                sights.place[n_places] = place_of[segment_column[segment]]
+                n_places += 1
+        for k in range(n_starts):
+            place_of[starts[k]] = -1
+    cursor[0], cursor[1], cursor[2], cursor[3] = n_obs, n_occurrences, n_places, n_column
+    return n_units
+
+
+@compiled
+def spread(
+    sights: Sights,
+    reduced: Reduced,
+    vector: FloatArray,
+    joint: FloatArray,
+    begin: int,
+    end: int,
+    covariance_m2: FloatArray,
+) -> None:
+    """Covariances (landmarks, 3, 3) of points X / w, begin to end, given that of their block's variables.
+
+    L^-T (I + W C W') L^-1 in the tangent space, with W the `arms`, taken through the derivative of X / w.
+    """
+    basis, tangent, half, point = np.empty((4, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    for j in range(begin, end):
+        c0, c1 = sights.column_begin[j], sights.column_begin[j + 1]
+        n = c1 - c0
+        arms, column = reduced.arms[3 * c0 : 3 * c1].reshape(3, n), sights.column[c0:c1]
+        for a in range(3):
+            for b in range(3):
+                tangent[a, b] = 1.0 if a == b else 0.0
+        for p in range(n):
+            for q in range(n):
+                c = joint[column[p], column[q]]
+                for a in range(3):
+                    for b in range(3):
+                        tangent[a, b] += arms[a, p] * c * arms[b, q]
+        tangent_basis(vector[j], basis)
+        w = vector[j, 3]
+        for k in range(3):
+            for a in range(3):
+                point[k, a] = basis[k, a] / w - vector[j, k] * basis[3, a] / (w * w)
+        f = reduced.factor[j]
+        for k in range(3):  # rows of point L^-T
+            half[k, 0] = point[k, 0] / f[0]
+            half[k, 1] = (point[k, 1] - f[1] * half[k, 0]) / f[2]
+            half[k, 2] = (point[k, 2] - f[3] * half[k, 0] - f[4] * half[k, 1]) / f[5]
+        for k in range(3):
+            for m in range(3):
+                total = 0.0
+                for a in range(3):
+                    for b in range(3):
+                        total += half[k, a] * tangent[a, b] * half[m, b]
+                covariance_m2[j, k, m] = total

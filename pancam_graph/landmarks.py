@@ -10,13 +10,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from pancam_graph import _landmark_loops as loops
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.losses import SQUARED, Loss
-
-_BEHIND_COST = 1e12
-_REFINE_STEPS = 15
-_NO_BASELINE_M = 1e-9
 
 __all__ = [
     "CameraViews",
@@ -68,10 +66,15 @@ class Measurements:
         """Number of landmarks."""
         return int(self.landmark[-1]) + 1 if len(self.landmark) else 0
 
+    @cached_property
+    def begin(self) -> IntArray:
+        """(landmarks + 1,) first row of each landmark, and n."""
+        return _begin(self.landmark)
+
     @property
     def starts(self) -> IntArray:
         """(landmarks,) first row of each landmark."""
-        return np.searchsorted(self.landmark, np.arange(self.n_landmarks))
+        return self.begin[:-1]
 
     def part(self, rows: IntArray) -> "Measurements":
         """Rows of whole landmarks, these numbered anew without gaps."""
@@ -125,31 +128,11 @@ def triangulate(
     one line, show no parallax: the landmark then lies on them at infinity. Where all weights of a landmark
     are 0, all its rays count alike.
     """
-    starts = np.searchsorted(landmark, np.arange(landmark[-1] + 1))
-    weight = np.where((np.add.reduceat(weight, starts) > 0)[landmark], weight, 1.0)
-    total = np.add.reduceat(weight, starts)
-    origin = np.add.reduceat(weight[:, None] * centre_m, starts) / total[:, None]
-    across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
-    arm = np.einsum("nij,nj->ni", across, centre_m - origin[landmark])
-    baseline = np.sqrt(np.add.reduceat(weight * np.einsum("ni,ni->n", arm, arm), starts) / total)
-    parallax = baseline > _NO_BASELINE_M
-    baseline = np.where(parallax, baseline, 1.0)
-    arm = np.where(parallax[landmark, None], arm / baseline[landmark, None], 0.0)
-    form = np.empty((len(landmark), 4, 4))
-    form[:, :3, :3] = across
-    form[:, :3, 3] = form[:, 3, :3] = -arm
-    form[:, 3, 3] = np.where(parallax[landmark], np.einsum("ni,ni->n", arm, arm), 1.0)
-    vector = np.empty((len(origin), 4))
-    ray_weight = weight
-    for _ in range(2):
-        _, vectors = np.linalg.eigh(np.add.reduceat(ray_weight[:, None, None] * form, starts))
-        vector = vectors[:, :, 0]
-        vector[:, 3] /= baseline
-        vector /= np.linalg.norm(vector, axis=1, keepdims=True)
-        towards = vector[landmark, :3] - vector[landmark, 3:] * (centre_m - origin[landmark])
-        ray_weight = weight / np.maximum(np.einsum("ni,ni->n", towards, towards), 1e-12)
-    sight = np.add.reduceat(weight * np.sign(np.einsum("ni,ni->n", towards, direction)), starts)
-    vector = vector * np.where(sight < 0, -1.0, 1.0)[:, None]
+    begin, n = _begin(landmark), len(landmark)
+    centre_m, direction = as_floats(centre_m, (n, 3)), as_floats(direction, (n, 3))
+    weight = as_floats(weight, (n,))
+    vector, origin = np.empty((len(begin) - 1, 4)), np.empty((len(begin) - 1, 3))
+    loops.over(loops.triangulate, np.arange(len(vector)), begin, centre_m, direction, weight, vector, origin)
     return Landmarks(vector=vector, origin_m=origin)
 
 
@@ -160,20 +143,11 @@ def evaluate(
 
     Residuals of landmarks behind a camera are those of the mirrored point and mean nothing.
     """
-    k, image = measurements.landmark, measurements.image
-    offset = views.world_t_camera[image] - landmarks.origin_m[k]
-    vector = landmarks.vector[k]
-    world_ray = vector[:, :3] - vector[:, 3:] * offset
-    to_pixel = views.to_pixel[image]
-    p = np.einsum("nij,nj->ni", to_pixel, world_ray)
-    in_front = p[:, 2] > 1e-12
-    depth = np.where(np.abs(p[:, 2]) > 1e-12, p[:, 2], 1e-12)
-    uv = p[:, :2] / depth[:, None]
-    residual = np.einsum("nij,nj->ni", measurements.whitening, uv - measurements.uv_px)
-    d_uv = (to_pixel[:, :2] - uv[:, :, None] * to_pixel[:, 2:]) / depth[:, None, None]
-    d_ray = measurements.whitening @ d_uv
-    d_vector = np.concatenate([d_ray, -np.einsum("nij,nj->ni", d_ray, offset)[:, :, None]], axis=2)
-    return residual, d_vector @ _tangent_basis(landmarks.vector)[k], in_front
+    seen, n = seen_by(measurements, views), len(measurements.image)
+    vector, origin = _arrays(landmarks, measurements)
+    residual, b, in_front = np.empty((n, 2)), np.empty((n, 2, 3)), np.empty(n, dtype=bool)
+    loops.over(loops.evaluate, np.arange(len(vector)), seen, vector, origin, residual, b, in_front)
+    return residual, b, in_front
 
 
 def free_derivatives(b: FloatArray, landmarks: Landmarks, measurements: Measurements) -> FloatArray:
@@ -182,18 +156,10 @@ def free_derivatives(b: FloatArray, landmarks: Landmarks, measurements: Measurem
     A landmark that `refine` holds at infinity (w is 0) does not follow its observations beyond it: its
     derivatives lose their part along w.
     """
-    at_infinity = landmarks.vector[:, 3] == 0
-    along_w = np.where(at_infinity[:, None], _tangent_basis(landmarks.vector)[:, 3, :], 0.0)
-    along_w = along_w[measurements.landmark]
-    return np.asarray(b - np.einsum("nij,nj->ni", b, along_w)[:, :, None] * along_w[:, None, :])
-
-
-def _tangent_basis(vector: FloatArray) -> FloatArray:
-    """Orthonormal bases (landmarks, 4, 3) of the tangent spaces, by Householder reflections."""
-    v = vector.copy()
-    v[:, 0] += np.where(v[:, 0] >= 0, 1.0, -1.0)
-    reflection = np.eye(4) - 2 * v[:, :, None] * v[:, None, :] / np.einsum("li,li->l", v, v)[:, None, None]
-    return np.asarray(reflection[:, :, 1:])
+    vector, _ = _arrays(landmarks, measurements)
+    free = as_floats(b, (len(measurements.image), 2, 3)).copy()
+    loops.over(loops.free_derivatives, np.arange(len(vector)), measurements.begin, vector, free)
+    return free
 
 
 def refine(
@@ -211,82 +177,12 @@ def refine(
     cost or move it behind a camera is not taken; directions that its rays leave free are not moved along.
     Landmarks whose rays diverge end at infinity, or beyond it where that is allowed.
     """
-    free = _refine(landmarks, measurements, views, weight, loss, held_at_infinity=False)
-    # One whose vector is its origin alone has no direction in which infinity could be.
-    is_beyond = (free.vector[:, 3] < 0) & (np.linalg.norm(free.vector[:, :3], axis=1) > 1e-9)
-    beyond = np.flatnonzero(is_beyond)
-    if beyond_infinity or len(beyond) == 0:
-        return free
-    rows = np.flatnonzero(is_beyond[measurements.landmark])
-    flat = free.vector[beyond] * [1.0, 1.0, 1.0, 0.0]
-    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
-    bound = _refine(
-        Landmarks(vector=flat, origin_m=free.origin_m[beyond]),
-        measurements.part(rows),
-        views,
-        weight[rows],
-        loss,
-        held_at_infinity=True,
-    )
-    vector = free.vector.copy()
-    vector[beyond] = bound.vector
-    return replace(free, vector=vector)
-
-
-def _refine(
-    landmarks: Landmarks,
-    measurements: Measurements,
-    views: CameraViews,
-    weight: FloatArray,
-    loss: Loss,
-    *,
-    held_at_infinity: bool,
-) -> Landmarks:
-    vector = landmarks.vector.copy()
-    damping = np.full(len(vector), 1e-6)
-    active = np.arange(len(vector))
-    rows = np.arange(len(measurements.row))
-    for _ in range(_REFINE_STEPS):
-        part, own = measurements.part(rows), weight[rows]
-        now = replace(landmarks, vector=vector[active], origin_m=landmarks.origin_m[active])
-        residual, b, in_front = evaluate(now, part, views)
-        cost = _landmark_cost(residual, in_front, own, part.starts, loss)
-        if held_at_infinity:
-            b = free_derivatives(b, now, part)
-        wb = (own * loss.weight(residual))[:, None, None] * b
-        v = np.add.reduceat(b.transpose(0, 2, 1) @ wb, part.starts)
-        g = np.add.reduceat(np.einsum("nij,ni->nj", wb, residual), part.starts)
-        values, vectors = np.linalg.eigh(v)
-        floor = 1e-13 * values[:, -1:] + 1e-300
-        along = np.einsum("lij,li->lj", vectors, g) * (values > floor)
-        step = -np.einsum("lij,lj->li", vectors, along / (values.clip(floor) * (1 + damping[active, None])))
-        length = np.linalg.norm(step, axis=1)
-        step *= np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))[:, None]
-        moved = now.vector + np.einsum("lij,lj->li", _tangent_basis(now.vector), step)
-        if held_at_infinity:
-            moved[:, 3] = 0.0
-        trial = replace(now, vector=moved / np.linalg.norm(moved, axis=1, keepdims=True))
-        trial_residual, _, trial_front = evaluate(trial, part, views)
-        trial_cost = _landmark_cost(trial_residual, trial_front, own, part.starts, loss)
-        better = trial_cost < cost
-        vector[active[better]] = trial.vector[better]
-        damping[active] = np.where(better, damping[active] * 0.1, damping[active] * 100.0).clip(1e-12, 1e9)
-        # A landmark stays where a step promises next to nothing, or where no damping makes one gain.
-        promised = -0.5 * np.einsum("li,li->l", step, g)
-        settled = (promised <= 1e-9 * cost + 1e-12) | (~better & (damping[active] > 1e6))
-        keep = np.zeros(len(vector), dtype=bool)
-        keep[active[~settled]] = True
-        rows, active = np.flatnonzero(keep[measurements.landmark]), np.flatnonzero(keep)
-        if len(active) == 0:
-            break
+    seen = seen_by(measurements, views)
+    start, origin = _arrays(landmarks, measurements)
+    own, vector = as_floats(weight, (len(measurements.image),)), start.copy()
+    which = np.arange(len(vector))
+    loops.over(loops.refine, which, seen, origin, own, loss.kind, loss.width, beyond_infinity, vector)
     return replace(landmarks, vector=vector)
-
-
-def _landmark_cost(
-    residual: FloatArray, in_front: BoolArray, weight: FloatArray, starts: IntArray, loss: Loss
-) -> FloatArray:
-    cost = loss.cost(residual) + np.where(in_front, 0.0, _BEHIND_COST)
-    return np.asarray(np.add.reduceat(weight * cost, starts))
 
 
 def residual_cofactor(b: FloatArray, measurements: Measurements, weight: FloatArray) -> FloatArray:
@@ -296,14 +192,11 @@ def residual_cofactor(b: FloatArray, measurements: Measurements, weight: FloatAr
     for the others I + B V^-1 B'. `b` (n, 2, 3) are `evaluate`'s derivatives. Source: Baarda, A testing
     procedure for use in geodetic networks, 1968.
     """
-    v = np.add.reduceat(b.transpose(0, 2, 1) @ (weight[:, None, None] * b), measurements.starts)
-    values, vectors = np.linalg.eigh(v)
-    # Directions that the accepted rays leave free: their observations determine them, whatever they say.
-    inverse = 1 / np.maximum(values, 1e-14 * values[:, -1:] + 1e-100)
-    half = b @ (vectors * np.sqrt(inverse)[:, None, :])[measurements.landmark]
-    leverage = half @ half.transpose(0, 2, 1)
-    sign = np.where(weight > 0, -weight, 1.0)
-    return np.asarray(np.eye(2) + sign[:, None, None] * leverage)
+    n = len(measurements.image)
+    derivatives, own, out = as_floats(b, (n, 2, 3)), as_floats(weight, (n,)), np.empty((n, 2, 2))
+    which = np.arange(measurements.n_landmarks)
+    loops.over(loops.cofactors, which, measurements.begin, derivatives, own, out)
+    return out
 
 
 def point_sigma_m(
@@ -314,16 +207,50 @@ def point_sigma_m(
     That direction is the line of sight but for points between their cameras. Infinite for landmarks that
     fewer than two accepted observations see.
     """
-    image, k = measurements.image, measurements.landmark
-    to_pixel = views.to_pixel[image]
-    p = np.einsum("nij,nj->ni", to_pixel, points_m[k] - views.world_t_camera[image])
-    depth = np.where(np.abs(p[:, 2]) > 1e-12, p[:, 2], 1e-12)
-    uv = p[:, :2] / depth[:, None]
-    d_point = (
-        measurements.whitening @ (to_pixel[:, :2] - uv[:, :, None] * to_pixel[:, 2:]) / depth[:, None, None]
-    )
-    d_point = np.where(accepted[:, None, None], d_point, 0.0)
-    information = np.add.reduceat(d_point.transpose(0, 2, 1) @ d_point, measurements.starts)
-    smallest = np.linalg.eigvalsh(information)[:, 0]
-    few = np.bincount(k, accepted, minlength=len(points_m)) < 2
+    seen, n = seen_by(measurements, views), measurements.n_landmarks
+    points, weight = as_floats(points_m, (n, 3)), as_floats(accepted, (len(measurements.image),))
+    smallest = np.empty(n)
+    loops.over(loops.smallest_information, np.arange(n), seen, points, weight, smallest)
+    few = np.bincount(measurements.landmark, weight, minlength=n) < 2
     return np.where(few | (smallest <= 0), np.inf, 1 / np.sqrt(smallest.clip(1e-300)))
+
+
+# --- arrays as the compiled loops take them ---
+
+
+def as_floats(array: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+    """The array as contiguous float64; raises ValueError where its shape is another.
+
+    Writable, so that every caller's arrays are of one type and a loop is compiled once.
+    """
+    floats = np.require(array, np.float64, ["C", "W"])
+    if floats.shape != shape:
+        raise ValueError(f"expected an array of shape {shape}, found {floats.shape}")
+    return floats
+
+
+def seen_by(measurements: Measurements, views: CameraViews) -> loops.Seen:
+    """Measurements with the cameras that made them. Raises IndexError for an image without a camera."""
+    n, n_images = len(measurements.image), len(views.world_t_camera)
+    image = np.require(measurements.image, np.int64, ["C", "W"])
+    if n and not 0 <= image.min() <= image.max() < n_images:
+        raise IndexError(f"image: expected 0 to {n_images - 1}, found {image.min()} to {image.max()}")
+    return loops.Seen(
+        begin=measurements.begin,
+        image=image,
+        uv_px=as_floats(measurements.uv_px, (n, 2)),
+        whitening=as_floats(measurements.whitening, (n, 2, 2)),
+        to_pixel=as_floats(views.to_pixel, (n_images, 3, 3)),
+        centre_m=as_floats(views.world_t_camera, (n_images, 3)),
+    )
+
+
+def _arrays(landmarks: Landmarks, measurements: Measurements) -> tuple[FloatArray, FloatArray]:
+    """Vectors (landmarks, 4) and origins (landmarks, 3), as many as measurements tell of."""
+    n = measurements.n_landmarks
+    return as_floats(landmarks.vector, (n, 4)), as_floats(landmarks.origin_m, (n, 3))
+
+
+def _begin(landmark: IntArray) -> IntArray:
+    n_landmarks = int(landmark[-1]) + 1 if len(landmark) else 0
+    return np.searchsorted(landmark, np.arange(n_landmarks + 1)).astype(np.int64, copy=False)

@@ -1,16 +1,20 @@
-"""Robust losses, in NumPy and as GTSAM's noise models.
+"""Robust losses, for arrays and as GTSAM's noise models.
 
 All take the length of a whitened residual; `scale` widens them where the noise is larger than its sigma.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import gtsam
 import numpy as np
 
+from pancam_graph import _landmark_loops as loops
+from pancam_graph import kernel
 from pancam_graph.errors import InputError
 from pancam_graph.geometry import FloatArray
+from pancam_graph.threads import in_parallel
 
 __all__ = ["SQUARED", "Loss", "LossName", "loss_of"]
 
@@ -23,6 +27,9 @@ _WIDTH: dict[LossName, float] = {
     "cauchy": 2.3849,
 }
 
+_KIND: dict[LossName, int] = {"none": kernel.NONE, "huber": kernel.HUBER, "cauchy": kernel.CAUCHY}
+_GRAIN = 65536
+
 
 @dataclass(frozen=True)
 class Loss:
@@ -32,25 +39,26 @@ class Loss:
     width: float
     """Where it bends away from the square, in sigmas."""
 
+    @property
+    def kind(self) -> int:
+        """The loss's number in compiled code."""
+        return _KIND[self.name]
+
     def cost(self, residual: FloatArray) -> FloatArray:
         """Costs (n,) of whitened residuals (n, m)."""
-        squared = np.einsum("ni,ni->n", residual, residual)
-        if self.name == "huber":
-            length = np.sqrt(squared)
-            beyond = self.width * (length - self.width / 2)
-            return np.asarray(np.where(length <= self.width, squared / 2, beyond))
-        if self.name == "cauchy":
-            return np.asarray(0.5 * self.width**2 * np.log1p(squared / self.width**2))
-        return np.asarray(squared / 2)
+        return self._each(loops.loss_costs, residual)
 
     def weight(self, residual: FloatArray) -> FloatArray:
         """Weights (n,) that make the square's gradient that of the loss."""
+        return self._each(loops.loss_weights, residual)
+
+    def _each(self, loop: Callable[..., None], residual: FloatArray) -> FloatArray:
         squared = np.einsum("ni,ni->n", residual, residual)
-        if self.name == "huber":
-            return np.asarray(np.minimum(1.0, self.width / np.sqrt(squared.clip(1e-300))))
-        if self.name == "cauchy":
-            return np.asarray(1 / (1 + squared / self.width**2))
-        return np.ones(len(residual))
+        out = np.empty(len(squared))
+        in_parallel(
+            lambda first, last: loop(self.kind, self.width, squared, first, last, out), len(out), grain=_GRAIN
+        )
+        return out
 
     def noise_model(self, gaussian: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
         """GTSAM's noise model of this loss over a Gaussian one."""

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from pancam_graph.errors import InputError
-from pancam_graph.graph import DEFAULT_TIES, Model, Tie
+from pancam_graph.graph import DEFAULT_FLEX, Flex, Model, Tie
 from pancam_graph.losses import LossName, loss_of
 
 __all__ = ["SolveOptions"]
@@ -15,33 +15,56 @@ class SolveOptions:
     """How to solve."""
 
     model: Model = "mast"
-    landmarks: Literal["explicit"] = "explicit"
-    """How landmarks are treated: as variables of the graph."""
+    landmarks: Literal["eliminated", "explicit"] = "eliminated"
+    """How landmarks are treated: eliminated from every linearisation, or as variables of the graph, which is
+    slow and serves for checking."""
     loss: LossName = "huber"
     """Robust loss while outliers are sought. The final estimate is always least squares over the
     observations that were kept; "none" keeps all of them."""
     tie: Tie | None = None
-    """How firmly camera poses are tied to the mast; default: the model's own (graph.DEFAULT_TIES)."""
+    """"hard": camera poses are computed from mast, pan and tilt (model "mast" only); "soft": they are
+    variables that a sigma holds near there. Default: hard for "mast", soft for the others."""
+    flex: Flex | None = None
+    """That sigma; default: the model's own (graph.DEFAULT_FLEX)."""
     outlier_sigma: float = 4.0
     """An observation goes where noise would take it less often than a Gaussian beyond this many sigmas."""
     rescale_noise: bool | None = None
     """Whether observation sigmas are multiplied by what residuals say; default: where this package measured
     the observations itself and their sigmas are guesses."""
+    landmark_covariances: bool = False
+    """Whether the solution gets the covariance of each terrain point."""
     max_iterations: int = 100
     """Of the final least squares; reaching it means not converged."""
     relative_decrease: float = 1e-7
-    """The final least squares stops where an iteration lowers the cost by a smaller share."""
+    """The final least squares ends where further iterations would lower the cost by a smaller share."""
 
     def __post_init__(self) -> None:
         """Check the choices."""
         loss_of(self.loss)
         for name, value, choices in (
-            ("model", self.model, tuple(DEFAULT_TIES)),
-            ("landmarks", self.landmarks, ("explicit",)),
+            ("model", self.model, tuple(DEFAULT_FLEX)),
+            ("landmarks", self.landmarks, ("eliminated", "explicit")),
+            ("tie", self.tie or "soft", ("hard", "soft")),
         ):
             if value not in choices:
                 raise InputError(f"{name}: expected one of {', '.join(choices)}; found {value!r}")
+        if self.tie == "hard" and self.model != "mast":
+            raise InputError(
+                f"tie: expected soft for the model {self.model}, found hard: its poses are variables"
+            )
+        if self.flex is not None and self.firm_tie == "hard":
+            raise InputError("flex: expected none with a hard tie, which has no sigma")
         if self.max_iterations < 1:
             raise InputError(f"max_iterations: expected 1 or more, found {self.max_iterations}")
         if not self.outlier_sigma > 0:
             raise InputError(f"outlier_sigma: expected a number above 0, found {self.outlier_sigma}")
+
+    @property
+    def firm_tie(self) -> Tie:
+        """The tie, the model's own where none was asked for."""
+        return self.tie or ("hard" if self.model == "mast" else "soft")
+
+    @property
+    def firm_flex(self) -> Flex:
+        """The flex of a soft tie."""
+        return self.flex or DEFAULT_FLEX[self.model]

@@ -86,6 +86,8 @@ class Solution:
     NaN, as the angles' sigmas, where the solution leaves a direction free; a warning says so."""
     angle_sigma_rad: FloatArray
     """(frames, 2) formal standard deviation of pan and tilt, landmarks marginalised."""
+    landmark_covariance_m2: FloatArray | None = None
+    """(landmarks, 3, 3) of `final.landmarks_m`, all else marginalised; formal; where it was asked for."""
     warnings: tuple[str, ...] = ()
     seconds: Seconds = field(default_factory=Seconds)
 

@@ -1,13 +1,19 @@
 """Ranges of items over all cores, for compiled loops that release the interpreter's lock."""
 
 import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache
+from itertools import islice
+from typing import TypeVar
 
 from pancam_graph.errors import InputError
 
-__all__ = ["in_parallel", "n_workers"]
+__all__ = ["in_parallel", "n_workers", "ordered"]
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 _VARIABLE = "PANCAM_GRAPH_THREADS"
 
@@ -45,6 +51,28 @@ def in_parallel(function: Callable[[int, int], None], n: int, *, grain: int) -> 
     for error in [future.exception() for future in futures]:
         if error is not None:
             raise error
+
+
+def ordered(function: Callable[[T], R], items: Iterable[T], *, ahead: int) -> Iterator[R]:
+    """Results of function(item) in the order of the items, of which `ahead` at most are under way.
+
+    An item is drawn only when there is room for it, so that items may carry buffers that the consumer of a
+    result gives back. Raises the exception of the first item that failed.
+    """
+    workers, waiting = n_workers(), iter(items)
+    if workers == 1:
+        yield from map(function, waiting)
+        return
+    pending: deque[Future[R]] = deque()
+    try:
+        while True:
+            for item in islice(waiting, ahead - len(pending)):
+                pending.append(_pool(workers).submit(function, item))
+            if not pending:
+                return
+            yield pending.popleft().result()
+    finally:
+        wait(pending)
 
 
 @cache

@@ -29,9 +29,9 @@ def main() -> int:
     )
     parser.add_argument(
         "--landmarks",
-        choices=("explicit",),
-        default="explicit",
-        help="explicit: terrain points are variables of the graph",
+        choices=("eliminated", "explicit"),
+        default="eliminated",
+        help="eliminated: terrain points follow the cameras (default); explicit: they are variables, slow",
     )
     parser.add_argument(
         "--loss",

@@ -58,7 +58,7 @@ def test_solves_and_writes_the_contract(run: Run, traverse_folder: Path, tmp_pat
     assert {p.name for p in out.iterdir()} == {"solution.json", "points.ply", "residuals.csv", "report.html"}
     solution = read_solution_json(out / "solution.json")
     assert solution.model == "mast"
-    assert solution.landmarks == "explicit"
+    assert solution.landmarks == "eliminated"
     raw = json.loads((out / "solution.json").read_text())
     n = len(json.loads((traverse_folder / "traverse.json").read_text())["images"])
     assert len(raw["images"]) == n

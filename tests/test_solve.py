@@ -21,7 +21,7 @@ from pancam_graph import (
 from pancam_graph._adjustment import Adjustment
 from pancam_graph.cameras import CAHVORE
 from pancam_graph.errors import InputError, SolveError
-from pancam_graph.graph import Tie
+from pancam_graph.graph import ExplicitLandmarks, Flex, SoftTemplate
 from pancam_graph.initialise import Start
 from pancam_graph.rigs import TEMPLATES, Eye, Rig, mer_navcam
 from pancam_graph.simulate import Simulation
@@ -122,9 +122,15 @@ def test_covariances_agree_with_gtsam_marginals() -> None:
     assert t.observations is not None
     distance = np.linalg.norm(simulation.truth.landmarks_m, axis=1)
     near = t.with_observations(t.observations.select((distance < 20.0)[t.observations.track]))
-    adjustment = Adjustment(near, SolveOptions(loss="none"), None, None)
+    adjustment = Adjustment(near, SolveOptions(loss="none", landmarks="explicit"), None, None)
     solution = adjustment.run()
-    marginals = gtsam.Marginals(adjustment.graph, adjustment.graph_values)
+    problem = adjustment.problem
+    assert isinstance(problem.template, SoftTemplate)
+    explicit = ExplicitLandmarks(problem.template, problem.measurements)
+    graph = gtsam.NonlinearFactorGraph(problem.factors)
+    graph.push_back(explicit.factors(problem.kept))
+    values = explicit.with_landmarks(problem.values, problem.points_m(), problem.present)
+    marginals = gtsam.Marginals(graph, values)
     assert solution.stop_covariance[0].tolist() == np.zeros((6, 6)).tolist()
     expected = marginals.marginalCovariance(gtsam.symbol("M", 1))
     assert solution.stop_covariance[1] == pytest.approx(expected, rel=1e-4, abs=1e-6 * np.abs(expected).max())
@@ -136,9 +142,9 @@ def test_covariances_agree_with_gtsam_marginals() -> None:
 def test_a_firm_tie_makes_all_models_agree() -> None:
     """Free cameras on a tie as firm as the mast's are the mast; looser, they fit better, never worse."""
     simulation = simulate(mer_navcam(), SMALL, seed=7)
-    tie = Tie(rotation_rad=1e-7, translation_m=1e-6)
+    flex = Flex(rotation_rad=1e-7, translation_m=1e-6)
     mast = solve(simulation.traverse, SolveOptions(loss="none"))
-    firm = solve(simulation.traverse, SolveOptions(loss="none", model="free", tie=tie))
+    firm = solve(simulation.traverse, SolveOptions(loss="none", model="free", flex=flex))
     free = solve(simulation.traverse, SolveOptions(loss="none", model="free"))
     circle = solve(simulation.traverse, SolveOptions(loss="none", model="circle"))
     assert firm.final.pan_tilt_rad == pytest.approx(mast.final.pan_tilt_rad, abs=1e-6)

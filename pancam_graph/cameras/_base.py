@@ -64,6 +64,11 @@ class Camera(ABC):
     def pinhole(self) -> "Pinhole":
         """The pinhole of the same camera: what is left without distortion, with the same axes."""
 
+    @property
+    def pupil_moves(self) -> bool:
+        """Whether rays of different pixels start at different points, so that near and far points differ."""
+        return False
+
     def project(self, points_m: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Pixels (n, 2) of points (n, 3) and their validity (n,); see `project_with_jacobian`."""
         uv_px, _, valid = self.project_with_jacobian(points_m)

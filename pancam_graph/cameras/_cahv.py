@@ -270,6 +270,11 @@ class CAHVORE(CAHVOR):
             return np.sin(y) / k, np.cos(y), inside
         return theta, np.ones_like(theta), np.ones(len(theta), dtype=bool)
 
+    @property
+    def pupil_moves(self) -> bool:
+        """True: where a ray starts depends on its angle."""
+        return True
+
     def _pupil(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Shift of the entrance pupil along O, metres, and its derivative by the field angle."""
         e0, e1, e2 = self.E

@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 
 from pancam_graph.geometry import BoolArray, FloatArray
-from pancam_graph.graph._template import FactorTemplate
+from pancam_graph.graph._soft import SoftTemplate
 from pancam_graph.landmarks import Measurements
 from pancam_graph.losses import SQUARED, Loss
 
@@ -23,7 +23,7 @@ class ExplicitLandmarks:
     constant there, so the optimiser rejects the step.
     """
 
-    def __init__(self, template: FactorTemplate, measurements: Measurements) -> None:
+    def __init__(self, template: SoftTemplate, measurements: Measurements) -> None:
         self.template = template
         self.measurements = measurements
         self._calibration = [

@@ -7,7 +7,10 @@ import numpy as np
 
 from pancam_graph.errors import InputError
 
-__all__ = ["DEFAULT_TIES", "Model", "Tie"]
+__all__ = ["DEFAULT_FLEX", "RIGID", "Flex", "Model", "Tie"]
+
+Tie = Literal["hard", "soft"]
+"""Whether camera poses are computed from the mast, or are variables that a sigma holds near it."""
 
 Model = Literal["mast", "circle", "free"]
 """How camera poses hang together: `mast` on the pan-tilt chain, `circle` with their centres on the mast's
@@ -15,8 +18,8 @@ circles and their rotations free (thesis 4.6 to 4.9), `free` each on its own but
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tie:
-    """How firmly a camera pose is tied to where the mast puts it: the flex of the mast, one sigma."""
+class Flex:
+    """How far a camera pose may be from where the mast puts it, one sigma: the flex of the mast."""
 
     rotation_rad: float
     translation_m: float
@@ -26,14 +29,17 @@ class Tie:
         for name in ("rotation_rad", "translation_m"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
-                raise InputError(f"tie: {name}: expected a number above 0, found {value}")
+                raise InputError(f"flex: {name}: expected a number above 0, found {value}")
 
 
-DEFAULT_TIES: dict[Model, Tie] = {
-    # Rigid: a hundredth of what the images of a panorama can tell, so the optimum is that of a rigid mast.
-    "mast": Tie(rotation_rad=1e-7, translation_m=1e-6),
+RIGID = Flex(rotation_rad=1e-7, translation_m=1e-6)
+"""A hundredth of what the images of a panorama can tell: the optimum is that of a rigid mast."""
+
+DEFAULT_FLEX: dict[Model, Flex] = {
+    # A tenth of a pixel of a rover's Navcam, and the millimetre to which mounts are known.
+    "mast": Flex(rotation_rad=5e-5, translation_m=1e-3),
     # Centres on the circle to a tenth of a millimetre; rotations held no better than 20 mrad by telemetry.
-    "circle": Tie(rotation_rad=0.02, translation_m=1e-4),
+    "circle": Flex(rotation_rad=0.02, translation_m=1e-4),
     # Loose enough to say nothing that images say, tight enough to join what no image joins.
-    "free": Tie(rotation_rad=0.02, translation_m=0.02),
+    "free": Flex(rotation_rad=0.02, translation_m=0.02),
 }

@@ -1,35 +1,72 @@
-"""A rig as a factor template: the recipe that turns a stop, a frame or an image into factors.
+"""A rig as a factor template: the recipe that turns stops, frames and images into variables and factors."""
 
-Variables: `M` mast pose per stop (Pose3), `A` pan and tilt per frame (vector of 2), `X` camera pose per
-image (Pose3), `R` circle radius per eye (double). What telemetry holds (sigma 0) is not a variable.
-"""
-
-from functools import cached_property
+from abc import ABC, abstractmethod
+from typing import Any
 
 import gtsam
 import numpy as np
 
-from pancam_graph.factors import CircleOffset, Fixed, Key, Slot, circle_factor, mast_factor
-from pancam_graph.geometry import FloatArray, IntArray, pan_tilt_from_rotation, pose_arrays, wrap_angle
-from pancam_graph.graph._options import Model, Tie
+from pancam_graph.elimination import Covariance, Linkage, Posture
+from pancam_graph.factors import Fixed, Key, Slot
+from pancam_graph.geometry import FloatArray, IntArray
+from pancam_graph.graph._options import Model
+from pancam_graph.landmarks import CameraViews
 from pancam_graph.solution import State
-from pancam_graph.traverse import Traverse
+from pancam_graph.traverse import Stop, Traverse
 
-__all__ = ["FactorTemplate"]
-
-_RADIUS_SIGMA_M = 1e-3
-"""Prior of a circle's radius about the rig's: sources of real rigs differ by millimetres."""
+__all__ = ["FactorTemplate", "Factors", "diagonal_noise", "read_variable"]
 
 Factors = list[gtsam.NonlinearFactor]
 
 
-class FactorTemplate:
+class FactorTemplate(ABC):
     """Factors and variables of a traverse's rig for one model; landmarks are added by others."""
 
-    def __init__(self, traverse: Traverse, model: Model, tie: Tie) -> None:
+    def __init__(self, traverse: Traverse, model: Model) -> None:
         self.traverse = traverse
         self.model: Model = model
-        self.tie = tie
+        self._calibration = np.array([p.calibration_matrix for p in traverse.rig.pinholes])[
+            traverse.image_eye
+        ]
+
+    @property
+    @abstractmethod
+    def linkage(self) -> Linkage:
+        """Variables, and how images hang on them; one group per stop, then one of what all stops share."""
+
+    @property
+    def cliques(self) -> tuple[tuple[int, ...], ...]:
+        """Groups of variables that factors of this template join."""
+        shared = range(len(self.traverse.stops), self.linkage.n_groups)
+        return tuple((stop, *shared) for stop in range(len(self.traverse.stops))) if shared else ()
+
+    @abstractmethod
+    def posture(self, values: gtsam.Values) -> Posture:
+        """Cameras and chain rule at the values."""
+
+    @abstractmethod
+    def views(self, values: gtsam.Values) -> CameraViews:
+        """Cameras of all images at the values."""
+
+    @abstractmethod
+    def factors(self) -> gtsam.NonlinearFactorGraph:
+        """All factors but those of landmarks."""
+
+    @abstractmethod
+    def values(self, state: State) -> gtsam.Values:
+        """The variables at a state."""
+
+    @abstractmethod
+    def state(self, values: gtsam.Values, landmarks_m: FloatArray) -> State:
+        """The state at values of the variables; inverse of `values`."""
+
+    @abstractmethod
+    def held_columns(self) -> dict[int, IntArray]:
+        """By key, tangent components that telemetry holds while others of the same variable are free."""
+
+    @abstractmethod
+    def angle_sigma_rad(self, covariance: Covariance, state: State) -> FloatArray:
+        """Standard deviation of pan and tilt (frames, 2); 0 where held."""
 
     def mast(self, stop: int) -> Slot:
         """Slot of a stop's mast pose: fixed where both its sigmas are 0."""
@@ -38,208 +75,53 @@ class FactorTemplate:
             return Fixed(entry.world_T_mast)
         return Key(gtsam.symbol("M", stop))
 
-    def pan_tilt(self, frame: int) -> Slot:
-        """Slot of a frame's pan and tilt: fixed where both sigmas are 0."""
-        entry = self.traverse.frames[frame]
-        if entry.sigma_pan_rad == 0 and entry.sigma_tilt_rad == 0:
-            return Fixed(self.traverse.pan_tilt_rad[frame])
-        return Key(gtsam.symbol("A", frame))
-
-    def held_components(self) -> dict[int, IntArray]:
-        """Tangent components of variables that telemetry holds while others of the same variable are free."""
-        held: dict[int, IntArray] = {}
-        for i, stop in enumerate(self.traverse.stops):
-            if isinstance(slot := self.mast(i), Key):
-                sigmas = np.repeat([stop.sigma_rotation_rad, stop.sigma_translation_m], 3)
-                held[slot.key] = np.flatnonzero(sigmas == 0)
-        for i, frame in enumerate(self.traverse.frames):
-            if isinstance(slot := self.pan_tilt(i), Key):
-                held[slot.key] = np.flatnonzero(np.array([frame.sigma_pan_rad, frame.sigma_tilt_rad]) == 0)
-        return held
-
-    @staticmethod
-    def camera_key(image: int) -> int:
-        """Key of an image's camera pose."""
-        return int(gtsam.symbol("X", image))
-
-    @staticmethod
-    def radius_key(eye: int) -> int:
-        """Key of the radius of an eye's circle."""
-        return int(gtsam.symbol("R", eye))
+    def masts(self, values: gtsam.Values) -> tuple[gtsam.Pose3, ...]:
+        """Mast poses of all stops at the values."""
+        slots = [self.mast(i) for i in range(len(self.traverse.stops))]
+        return tuple(values.atPose3(slot.key) if isinstance(slot, Key) else slot.value for slot in slots)
 
     def stop_factors(self, stop: int) -> Factors:
         """The prior of a stop's mast pose."""
         entry, slot = self.traverse.stops[stop], self.mast(stop)
         if not isinstance(slot, Key):
             return []
-        sigmas = np.repeat([entry.sigma_rotation_rad, entry.sigma_translation_m], 3)
-        return [gtsam.PriorFactorPose3(slot.key, entry.world_T_mast, _diagonal(sigmas))]
+        return [gtsam.PriorFactorPose3(slot.key, entry.world_T_mast, diagonal_noise(_stop_sigmas(entry)))]
 
-    def frame_factors(self, frame: int) -> Factors:
-        """The prior of a frame's pan and tilt."""
-        entry, slot = self.traverse.frames[frame], self.pan_tilt(frame)
-        if not isinstance(slot, Key):
-            return []
-        sigmas = np.array([entry.sigma_pan_rad, entry.sigma_tilt_rad])
-        return [gtsam.PriorFactorVector(slot.key, self.traverse.pan_tilt_rad[frame], _diagonal(sigmas))]
+    def held_of_stops(self) -> dict[int, IntArray]:
+        """`held_columns` of the masts."""
+        slots = [(self.mast(i), stop) for i, stop in enumerate(self.traverse.stops)]
+        return {s.key: np.flatnonzero(_stop_sigmas(stop) == 0) for s, stop in slots if isinstance(s, Key)}
 
-    def image_factors(self, image: int) -> Factors:
-        """The tie of an image's camera pose to its mast, and to its circle where the model says so."""
-        traverse = self.traverse
-        frame, eye = int(traverse.image_frame[image]), int(traverse.image_eye[image])
-        camera, mast = Key(self.camera_key(image)), self.mast(int(traverse.frame_stop[frame]))
-        angles, mount = self.pan_tilt(frame), traverse.rig.eyes[eye].head_T_camera
-        pan_T_tilt, tie = traverse.rig.pan_T_tilt, self.tie
-        if self.model != "circle":
-            sigmas = np.repeat([tie.rotation_rad, tie.translation_m], 3)
-            return [mast_factor(_diagonal(sigmas), camera, mast, angles, Fixed(mount), pan_T_tilt)]
-
-        # The chain ties the rotation, loosely; the circle alone ties the centre.
-        entry = traverse.frames[frame]
-        radius, phase, height = traverse.rig.circle(eye, entry.tilt_rad)
-        offset = CircleOffset(
-            height_m=height, phase_rad=phase, radius_m=radius - float(self.reference_radius_m[eye])
-        )
-        # The measured tilt places the circle; its error moves the centre by the eye's arm.
-        arm = float(np.linalg.norm(mount.translation()[[0, 2]]))
-        sigma = float(np.hypot(tie.translation_m, arm * entry.sigma_tilt_rad))
-        loose = _diagonal(np.repeat([tie.rotation_rad, 1e3], 3))
-        return [
-            mast_factor(loose, camera, mast, angles, Fixed(mount), pan_T_tilt),
-            circle_factor(
-                gtsam.noiseModel.Isotropic.Sigma(3, sigma),
-                camera,
-                mast,
-                Key(self.radius_key(eye)),
-                angles,
-                offset,
-            ),
-        ]
-
-    def shared_factors(self) -> Factors:
-        """Priors of what all stops share: the circles' radii."""
-        if self.model != "circle":
-            return []
-        noise = gtsam.noiseModel.Isotropic.Sigma(1, _RADIUS_SIGMA_M)
-        return [
-            gtsam.PriorFactorDouble(self.radius_key(eye), float(self.reference_radius_m[eye]), noise)
-            for eye in np.unique(self.traverse.image_eye)
-        ]
-
-    @cached_property
-    def reference_radius_m(self) -> FloatArray:
-        """(eyes,) the rig's radius of each eye's circle at the mean measured tilt."""
-        tilt = float(np.mean(self.traverse.pan_tilt_rad[:, 1]))
-        return np.array([self.traverse.rig.circle(e, tilt)[0] for e in range(len(self.traverse.rig.eyes))])
-
-    def factors(self) -> gtsam.NonlinearFactorGraph:
-        """All factors but those of landmarks."""
-        graph = gtsam.NonlinearFactorGraph()
-        t = self.traverse
-        groups = [
-            *(self.stop_factors(i) for i in range(len(t.stops))),
-            *(self.frame_factors(i) for i in range(len(t.frames))),
-            *(self.image_factors(i) for i in range(len(t.images))),
-            self.shared_factors(),
-        ]
-        for group in groups:
-            for factor in group:
-                graph.push_back(factor)
-        return graph
-
-    def values(self, state: State) -> gtsam.Values:
-        """The variables at a state."""
-        t, values = self.traverse, gtsam.Values()
-        for i, pose in enumerate(state.world_T_mast):
+    def stop_covariance(self, covariance: Covariance) -> FloatArray:
+        """Covariance of each mast pose (stops, 6, 6), rotation first, body frame; 0 where held."""
+        out = np.zeros((len(self.traverse.stops), 6, 6))
+        for i in range(len(out)):
             if isinstance(slot := self.mast(i), Key):
-                values.insert(slot.key, pose)
-        for i, angles in enumerate(state.pan_tilt_rad):
-            if isinstance(slot := self.pan_tilt(i), Key):
-                values.insert(slot.key, angles)
-        for i in range(len(t.images)):
-            pose = gtsam.Pose3(gtsam.Rot3(state.world_R_camera[i]), state.world_t_camera[i])
-            values.insert(self.camera_key(i), pose)
-        if self.model == "circle":
-            for eye in np.unique(t.image_eye):
-                values.insert(self.radius_key(eye), float(self.reference_radius_m[eye]))
-        return values
+                rows = self.linkage.columns_of(slot.key)
+                out[i] = covariance.block(i, i)[rows, rows]
+        return out
 
-    def only_cameras(self, values: gtsam.Values) -> gtsam.Values:
-        """The variables of this template out of values that hold landmarks too."""
-        kept = gtsam.Values()
-        for key in values.keys():  # noqa: SIM118  gtsam.Values is not a dictionary
-            kind = chr(gtsam.symbolChr(key))
-            if kind in "MX":
-                kept.insert(key, values.atPose3(key))
-            elif kind == "A":
-                kept.insert(key, values.atVector(key))
-            elif kind == "R":
-                kept.insert(key, values.atDouble(key))
-        return kept
-
-    @staticmethod
-    def retract(values: gtsam.Values, step: gtsam.VectorValues, share: float) -> gtsam.Values:
-        """The variables of this template moved by a share of a step that may move landmarks too."""
-        own = gtsam.VectorValues()
-        for key in values.keys():  # noqa: SIM118  gtsam.Values is not a dictionary
-            own.insert(key, share * step.at(key))
-        return values.retract(own)
-
-    def state(self, values: gtsam.Values, landmarks_m: FloatArray) -> State:
-        """The state at values of the variables; inverse of `values`.
-
-        Pan and tilt are the variables themselves where the model is `mast`, and those of the camera poses as
-        seen from their mast otherwise: there the poses hold what images say of the pointing.
-        """
-        t = self.traverse
-        masts = tuple(
-            values.atPose3(slot.key) if isinstance(slot := self.mast(i), Key) else slot.value
-            for i in range(len(t.stops))
-        )
-        cameras = [values.atPose3(self.camera_key(i)) for i in range(len(t.images))]
-        rotations, centres = pose_arrays(cameras)
-        angles = np.array(
-            [
-                values.atVector(slot.key) if isinstance(slot := self.pan_tilt(i), Key) else slot.value
-                for i in range(len(t.frames))
-            ]
-        ).reshape(-1, 2)
-        if self.model != "mast":
-            angles = angles + _mean_by_frame(t, self.image_pointing_offset(masts, angles, rotations))
-        return State(
-            world_T_mast=masts,
-            pan_tilt_rad=angles,
-            world_R_camera=rotations,
-            world_t_camera=centres,
-            landmarks_m=landmarks_m,
+    def views_of(self, world_R_camera: FloatArray, world_t_camera: FloatArray) -> CameraViews:
+        """Cameras of all images from their poses (images, 3, 3), (images, 3)."""
+        return CameraViews(
+            world_R_camera=world_R_camera, world_t_camera=world_t_camera, calibration=self._calibration
         )
 
-    def image_pointing_offset(
-        self, masts: tuple[gtsam.Pose3, ...], pan_tilt_rad: FloatArray, world_R_camera: FloatArray
-    ) -> FloatArray:
-        """(images, 2) pan and tilt of each camera pose as seen from its mast, minus those of its frame."""
-        t = self.traverse
-        masts_R, _ = pose_arrays(masts)
-        mounts_R, _ = pose_arrays([e.head_T_camera for e in t.rig.eyes])
-        head_R = (
-            masts_R[t.image_stop].transpose(0, 2, 1)
-            @ world_R_camera
-            @ mounts_R[t.image_eye].transpose(0, 2, 1)
-        )
-        before = t.rig.mast_T_head(pan_tilt_rad[t.image_frame, 0], pan_tilt_rad[t.image_frame, 1])[0]
-        found, nominal = pan_tilt_from_rotation(head_R), pan_tilt_from_rotation(before)
-        offset = np.column_stack([found[0] - nominal[0], found[1] - nominal[1]])
-        return wrap_angle(offset)
+
+def _stop_sigmas(stop: Stop) -> FloatArray:
+    return np.repeat([stop.sigma_rotation_rad, stop.sigma_translation_m], 3)
 
 
-def _mean_by_frame(traverse: Traverse, per_image: FloatArray) -> FloatArray:
-    count = np.bincount(traverse.image_frame, minlength=len(traverse.frames)).clip(1)
-    sums = [np.bincount(traverse.image_frame, c, minlength=len(traverse.frames)) for c in per_image.T]
-    return np.asarray(np.stack(sums, axis=1) / count[:, None])
-
-
-def _diagonal(sigmas: FloatArray) -> gtsam.noiseModel.Base:
+def diagonal_noise(sigmas: FloatArray) -> gtsam.noiseModel.Base:
     """Diagonal noise; entries of 0 are held exactly (1e3 is GTSAM's own weight of a violation)."""
     if np.all(sigmas > 0):
         return gtsam.noiseModel.Diagonal.Sigmas(sigmas)
     return gtsam.noiseModel.Constrained.MixedSigmas(np.full(len(sigmas), 1e3), sigmas)
+
+
+def read_variable(values: gtsam.Values, key: int) -> Any:
+    """Value of a template's variable: gtsam.Pose3, vector or number, by the letter of its key."""
+    kind = chr(gtsam.symbolChr(key))
+    if kind in "MX":
+        return values.atPose3(key)
+    return values.atVector(key) if kind == "A" else values.atDouble(key)

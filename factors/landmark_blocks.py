@@ -1,0 +1,165 @@
+"""Landmark blocks: factors on cameras' variables alone, landmarks eliminated (as many rows as the rank left).
+
+Linearised, with A, B the whitened Jacobians of all observations by cameras and landmarks, V = B'B, E = A'B:
+
+    S = A'A - sum E V^-1 E'        s = A'r - sum E V^-1 g        g = B'r
+
+One factor per group of variables (a stop) hands over the rows of a square root R'R = S that begin with that
+group, R'e = s; together they are S exactly, and each row is handed over once. Evaluated elsewhere, with dx
+the step of the variables, landmarks follow by dp = -V^-1 (g + E' dx), and each factor's error is the true
+cost of its block there. So GTSAM's Levenberg-Marquardt takes the exact joint step of cameras and landmarks,
+as sparse bundle adjustment does (thesis section 3.8).
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from pancam_graph.elimination import LandmarkSystem, Posture, Root
+from pancam_graph.geometry import FloatArray
+
+__all__ = ["LandmarkBlocks"]
+
+Reader = Callable[[gtsam.Values, int], Any]
+"""Takes values and a key to a gtsam.Pose3, a vector or a number."""
+
+
+class LandmarkBlocks:
+    """All landmark blocks of a problem; they are linearised together and share what that found.
+
+    The landmarks are no variables of the graph: they are state of this object, and move when GTSAM linearises
+    where a step led. So a graph with these factors is for one optimiser at a time.
+    """
+
+    def __init__(
+        self, system: LandmarkSystem, read: Reader, posture: Callable[[gtsam.Values], Posture]
+    ) -> None:
+        """`read` takes values and a key to what the variable is; `posture` gives the cameras at values."""
+        self.system, self._posture = system, posture
+        link, structure = system.linkage, system.structure
+        self._touched = np.flatnonzero(link.touched).tolist()
+        self._read = read
+        begin = np.concatenate([[0], np.cumsum(link.group_dim)])
+        self._slice = {
+            v: slice(c, c + int(link.dim[v]))
+            for v in self._touched
+            for c in [int(begin[link.group[v]] + link.variable_column[v])]
+        }
+        self._n_columns = int(begin[-1])
+        self._members = [
+            [v for v in range(link.group_begin[g], link.group_begin[g + 1]) if link.touched[v]]
+            for g in range(link.n_groups)
+        ]
+        self._groups = [g for g in structure.order if self._members[g]]
+        self._owner = np.array([b.groups[0] if b.groups else self._groups[0] for b in system.blocks])
+        self._here: dict[int, Any] = {}
+        self._there: dict[int, Any] = {}
+        self._cost = np.zeros(0)
+        self._root: Root | None = None
+
+    def factors(self) -> list[gtsam.CustomFactor]:
+        """The factors, in the order of elimination."""
+        return [self._factor(g) for g in self._groups]
+
+    def ordering(self) -> list[int]:
+        """Keys in an order of elimination that fills in no more than the factors hold already."""
+        link = self.system.linkage
+        return [
+            link.key[v]
+            for g in self.system.structure.order
+            for v in range(link.group_begin[g], link.group_begin[g + 1])
+        ]
+
+    def settle(self, values: gtsam.Values) -> float:
+        """Move the landmarks to where a step to these values leads them; the true cost of all there."""
+        self._evaluate(values, self._touched)
+        self._adopt()
+        return float(self._cost.sum())
+
+    def _factor(self, group: int) -> gtsam.CustomFactor:
+        link, structure = self.system.linkage, self.system.structure
+        members = [
+            (v, begin + int(link.variable_column[v]))
+            for g, begin in zip(structure.after[group], structure.begin[group], strict=False)
+            for v in self._members[g]
+        ]
+        variables = [v for v, _ in members]
+        columns = [slice(c, c + int(link.dim[v])) for v, c in members]
+        own = self._owner == group
+        first = group == self._groups[0]
+
+        def evaluate(
+            _this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
+        ) -> FloatArray:
+            self._evaluate(values, variables)
+            if jacobians is None:
+                return np.array([np.sqrt(2 * self._cost[own].sum())])
+            root = self._linearised()
+            rows = root.rows[group]
+            error = np.empty(len(rows) + first)
+            error[: len(rows)] = rows[:, -1]
+            if first:
+                error[-1] = self._remainder(root)
+            for i, column in enumerate(columns):
+                jacobian = np.zeros((len(error), column.stop - column.start), order="F")
+                jacobian[: len(rows)] = rows[:, column]
+                jacobians[i] = jacobian
+            return error
+
+        # No noise model: everything is whitened, and the number of rows is the rank found.
+        return gtsam.CustomFactor(None, [link.key[v] for v in variables], evaluate)
+
+    def _evaluate(self, values: gtsam.Values, variables: Sequence[int]) -> None:
+        """Bring costs to these values, unless the given variables are as they were."""
+        if self._there and all(_same(self._there[v], self._value(values, v)) for v in variables):
+            return
+        there = {v: self._value(values, v) for v in self._touched}
+        posture = self._posture(values)
+        if not self._here:
+            self._there = there
+            self._linearise(posture)
+            return
+        step = np.zeros(self._n_columns)
+        for v in self._touched:
+            step[self._slice[v]] = _difference(self._here[v], there[v])
+        self._cost = self.system.try_step(posture, step)
+        self._there, self._pending = there, posture
+
+    def _value(self, values: gtsam.Values, variable: int) -> Any:
+        return self._read(values, self.system.linkage.key[variable])
+
+    def _linearised(self) -> Root:
+        """The square root at the last values evaluated."""
+        self._adopt()
+        assert self._root is not None
+        return self._root
+
+    def _adopt(self) -> None:
+        if self._here is not self._there:
+            self.system.adopt()
+            self._linearise(self._pending)
+
+    def _linearise(self, posture: Posture) -> None:
+        self._root = self.system.linearise(posture).root()
+        self._cost = self.system.block_costs()
+        self._here = self._there
+
+    def _remainder(self, root: Root) -> float:
+        """What the cost has beyond the squares of all e, as one more row."""
+        explained = sum(float(rows[:, -1] @ rows[:, -1]) for rows in root.rows)
+        return float(np.sqrt(max(2 * float(self._cost.sum()) - explained, 0.0)))
+
+
+def _same(a: Any, b: Any) -> bool:
+    if isinstance(a, gtsam.Pose3):
+        return bool(a.equals(b, 0.0))
+    return bool(np.array_equal(a, b))
+
+
+def _difference(a: Any, b: Any) -> FloatArray:
+    """Local coordinates of b at a."""
+    if isinstance(a, gtsam.Pose3):
+        return np.asarray(a.localCoordinates(b))
+    return np.asarray(b - a)

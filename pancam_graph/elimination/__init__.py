@@ -1,0 +1,9 @@
+"""Landmarks eliminated: structure, blocks, square root of what is left, entries of its inverse."""
+
+from pancam_graph.elimination._linkage import Linkage as Linkage
+from pancam_graph.elimination._linkage import Posture as Posture
+from pancam_graph.elimination._panels import Covariance as Covariance
+from pancam_graph.elimination._panels import Panels as Panels
+from pancam_graph.elimination._panels import Root as Root
+from pancam_graph.elimination._panels import pattern as pattern
+from pancam_graph.elimination._system import LandmarkSystem as LandmarkSystem

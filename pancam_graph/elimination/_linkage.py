@@ -1,0 +1,101 @@
+"""How camera poses hang on the variables of a graph: what a model tells the landmark blocks."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from pancam_graph.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.landmarks import CameraViews
+
+__all__ = ["Linkage", "Posture"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Linkage:
+    """Structure of the chain rule, which no step changes.
+
+    Images that all variables move alike are one *unit* (the eyes of a frame on a rigid head; else each image
+    is its own). A unit hangs on variables by *segments*: some columns of one variable, and a small matrix
+    that takes these to the unit's pose (and calibration). Variables of one *group* (a stop) are eliminated
+    together.
+    """
+
+    key: tuple[int, ...]
+    """Keys of the variables."""
+    dim: IntArray
+    """(variables,) tangent dimensions"""
+    group: IntArray
+    """(variables,) ascending"""
+    image_unit: IntArray
+    """(images,)"""
+    segment_begin: IntArray
+    """(units + 1,) first segment of each unit"""
+    segment_variable: IntArray
+    """(segments,)"""
+    segment_column: IntArray
+    """(segments,) first column of the variable"""
+    segment_width: IntArray
+    """(segments,) number of columns"""
+
+    @property
+    def n_groups(self) -> int:
+        """Number of groups."""
+        return int(self.group[-1]) + 1 if len(self.group) else 0
+
+    @cached_property
+    def group_begin(self) -> IntArray:
+        """(groups + 1,) first variable of each group."""
+        return np.searchsorted(self.group, np.arange(self.n_groups + 1))
+
+    @cached_property
+    def variable_column(self) -> IntArray:
+        """(variables,) first column of each among the columns of its group."""
+        before = np.concatenate([[0], np.cumsum(self.dim)])[:-1]
+        return np.asarray(before - before[self.group_begin[:-1]][self.group])
+
+    @cached_property
+    def group_dim(self) -> IntArray:
+        """(groups,) columns of each group."""
+        return np.bincount(self.group, self.dim, minlength=self.n_groups).astype(np.int64)
+
+    @cached_property
+    def row(self) -> dict[int, int]:
+        """Variable of each key."""
+        return {key: i for i, key in enumerate(self.key)}
+
+    def columns_of(self, key: int) -> slice:
+        """Columns of a variable among those of its group."""
+        i = self.row[key]
+        begin = int(self.variable_column[i])
+        return slice(begin, begin + int(self.dim[i]))
+
+    @cached_property
+    def touched(self) -> BoolArray:
+        """(variables,) whether any image hangs on it."""
+        out = np.zeros(len(self.dim), dtype=bool)
+        out[self.segment_variable] = True
+        return out
+
+    @cached_property
+    def unit_groups(self) -> tuple[tuple[int, ...], ...]:
+        """Groups that each unit's variables are of."""
+        group = self.group[self.segment_variable]
+        begin = self.segment_begin
+        return tuple(
+            tuple(sorted(set(group[begin[u] : begin[u + 1]].tolist()))) for u in range(len(begin) - 1)
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Posture:
+    """Cameras at some values of the variables, and how they move with them."""
+
+    views: CameraViews
+    unit_R: FloatArray
+    """(units, 3, 3) world_R_base of the body whose twist (its frame, rotation first) moves a unit's images"""
+    unit_t: FloatArray
+    """(units, 3) where that body is, metres"""
+    chain: FloatArray
+    """(segments, 6 or 11, widest) takes a segment's columns to that twist, and to changes of fx, fy, skew, cx
+    and cy where calibrations are free; columns beyond a segment's width are 0"""

@@ -1,0 +1,233 @@
+"""Symmetric block-sparse systems: order of elimination, square root, and entries of the inverse."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import blas, lapack
+
+from pancam_graph.errors import SolveError
+from pancam_graph.geometry import FloatArray, IntArray
+
+__all__ = ["Covariance", "Panels", "Pattern", "Root", "pattern"]
+
+_RANK_TOLERANCE = 1e-13
+"""A pivot of the system scaled to a unit diagonal that is below this is taken for zero."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pattern:
+    """Which blocks of the square root are filled, in an order of elimination that keeps them few."""
+
+    dim: IntArray
+    """(groups,)"""
+    order: tuple[int, ...]
+    """Groups in the order of elimination."""
+    after: tuple[tuple[int, ...], ...]
+    """For each group those that its rows reach, itself first, then in the order of elimination."""
+    begin: tuple[IntArray, ...]
+    """For each group the first column of each of these in its panel, and the number of columns."""
+
+
+def pattern(dim: IntArray, cliques: Iterable[Iterable[int]]) -> Pattern:
+    """Order of elimination by least fill-in of the next step (minimum degree, in columns).
+
+    `cliques` are sets of groups that some factor joins. On a drive without loops it follows the road.
+    """
+    n = len(dim)
+    near: list[set[int]] = [set() for _ in range(n)]
+    for clique in {frozenset(c) for c in cliques}:
+        for g in clique:
+            near[g] |= clique
+    degree = np.array([sum(int(dim[h]) for h in near[g] - {g}) for g in range(n)], dtype=np.int64)
+    left = np.ones(n, dtype=bool)
+    order: list[int] = []
+    reach: list[set[int]] = [set() for _ in range(n)]
+    for _ in range(n):
+        g = int(np.argmin(np.where(left, degree, np.iinfo(np.int64).max)))
+        left[g] = False
+        order.append(g)
+        reach[g] = near[g] - {g}
+        for h in reach[g]:
+            near[h] = (near[h] | reach[g]) - {g}
+            degree[h] = sum(int(dim[k]) for k in near[h] - {h})
+    position = np.empty(n, dtype=np.int64)
+    position[order] = np.arange(n)
+    after = tuple((g, *sorted(reach[g], key=lambda h: int(position[h]))) for g in range(n))
+    begin = tuple(np.concatenate([[0], np.cumsum(dim[list(a)])]) for a in after)
+    return Pattern(dim=dim, order=tuple(order), after=after, begin=begin)
+
+
+class Panels:
+    """Upper half of a symmetric system (S, s): one dense panel per group, s as a last column."""
+
+    def __init__(self, structure: Pattern) -> None:
+        self.structure = structure
+        self.panel = [
+            np.zeros((int(structure.dim[g]), int(structure.begin[g][-1]) + 1))
+            for g in range(len(structure.dim))
+        ]
+        self._place = [
+            dict(zip(a, b, strict=False)) for a, b in zip(structure.after, structure.begin, strict=True)
+        ]
+        self._position = {g: i for i, g in enumerate(structure.order)}
+
+    def clear(self) -> None:
+        """Set everything to 0."""
+        for panel in self.panel:
+            panel.fill(0.0)
+
+    def sorted(self, groups: Iterable[int]) -> list[int]:
+        """Groups in the order of elimination."""
+        return sorted(groups, key=self._position.__getitem__)
+
+    def add(self, groups: Sequence[int], S: FloatArray, s: FloatArray) -> None:
+        """Add a dense system over groups in the order of elimination; of S the upper triangle counts."""
+        dim = self.structure.dim
+        begin = np.concatenate([[0], np.cumsum(dim[list(groups)])])
+        for i, g in enumerate(groups):
+            panel, place = self.panel[g], self._place[g]
+            rows = slice(begin[i], begin[i + 1])
+            panel[:, -1] += s[rows]
+            # Runs of groups that are neighbours in the panel too are added at once.
+            j = i
+            while j < len(groups):
+                k, first = j + 1, place[groups[j]]
+                while k < len(groups) and place[groups[k]] - first == begin[k] - begin[j]:
+                    k += 1
+                width = begin[k] - begin[j]
+                panel[:, first : first + width] += S[rows, begin[j] : begin[k]]
+                j = k
+
+    def add_entries(
+        self, g: IntArray, row: IntArray, h: IntArray, column: IntArray, entry: FloatArray
+    ) -> None:
+        """Add entries of S one by one: at `row` of group g and `column` of group h, both halves given."""
+        for a in np.unique(g):
+            place = self._place[int(a)]
+            for b in np.unique(h[g == a]):
+                if int(b) in place:
+                    here = (g == a) & (h == b)
+                    np.add.at(self.panel[a], (row[here], place[int(b)] + column[here]), entry[here])
+
+    def hold(self, held: dict[int, IntArray]) -> None:
+        """Make some columns of groups independent of everything, of unit information."""
+        for g, columns in held.items():
+            self.panel[g][columns] = 0.0
+            for panel, place in zip(self.panel, self._place, strict=True):
+                if g in place:
+                    panel[:, place[g] + columns] = 0.0
+            self.panel[g][columns, columns] = 1.0
+
+    def root(self) -> "Root":
+        """Square root R'R = S with R'e = s, rows by group; destroys the panels.
+
+        Rank-revealing: where S leaves directions free, as images alone leave the place and orientation of the
+        world, a group's rows are fewer than its columns.
+        """
+        st = self.structure
+        rows: list[FloatArray] = [np.zeros((0, 0))] * len(st.dim)
+        for g in st.order:
+            rows[g] = _root_of_panel(self.panel[g], int(st.dim[g]))
+            self._pass_on(g, rows[g])
+        return Root(structure=st, rows=tuple(rows))
+
+    def _pass_on(self, g: int, rows: FloatArray) -> None:
+        st = self.structure
+        n = int(st.dim[g])
+        rest = rows[:, n:]
+        if rest.shape[1] == 1 or len(rows) == 0:
+            return
+        update = rest.T @ rest
+        begin, after = st.begin[g] - n, st.after[g]
+        for i in range(1, len(after)):
+            h = after[i]
+            panel, place = self.panel[h], self._place[h]
+            own = slice(begin[i], begin[i + 1])
+            panel[:, -1] -= update[own, -1]
+            j = i
+            while j < len(after):
+                k, first = j + 1, place[after[j]]
+                while k < len(after) and place[after[k]] - first == begin[k] - begin[j]:
+                    k += 1
+                width = begin[k] - begin[j]
+                panel[:, first : first + width] -= update[own, begin[j] : begin[k]]
+                j = k
+
+
+def _root_of_panel(panel: FloatArray, n: int) -> FloatArray:
+    """Rows (rank, columns) of the square root of a panel whose own block comes first.
+
+    Pivoted Cholesky P'S P = U'U of the block scaled to a unit diagonal: radians and metres differ by much.
+    """
+    diagonal = np.diag(panel)
+    unit = np.sqrt(np.maximum(diagonal, 0.0))
+    scale = np.where(unit > 0, 1 / np.maximum(unit, 1e-150), 0.0)
+    upper, pivot, rank, _ = lapack.dpstrf(panel[:, :n] * scale[:, None] * scale, tol=_RANK_TOLERANCE)
+    if not np.all(np.isfinite(upper[:rank, :rank])):
+        raise SolveError("the linearised system is not finite: a camera or a landmark has left the domain")
+    pivot -= 1  # LAPACK counts from 1
+    rows = np.zeros((rank, panel.shape[1]))
+    if rank > 0:
+        upper = np.triu(upper)[:rank]
+        rows[:, pivot] = upper * unit[pivot]
+        right = panel[pivot[:rank], n:] * scale[pivot[:rank], None]
+        rows[:, n:] = blas.dtrsm(1.0, upper[:, :rank], right, trans_a=1)
+    return rows
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Root:
+    """Square root of a system, by group."""
+
+    structure: Pattern
+    rows: tuple[FloatArray, ...]
+    """For each group (rank, columns of its panel + 1): R, and e as the last column."""
+
+    def covariance(self) -> "Covariance":
+        """The blocks of the inverse of R'R where R is filled (Takahashi's recursion).
+
+        Raises SolveError where R leaves a direction free.
+        """
+        st = self.structure
+        blocks: dict[tuple[int, int], FloatArray] = {}
+        for g in reversed(st.order):
+            n, rows = int(st.dim[g]), self.rows[g]
+            if len(rows) < n:
+                raise SolveError("covariances: nothing holds a direction of the solution")
+            half = np.linalg.inv(rows[:, :n])
+            blocks[g, g] = half @ half.T
+            rest = st.after[g][1:]
+            if not rest:
+                continue
+            to_rest = half @ rows[:, n:-1]
+            around = np.block([[_block(blocks, h, k) for k in rest] for h in rest])
+            across = -to_rest @ around
+            blocks[g, g] -= across @ to_rest.T
+            for h, first, last in zip(rest, st.begin[g][1:-1] - n, st.begin[g][2:] - n, strict=True):
+                blocks[g, h] = across[:, first:last]
+        return Covariance(blocks)
+
+
+def _block(blocks: dict[tuple[int, int], FloatArray], g: int, h: int) -> FloatArray:
+    return blocks[g, h] if (g, h) in blocks else blocks[h, g].T
+
+
+class Covariance:
+    """Entries of an inverse."""
+
+    def __init__(self, blocks: dict[tuple[int, int], FloatArray]) -> None:
+        self._blocks = blocks
+
+    def release(self, held: dict[int, IntArray]) -> None:
+        """Set the variance of columns that were held to 0."""
+        for g, columns in held.items():
+            for (a, b), block in self._blocks.items():
+                if a == g:
+                    block[columns] = 0.0
+                if b == g:
+                    block[:, columns] = 0.0
+
+    def block(self, g: int, h: int) -> FloatArray:
+        """Covariance (dim g, dim h) of two groups. Raises KeyError for two that no clique joins."""
+        return _block(self._blocks, g, h)

@@ -1,0 +1,287 @@
+"""Camera poses as variables, tied to the mast: the rig as a factor template with flex.
+
+Variables: `M` mast pose per stop (Pose3), `A` pan and tilt per frame (vector of 2), `X` camera pose per
+image (Pose3), `R` circle radius per eye (double). What telemetry holds (sigma 0) is not a variable.
+"""
+
+from functools import cached_property
+
+import gtsam
+import numpy as np
+
+from pancam_graph.elimination import Covariance, Linkage, Posture
+from pancam_graph.factors import CircleOffset, Fixed, Key, Slot, circle_factor, mast_factor
+from pancam_graph.geometry import FloatArray, IntArray, pan_tilt_from_rotation, pose_arrays, wrap_angle
+from pancam_graph.graph._options import Flex, Model
+from pancam_graph.graph._template import Factors, FactorTemplate, diagonal_noise, read_variable
+from pancam_graph.landmarks import CameraViews
+from pancam_graph.solution import State
+from pancam_graph.traverse import Traverse
+
+__all__ = ["SoftTemplate"]
+
+_RADIUS_SIGMA_M = 1e-3
+"""Prior of a circle's radius about the rig's: sources of real rigs differ by millimetres."""
+
+_DIMENSION = {"A": 2, "M": 6, "R": 1, "X": 6}
+
+
+class SoftTemplate(FactorTemplate):
+    """Factors and variables for camera poses that a tie holds; its sigma stands for the mast's flex."""
+
+    def __init__(self, traverse: Traverse, model: Model, flex: Flex) -> None:
+        super().__init__(traverse, model)
+        self.flex = flex
+
+    def pan_tilt(self, frame: int) -> Slot:
+        """Slot of a frame's pan and tilt: fixed where both sigmas are 0."""
+        entry = self.traverse.frames[frame]
+        if entry.sigma_pan_rad == 0 and entry.sigma_tilt_rad == 0:
+            return Fixed(self.traverse.pan_tilt_rad[frame])
+        return Key(gtsam.symbol("A", frame))
+
+    @staticmethod
+    def camera_key(image: int) -> int:
+        """Key of an image's camera pose."""
+        return int(gtsam.symbol("X", image))
+
+    @staticmethod
+    def radius_key(eye: int) -> int:
+        """Key of the radius of an eye's circle."""
+        return int(gtsam.symbol("R", eye))
+
+    @cached_property
+    def linkage(self) -> Linkage:
+        """One unit per image, which hangs on its own pose; mast and angles are joined to it by ties alone."""
+        t = self.traverse
+        keys: list[int] = []
+        group: list[int] = []
+        for stop in range(len(t.stops)):
+            own = [self.camera_key(int(i)) for i in np.flatnonzero(t.image_stop == stop)]
+            slots = [*(self.pan_tilt(int(f)) for f in np.flatnonzero(t.frame_stop == stop)), self.mast(stop)]
+            own += [slot.key for slot in slots if isinstance(slot, Key)]
+            keys += own
+            group += [stop] * len(own)
+        if self.model == "circle":
+            radii = [self.radius_key(int(e)) for e in np.unique(t.image_eye)]
+            keys += radii
+            group += [len(t.stops)] * len(radii)
+        row = {key: i for i, key in enumerate(keys)}
+        n = len(t.images)
+        return Linkage(
+            key=tuple(keys),
+            dim=np.array([_DIMENSION[chr(gtsam.symbolChr(key))] for key in keys], dtype=np.int64),
+            group=np.array(group, dtype=np.int64),
+            image_unit=np.arange(n),
+            segment_begin=np.arange(n + 1),
+            segment_variable=np.array([row[self.camera_key(i)] for i in range(n)], dtype=np.int64),
+            segment_column=np.zeros(n, dtype=np.int64),
+            segment_width=np.full(n, 6),
+        )
+
+    def posture(self, values: gtsam.Values) -> Posture:
+        """Cameras at the values; a unit's base is the camera itself."""
+        views = self.views(values)
+        return Posture(
+            views=views,
+            unit_R=views.world_R_camera,
+            unit_t=views.world_t_camera,
+            chain=np.broadcast_to(np.eye(6), (len(self.traverse.images), 6, 6)),
+        )
+
+    def views(self, values: gtsam.Values) -> CameraViews:
+        """Cameras of all images at the values."""
+        poses = [values.atPose3(self.camera_key(i)) for i in range(len(self.traverse.images))]
+        return self.views_of(*pose_arrays(poses))
+
+    def frame_factors(self, frame: int) -> Factors:
+        """The prior of a frame's pan and tilt."""
+        entry, slot = self.traverse.frames[frame], self.pan_tilt(frame)
+        if not isinstance(slot, Key):
+            return []
+        sigmas = np.array([entry.sigma_pan_rad, entry.sigma_tilt_rad])
+        return [gtsam.PriorFactorVector(slot.key, self.traverse.pan_tilt_rad[frame], diagonal_noise(sigmas))]
+
+    def image_factors(self, image: int) -> Factors:
+        """The tie of an image's camera pose to its mast, and to its circle where the model says so."""
+        traverse = self.traverse
+        frame, eye = int(traverse.image_frame[image]), int(traverse.image_eye[image])
+        camera, mast = Key(self.camera_key(image)), self.mast(int(traverse.frame_stop[frame]))
+        angles, mount = self.pan_tilt(frame), traverse.rig.eyes[eye].head_T_camera
+        pan_T_tilt, flex = traverse.rig.pan_T_tilt, self.flex
+        if self.model != "circle":
+            sigmas = np.repeat([flex.rotation_rad, flex.translation_m], 3)
+            return [mast_factor(diagonal_noise(sigmas), camera, mast, angles, Fixed(mount), pan_T_tilt)]
+
+        # The chain ties the rotation, loosely; the circle alone ties the centre.
+        entry = traverse.frames[frame]
+        radius, phase, height = traverse.rig.circle(eye, entry.tilt_rad)
+        offset = CircleOffset(
+            height_m=height, phase_rad=phase, radius_m=radius - float(self.reference_radius_m[eye])
+        )
+        # The measured tilt places the circle; its error moves the centre by the eye's arm.
+        arm = float(np.linalg.norm(mount.translation()[[0, 2]]))
+        sigma = float(np.hypot(flex.translation_m, arm * entry.sigma_tilt_rad))
+        loose = diagonal_noise(np.repeat([flex.rotation_rad, 1e3], 3))
+        return [
+            mast_factor(loose, camera, mast, angles, Fixed(mount), pan_T_tilt),
+            circle_factor(
+                gtsam.noiseModel.Isotropic.Sigma(3, sigma),
+                camera,
+                mast,
+                Key(self.radius_key(eye)),
+                angles,
+                offset,
+            ),
+        ]
+
+    def shared_factors(self) -> Factors:
+        """Priors of what all stops share: the circles' radii."""
+        if self.model != "circle":
+            return []
+        noise = gtsam.noiseModel.Isotropic.Sigma(1, _RADIUS_SIGMA_M)
+        return [
+            gtsam.PriorFactorDouble(self.radius_key(eye), float(self.reference_radius_m[eye]), noise)
+            for eye in np.unique(self.traverse.image_eye)
+        ]
+
+    @cached_property
+    def reference_radius_m(self) -> FloatArray:
+        """(eyes,) the rig's radius of each eye's circle at the mean measured tilt."""
+        tilt = float(np.mean(self.traverse.pan_tilt_rad[:, 1]))
+        return np.array([self.traverse.rig.circle(e, tilt)[0] for e in range(len(self.traverse.rig.eyes))])
+
+    def factors(self) -> gtsam.NonlinearFactorGraph:
+        """All factors but those of landmarks."""
+        graph = gtsam.NonlinearFactorGraph()
+        t = self.traverse
+        groups = [
+            *(self.stop_factors(i) for i in range(len(t.stops))),
+            *(self.frame_factors(i) for i in range(len(t.frames))),
+            *(self.image_factors(i) for i in range(len(t.images))),
+            self.shared_factors(),
+        ]
+        for group in groups:
+            for factor in group:
+                graph.push_back(factor)
+        return graph
+
+    def values(self, state: State) -> gtsam.Values:
+        """The variables at a state."""
+        t, values = self.traverse, gtsam.Values()
+        for i, pose in enumerate(state.world_T_mast):
+            if isinstance(slot := self.mast(i), Key):
+                values.insert(slot.key, pose)
+        for i, angles in enumerate(state.pan_tilt_rad):
+            if isinstance(slot := self.pan_tilt(i), Key):
+                values.insert(slot.key, angles)
+        for i in range(len(t.images)):
+            pose = gtsam.Pose3(gtsam.Rot3(state.world_R_camera[i]), state.world_t_camera[i])
+            values.insert(self.camera_key(i), pose)
+        if self.model == "circle":
+            for eye in np.unique(t.image_eye):
+                values.insert(self.radius_key(eye), float(self.reference_radius_m[eye]))
+        return values
+
+    def only_cameras(self, values: gtsam.Values) -> gtsam.Values:
+        """The variables of this template out of values that hold landmarks too."""
+        kept = gtsam.Values()
+        for key in self.linkage.key:
+            kept.insert(key, read_variable(values, key))
+        return kept
+
+    @staticmethod
+    def retract(values: gtsam.Values, step: gtsam.VectorValues, share: float) -> gtsam.Values:
+        """The variables of this template moved by a share of a step that may move landmarks too."""
+        own = gtsam.VectorValues()
+        for key in values.keys():  # noqa: SIM118  gtsam.Values is not a dictionary
+            own.insert(key, share * step.at(key))
+        return values.retract(own)
+
+    def state(self, values: gtsam.Values, landmarks_m: FloatArray) -> State:
+        """The state at values of the variables; inverse of `values`.
+
+        Pan and tilt are the variables themselves where the model is `mast`, and those of the camera poses as
+        seen from their mast otherwise: there the poses hold what images say of the pointing.
+        """
+        t, masts = self.traverse, self.masts(values)
+        cameras = [values.atPose3(self.camera_key(i)) for i in range(len(t.images))]
+        rotations, centres = pose_arrays(cameras)
+        angles = np.array(
+            [
+                values.atVector(slot.key) if isinstance(slot := self.pan_tilt(i), Key) else slot.value
+                for i in range(len(t.frames))
+            ]
+        ).reshape(-1, 2)
+        if self.model != "mast":
+            angles = angles + _mean_by_frame(t, self.image_pointing_offset(masts, angles, rotations))
+        return State(
+            world_T_mast=masts,
+            pan_tilt_rad=angles,
+            world_R_camera=rotations,
+            world_t_camera=centres,
+            landmarks_m=landmarks_m,
+        )
+
+    def held_columns(self) -> dict[int, IntArray]:
+        """By key, tangent components that telemetry holds while others of the same variable are free."""
+        held = self.held_of_stops()
+        for i, frame in enumerate(self.traverse.frames):
+            if isinstance(slot := self.pan_tilt(i), Key):
+                held[slot.key] = np.flatnonzero(np.array([frame.sigma_pan_rad, frame.sigma_tilt_rad]) == 0)
+        return held
+
+    def angle_sigma_rad(self, covariance: Covariance, state: State) -> FloatArray:
+        """Standard deviation of pan and tilt (frames, 2): of the variables, or of what camera poses say.
+
+        As in `state`: where the model is not `mast`, it is that of the mean over a frame's eyes.
+        """
+        t, link = self.traverse, self.linkage
+        sigma = np.zeros((len(t.frames), 2))
+        for frame in range(len(t.frames)):
+            stop = int(t.frame_stop[frame])
+            if self.model == "mast":
+                if isinstance(slot := self.pan_tilt(frame), Key):
+                    rows = link.columns_of(slot.key)
+                    sigma[frame] = np.sqrt(np.diag(covariance.block(stop, stop)[rows, rows]))
+                continue
+            images = np.flatnonzero(t.image_frame == frame)
+            if len(images) == 0:
+                continue
+            mast_R = state.world_T_mast[stop].rotation().matrix()
+            pan, tilt = state.pan_tilt_rad[frame]
+            # A small turn w of the head, in the mast frame, moves pan by d_pan w and tilt by d_tilt w.
+            d_pan = np.array([-np.cos(pan) * np.tan(tilt), -np.sin(pan) * np.tan(tilt), 1.0])
+            d_tilt = np.array([np.sin(pan), -np.cos(pan), 0.0])
+            d_angles = np.vstack([d_pan, d_tilt])
+            jacobian = np.zeros((2, int(link.group_dim[stop])))
+            for i in images:
+                turn = link.columns_of(self.camera_key(int(i))).start + np.arange(3)
+                jacobian[:, turn] = d_angles @ mast_R.T @ state.world_R_camera[i] / len(images)
+            if isinstance(slot := self.mast(stop), Key):
+                jacobian[:, link.columns_of(slot.key).start + np.arange(3)] = -d_angles
+            sigma[frame] = np.sqrt(np.diag(jacobian @ covariance.block(stop, stop) @ jacobian.T))
+        return sigma
+
+    def image_pointing_offset(
+        self, masts: tuple[gtsam.Pose3, ...], pan_tilt_rad: FloatArray, world_R_camera: FloatArray
+    ) -> FloatArray:
+        """(images, 2) pan and tilt of each camera pose as seen from its mast, minus those of its frame."""
+        t = self.traverse
+        masts_R, _ = pose_arrays(masts)
+        mounts_R, _ = pose_arrays([e.head_T_camera for e in t.rig.eyes])
+        head_R = (
+            masts_R[t.image_stop].transpose(0, 2, 1)
+            @ world_R_camera
+            @ mounts_R[t.image_eye].transpose(0, 2, 1)
+        )
+        before = t.rig.mast_T_head(pan_tilt_rad[t.image_frame, 0], pan_tilt_rad[t.image_frame, 1])[0]
+        found, nominal = pan_tilt_from_rotation(head_R), pan_tilt_from_rotation(before)
+        offset = np.column_stack([found[0] - nominal[0], found[1] - nominal[1]])
+        return wrap_angle(offset)
+
+
+def _mean_by_frame(traverse: Traverse, per_image: FloatArray) -> FloatArray:
+    count = np.bincount(traverse.image_frame, minlength=len(traverse.frames)).clip(1)
+    sums = [np.bincount(traverse.image_frame, c, minlength=len(traverse.frames)) for c in per_image.T]
+    return np.asarray(np.stack(sums, axis=1) / count[:, None])
