@@ -306,6 +306,8 @@ def test_growth_is_per_observation_and_iteration(seconds: float, growth: float) 
         )
     )
     assert report.growth() == pytest.approx(growth)
+    assert report.growth(per_iteration=False) == pytest.approx(2.5 * growth)
+    assert f"per observation alone times {2.5 * growth:.2f}" in report.notes()[-1]
     assert (report.complaints() == []) == (growth < 1.3)
     assert list(report.ratios()) == ["long80 / long10: time per observation and iteration"]
 
