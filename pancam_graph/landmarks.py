@@ -15,6 +15,9 @@ from numpy.typing import ArrayLike
 from pancam_graph import _landmark_loops as loops
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.losses import SQUARED, Loss
+from pancam_graph.threads import in_parallel
+
+_RAY_GRAIN = 16384
 
 __all__ = [
     "CameraViews",
@@ -23,8 +26,10 @@ __all__ = [
     "evaluate",
     "free_derivatives",
     "point_sigma_m",
+    "rays_of",
     "refine",
     "residual_cofactor",
+    "residuals",
     "triangulate",
 ]
 
@@ -110,6 +115,12 @@ class Landmarks:
         depth = np.maximum(w, np.linalg.norm(x, axis=1) / furthest_m).clip(1e-300)
         return np.asarray(self.origin_m + x / depth[:, None])
 
+    def about(self, origin_m: FloatArray) -> "Landmarks":
+        """The same points relative to other origins (landmarks, 3)."""
+        x = self.vector[:, :3] + self.vector[:, 3:] * (self.origin_m - origin_m)
+        vector = np.column_stack([x, self.vector[:, 3]])
+        return Landmarks(vector=vector / np.linalg.norm(vector, axis=1, keepdims=True), origin_m=origin_m)
+
     def moved_to(self, points_m: FloatArray) -> "Landmarks":
         """Landmarks of the same origins at world points (landmarks, 3)."""
         vector = np.column_stack([points_m - self.origin_m, np.ones(len(points_m))])
@@ -136,6 +147,20 @@ def triangulate(
     return Landmarks(vector=vector, origin_m=origin)
 
 
+def rays_of(measurements: Measurements, views: CameraViews) -> tuple[FloatArray, FloatArray]:
+    """Centres (n, 3) and unit directions (n, 3) of the measurements' lines of sight, in the world."""
+    seen = seen_by(measurements, views)
+    n_images, direction = len(views.calibration), np.empty((len(seen.image), 3))
+    calibration = as_floats(views.calibration, (n_images, 3, 3))
+    rotation = as_floats(views.world_R_camera, (n_images, 3, 3))
+    in_parallel(
+        lambda first, last: loops.rays(seen.image, seen.uv_px, calibration, rotation, first, last, direction),
+        len(direction),
+        grain=_RAY_GRAIN,
+    )
+    return views.world_t_camera[seen.image], direction
+
+
 def evaluate(
     landmarks: Landmarks, measurements: Measurements, views: CameraViews
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
@@ -150,6 +175,17 @@ def evaluate(
     return residual, b, in_front
 
 
+def residuals(
+    landmarks: Landmarks, measurements: Measurements, views: CameraViews
+) -> tuple[FloatArray, BoolArray]:
+    """`evaluate` without derivatives: whitened residuals (n, 2), and what is in front (n,)."""
+    seen, n = seen_by(measurements, views), len(measurements.image)
+    vector, origin = _arrays(landmarks, measurements)
+    residual, in_front = np.empty((n, 2)), np.empty(n, dtype=bool)
+    loops.over(loops.residuals, np.arange(len(vector)), seen, vector, origin, residual, in_front)
+    return residual, in_front
+
+
 def free_derivatives(b: FloatArray, landmarks: Landmarks, measurements: Measurements) -> FloatArray:
     """`evaluate`'s derivatives (n, 2, 3) along those directions that `refine` leaves free.
 
@@ -157,7 +193,7 @@ def free_derivatives(b: FloatArray, landmarks: Landmarks, measurements: Measurem
     derivatives lose their part along w.
     """
     vector, _ = _arrays(landmarks, measurements)
-    free = as_floats(b, (len(measurements.image), 2, 3)).copy()
+    free: FloatArray = as_floats(b, (len(measurements.image), 2, 3)).copy()
     loops.over(loops.free_derivatives, np.arange(len(vector)), measurements.begin, vector, free)
     return free
 
@@ -223,7 +259,7 @@ def as_floats(array: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
 
     Writable, so that every caller's arrays are of one type and a loop is compiled once.
     """
-    floats = np.require(array, np.float64, ["C", "W"])
+    floats: FloatArray = np.require(array, np.float64, ["C", "W"])
     if floats.shape != shape:
         raise ValueError(f"expected an array of shape {shape}, found {floats.shape}")
     return floats
