@@ -75,7 +75,9 @@ class LandmarkBlocks:
     def settle(self, values: gtsam.Values) -> float:
         """Move the landmarks to where a step to these values leads them; the true cost of all there."""
         self._evaluate(values, self._touched)
-        self._adopt()
+        if self._here is not self._there:
+            self.system.adopt()
+            self._here, self._root = {}, None
         return float(self._cost.sum())
 
     def _factor(self, group: int) -> gtsam.CustomFactor:

@@ -12,13 +12,13 @@ from pancam_graph._eliminated import EliminatedSolver
 from pancam_graph._explicit import ExplicitSolver
 from pancam_graph._optimise import Iteration, Outcome, StopRule
 from pancam_graph._problem import Problem, Solver, reach_m
-from pancam_graph._rejection import rays_of, screen
+from pancam_graph._rejection import screen
 from pancam_graph.cameras import carry_to_pinhole
 from pancam_graph.errors import InputError, SolveError
 from pancam_graph.geometry import BoolArray, FloatArray
 from pancam_graph.graph import RIGID, FactorTemplate, HardTemplate, SoftTemplate
 from pancam_graph.initialise import Start, start_from_telemetry
-from pancam_graph.landmarks import Landmarks, Measurements, evaluate, refine, triangulate
+from pancam_graph.landmarks import Landmarks, Measurements, rays_of, refine, residuals, triangulate
 from pancam_graph.losses import loss_of
 from pancam_graph.options import SolveOptions
 from pancam_graph.solution import Solution, State
@@ -61,8 +61,7 @@ class Adjustment:
         self.reason = np.full(len(self.observations), "", dtype=object)
         solvers: dict[str, type[Solver]] = {"eliminated": EliminatedSolver, "explicit": ExplicitSolver}
         self.solver = solvers[options.landmarks](on_iteration)
-        self.problem = self._first_problem(_template(traverse, options))
-        self.first = self.problem
+        self.problem = self.first = self._first_problem(_template(traverse, options)).placed()
 
     # --- preparation ---
 
@@ -274,7 +273,7 @@ class Adjustment:
         """By how much the residuals' spread exceeds the sigmas: the square root of the variance factor."""
         p = self.problem
         rows = p.kept
-        residual, _, _ = evaluate(p.landmarks, p.measurements, p.views)
+        residual, _ = p.residuals()
         # Priors add as many equations as they have unknowns, but for what observations say on top of them.
         freedom = 2 * int(rows.sum()) - 3 * int(p.present.sum())
         if freedom < 1:
@@ -292,11 +291,9 @@ class Adjustment:
             self.reason[row] = np.where(self.reason[row] == "", reason, self.reason[row])
 
         # The start again, with the landmarks that fit it best: what is gained is then due to the cameras.
-        first = _triangulated(replace(self.first, measurements=m, accepted=p.accepted))
-        first = first.at(
-            first.values,
-            refine(first.landmarks, m, first.views, kept.astype(float), beyond_infinity=True),
-        )
+        first = self.first
+        if m is not first.measurements or not p.accepted.all():
+            first = _triangulated(replace(first, measurements=m, accepted=p.accepted)).placed()
         final = _state(p)
         found = self._uncertainty(final)
         return Solution(
@@ -350,7 +347,7 @@ class Adjustment:
     def _raw_residuals(self, problem: Problem, present: BoolArray) -> FloatArray:
         """Projected minus measured (observations, 2) in raw pixels; NaN where there is no landmark."""
         m = problem.measurements
-        whitened, _, in_front = evaluate(problem.landmarks, m, problem.views)
+        whitened, in_front = problem.residuals()
         out = np.full((len(self.observations), 2), np.nan)
         known = present[m.landmark] & in_front
         out[m.row[known]] = whitened[known] * self.sigma_px[m.row[known], None]
@@ -384,7 +381,7 @@ def _triangulated(problem: Problem) -> Problem:
     m, views, weight = problem.measurements, problem.views, problem.accepted.astype(float)
     centre, direction = rays_of(m, views)
     landmarks = triangulate(centre, direction, m.landmark, weight)
-    _, _, in_front = evaluate(landmarks, m, views)
+    _, in_front = residuals(landmarks, m, views)
     behind = np.bincount(m.landmark, ~in_front & (weight > 0), minlength=m.n_landmarks) > 0
     problem = replace(problem, landmarks=landmarks)
     if not behind.any():

@@ -10,7 +10,6 @@ from pancam_graph._eliminated import system_of
 from pancam_graph._problem import Problem
 from pancam_graph.elimination import Linkage, Panels
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray
-from pancam_graph.landmarks import evaluate
 from pancam_graph.solution import State
 
 __all__ = ["Uncertainty", "uncertainty"]
@@ -33,8 +32,7 @@ class Uncertainty:
 def uncertainty(problem: Problem, state: State, *, landmarks: bool) -> Uncertainty:
     """Covariances, everything else marginalised. Raises SolveError where a direction is held by nothing."""
     template, m = problem.template, problem.measurements
-    in_front = evaluate(problem.landmarks, m, problem.views)[2]
-    system, rows = system_of(problem, in_front)
+    system, rows = system_of(problem)
     panels = system.linearise(template.posture(problem.values))
     _add(panels, template.linkage, problem.factors.linearize(problem.values))
     held = _columns(template.linkage, template.held_columns())

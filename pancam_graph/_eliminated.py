@@ -11,14 +11,12 @@ from pancam_graph._problem import Problem, Solver
 from pancam_graph.elimination import LandmarkSystem
 from pancam_graph.errors import SolveError
 from pancam_graph.factors import LandmarkBlocks
-from pancam_graph.geometry import BoolArray, IntArray
+from pancam_graph.geometry import IntArray
 from pancam_graph.graph import HardTemplate, SoftTemplate, read_variable
-from pancam_graph.landmarks import Landmarks, evaluate, refine
+from pancam_graph.landmarks import Landmarks
 from pancam_graph.losses import SQUARED, Loss
 
 __all__ = ["EliminatedSolver", "system_of"]
-
-_RETRIES = 3
 
 
 class EliminatedSolver(Solver):
@@ -35,24 +33,22 @@ class EliminatedSolver(Solver):
     def adjust(self, problem: Problem, rule: StopRule) -> tuple[Problem, Outcome]:
         """Levenberg-Marquardt; observations of landmarks behind their camera are no longer accepted."""
         problem, outcome = self._fit(problem, rule, SQUARED, "solve")
-        ahead = _in_front(problem)
-        return replace(problem, accepted=problem.accepted & ahead), outcome
+        _, in_front = problem.residuals()
+        if np.all(in_front[problem.kept]):
+            return problem, outcome
+        problem, again = self._fit(
+            replace(problem, accepted=problem.accepted & in_front), rule, SQUARED, "solve"
+        )
+        return problem, replace(again, costs=outcome.costs + again.costs[1:])
 
     def _fit(self, problem: Problem, rule: StopRule, loss: Loss, stage: str) -> tuple[Problem, Outcome]:
-        costs: list[float] = []
+        costs: tuple[float, ...] = ()
         if not self._is_near and isinstance(problem.template, SoftTemplate):
             problem, outcome = self._fit_rigid(problem, loss, stage)
-            costs += outcome.costs
+            costs = outcome.costs[:-1]
         self._is_near = True
-        ahead = _in_front(problem)
-        for _ in range(_RETRIES):
-            problem, outcome = self._fit_ahead(problem, ahead, rule, loss, stage)
-            costs += outcome.costs[1:] if costs else outcome.costs
-            # What was behind its camera at the start may now be where the camera sees it.
-            before, ahead = ahead, _in_front(problem)
-            if not np.any(problem.kept & ahead & ~before):
-                break
-        return problem, replace(outcome, costs=tuple(costs))
+        problem, outcome = self._minimise(problem, rule, loss, stage)
+        return problem, replace(outcome, costs=costs + outcome.costs)
 
     def _fit_rigid(self, problem: Problem, loss: Loss, stage: str) -> tuple[Problem, Outcome]:
         """The problem with cameras where a rigid mast fits best.
@@ -64,18 +60,15 @@ class EliminatedSolver(Solver):
         values = rigid.values(problem.template.state(problem.values, no_landmarks))
         start = replace(problem, template=rigid, factors=rigid.factors(), values=values)
         rule = StopRule(max_iterations=20, relative_decrease=1e-4)
-        found, outcome = self._fit_ahead(start, _in_front(start), rule, loss, stage)
+        found, outcome = self._minimise(start, rule, loss, stage)
         values = problem.template.values(rigid.state(found.values, no_landmarks))
         return problem.at(values, found.landmarks), outcome
 
-    def _fit_ahead(
-        self, problem: Problem, ahead: BoolArray, rule: StopRule, loss: Loss, stage: str
-    ) -> tuple[Problem, Outcome]:
-        """Levenberg-Marquardt over the observations that have their landmarks in front."""
+    def _minimise(self, problem: Problem, rule: StopRule, loss: Loss, stage: str) -> tuple[Problem, Outcome]:
         template = problem.template
-        system, rows = system_of(problem, ahead, loss)
         if not template.linkage.touched.any():
             return _only_landmarks(problem, loss)
+        system, rows = system_of(problem, loss)
         blocks = LandmarkBlocks(system, read_variable, template.posture)
         graph = gtsam.NonlinearFactorGraph(problem.factors)
         for factor in blocks.factors():
@@ -89,20 +82,18 @@ class EliminatedSolver(Solver):
             on_iteration=self.on_iteration,
         )
         blocks.settle(outcome.values)
-        found = system.landmarks()
         vector = problem.landmarks.vector.copy()
-        vector[rows] = found.vector
+        vector[rows] = system.landmarks().vector
         return problem.at(outcome.values, replace(problem.landmarks, vector=vector)), outcome
 
 
-def system_of(problem: Problem, ahead: BoolArray, loss: Loss = SQUARED) -> tuple[LandmarkSystem, IntArray]:
-    """The landmark system of what takes part and is in front, and its rows among the landmarks.
+def system_of(problem: Problem, loss: Loss = SQUARED) -> tuple[LandmarkSystem, IntArray]:
+    """The landmark system of what takes part, and its rows among the landmarks.
 
     Raises SolveError where nothing is left.
     """
     m = problem.measurements
-    take = problem.kept & ahead
-    take &= (np.bincount(m.landmark, take, minlength=m.n_landmarks) >= 2)[m.landmark]
+    take = problem.kept
     if not take.any():
         raise SolveError("observations: expected tracks that agree in two or more images, found none")
     rows = np.flatnonzero(np.bincount(m.landmark, take, minlength=m.n_landmarks))
@@ -113,17 +104,9 @@ def system_of(problem: Problem, ahead: BoolArray, loss: Loss = SQUARED) -> tuple
     return LandmarkSystem(template.linkage, m, landmarks, loss, cliques=template.cliques), rows
 
 
-def _in_front(problem: Problem) -> BoolArray:
-    return evaluate(problem.landmarks, problem.measurements, problem.views)[2]
-
-
 def _only_landmarks(problem: Problem, loss: Loss) -> tuple[Problem, Outcome]:
     """Where telemetry holds every camera there are only landmarks to place."""
-    weight = problem.accepted.astype(float)
-    placed = refine(
-        problem.landmarks, problem.measurements, problem.views, weight, loss, beyond_infinity=True
-    )
-    found = replace(problem, landmarks=placed)
+    found = problem.placed(loss)
     costs = (problem.cost(loss), found.cost(loss))
     return found, Outcome(
         values=problem.values, converged=True, reason="nothing but landmarks to place", costs=costs

@@ -11,7 +11,7 @@ from pancam_graph._problem import Problem, Solver, typical_sigma_px
 from pancam_graph.errors import SolveError
 from pancam_graph.geometry import BoolArray, FloatArray
 from pancam_graph.graph import ExplicitLandmarks, SoftTemplate
-from pancam_graph.landmarks import evaluate, point_sigma_m, refine
+from pancam_graph.landmarks import point_sigma_m, refine
 from pancam_graph.losses import SQUARED, Loss
 
 __all__ = ["ExplicitSolver"]
@@ -99,7 +99,7 @@ class ExplicitSolver(Solver):
         if not self._is_near:
             rule_afar = StopRule(max_iterations=20, relative_decrease=1e-4)
             problem, costs = self._approach(problem, rule_afar, SQUARED, "approach")
-            in_front = evaluate(problem.landmarks, problem.measurements, problem.views)[2]
+            _, in_front = problem.residuals()
             problem = replace(problem, accepted=problem.accepted & in_front)
             self._is_near = True
         for _ in range(_ROUNDS):

@@ -334,6 +334,23 @@ def evaluate(
 
 
 @compiled
+def residuals(
+    which: IntArray,
+    seen: Seen,
+    vector: FloatArray,
+    origin_m: FloatArray,
+    residual: FloatArray,
+    in_front: BoolArray,
+) -> None:
+    """`evaluate` without derivatives."""
+    at = _sighting()
+    for j in which:
+        for i in range(seen.begin[j], seen.begin[j + 1]):
+            in_front[i] = _observe(seen, i, vector[j], origin_m[j], at)
+            residual[i, 0], residual[i, 1] = at.residual[0], at.residual[1]
+
+
+@compiled
 def free_derivatives(which: IntArray, begin: IntArray, vector: FloatArray, b: FloatArray) -> None:
     """Take from derivatives (n, 2, 3) their part along w where a landmark is held at infinity."""
     basis = np.empty((4, 3))
@@ -492,7 +509,7 @@ def refine(
                     slope = _newton(v, g, turn, step)
             norm = np.sqrt(here[0] * here[0] + here[1] * here[1] + here[2] * here[2])
             # One whose vector is its origin alone has no direction in which infinity could be.
-            if held or beyond_infinity or here[3] >= 0 or norm <= 1e-9:
+            if held or beyond_infinity or not (here[3] < 0 and norm > 1e-9):
                 break
             # Beyond infinity: brought to it, and refined there.
             for k in range(3):

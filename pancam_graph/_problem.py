@@ -10,7 +10,7 @@ import numpy as np
 from pancam_graph._optimise import Iteration, Outcome, StopRule
 from pancam_graph.geometry import BoolArray, FloatArray
 from pancam_graph.graph import FactorTemplate
-from pancam_graph.landmarks import CameraViews, Landmarks, Measurements, evaluate
+from pancam_graph.landmarks import CameraViews, Landmarks, Measurements, refine, residuals
 from pancam_graph.losses import SQUARED, Loss
 
 __all__ = ["Problem", "Solver", "reach_m", "typical_sigma_px"]
@@ -55,8 +55,18 @@ class Problem:
 
     def cost(self, loss: Loss = SQUARED) -> float:
         """True cost: half the squares of priors and ties, and the loss of what takes part."""
-        residual, _, _ = evaluate(self.landmarks, self.measurements, self.views)
+        residual, _ = self.residuals()
         return float(self.factors.error(self.values) + loss.cost(residual)[self.kept].sum())
+
+    def residuals(self) -> tuple[FloatArray, BoolArray]:
+        """Whitened residuals (n, 2), and whether the landmark is in front of its camera (n,)."""
+        return residuals(self.landmarks, self.measurements, self.views)
+
+    def placed(self, loss: Loss = SQUARED) -> "Problem":
+        """Landmarks where they fit best with the cameras as they are, be it beyond infinity."""
+        weight = self.accepted.astype(float)
+        best = refine(self.landmarks, self.measurements, self.views, weight, loss, beyond_infinity=True)
+        return replace(self, landmarks=best)
 
     def at(self, values: gtsam.Values, landmarks: Landmarks) -> "Problem":
         """The same elsewhere."""

@@ -12,14 +12,12 @@ from scipy.stats import chi2, norm
 
 from pancam_graph import _landmark_loops as loops
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray
-from pancam_graph.landmarks import CameraViews, Landmarks, Measurements, as_floats, seen_by
+from pancam_graph.landmarks import CameraViews, Landmarks, Measurements, as_floats, rays_of, seen_by
 from pancam_graph.losses import SQUARED
-from pancam_graph.threads import in_parallel
 
-__all__ = ["Screening", "rays_of", "screen"]
+__all__ = ["Screening", "screen"]
 
 _SWEEPS = 12
-_RAY_GRAIN = 16384
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,20 +31,6 @@ class Screening:
     """Robust estimate of the noise in units of the given sigmas."""
     behind: BoolArray
     """(n,) whether the landmark is behind the camera."""
-
-
-def rays_of(measurements: Measurements, views: CameraViews) -> tuple[FloatArray, FloatArray]:
-    """Centres (n, 3) and unit directions (n, 3) of the measurements' lines of sight, in the world."""
-    seen = seen_by(measurements, views)
-    n_images, direction = len(views.calibration), np.empty((len(seen.image), 3))
-    calibration = as_floats(views.calibration, (n_images, 3, 3))
-    rotation = as_floats(views.world_R_camera, (n_images, 3, 3))
-    in_parallel(
-        lambda first, last: loops.rays(seen.image, seen.uv_px, calibration, rotation, first, last, direction),
-        len(direction),
-        grain=_RAY_GRAIN,
-    )
-    return views.world_t_camera[seen.image], direction
 
 
 def screen(

@@ -13,6 +13,8 @@ from pancam_graph.geometry import BoolArray, FloatArray, IntArray
 
 __all__ = [
     "BEHIND_COST",
+    "SURPRISE",
+    "SURPRISE_COST",
     "WEAK_PRIOR",
     "Bearings",
     "Reduced",
@@ -33,8 +35,11 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 
 
 def compiled(function: _F) -> _F:
-    """Compile for the machine, without the interpreter's lock, and keep the result on disk."""
-    return numba.njit(cache=True, nogil=True, error_model="numpy")(function)  # type: ignore[no-any-return] # numba is untyped
+    """Compile for the machine, without the interpreter's lock, and keep the result on disk.
+
+    Sums of products may be fused, and so are the more exact; nothing else is reordered.
+    """
+    return numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})(function)  # type: ignore[no-any-return] # numba is untyped
 
 
 NONE, HUBER, CAUCHY = 0, 1, 2
@@ -183,9 +188,10 @@ WEAK_PRIOR = 1e-12
 """Weak prior of a landmark: its information, over the trace of what the landmark's observations know."""
 _UNDETERMINED = 1e-9
 """A pivot below this share of the trace is called undetermined."""
-BEHIND_COST = 1e30
-"""What an observation of a landmark behind its camera costs: no step that leads there is taken."""
-_SURPRISE, _SURPRISE_COST = 2.0, 10.0
+BEHIND_COST = 0.5 * 1000.0**2
+"""What an observation of a landmark behind its camera costs: as much as one that is 1000 sigma off. It pulls
+nowhere, so that one bad match holds back nobody; the solver sets aside and counts what ends there."""
+SURPRISE, SURPRISE_COST = 2.0, 10.0
 """A step is shortened for a landmark whose cost more than doubles by more than this."""
 
 
@@ -206,6 +212,9 @@ def _chain(
         unit = unit_of[row]
         if unit < 0:
             continue
+        for p in range(rows):
+            for q in range(p):
+                unit_H[row, p, q] = unit_H[row, q, p]
         for a in range(bearings.segment_begin[unit], bearings.segment_begin[unit + 1]):
             chain_a, column_a, width_a = bearings.chain[a], segment_column[a], bearings.segment_width[a]
             for p in range(rows):
@@ -347,7 +356,7 @@ def _eliminating(rows: int) -> Callable[..., None]:
                         h[p] += ja * r0 + jb * r1
                         for k in range(3):
                             cross[p, k] += ja * b[0, k] + jb * b[1, k]
-                        for q in range(rows):
+                        for q in range(p, rows):
                             H[p, q] += ja * jac[0, q] + jb * jac[1, q]
                 place = sights.place_begin[o]
                 for segment in range(bearings.segment_begin[unit], bearings.segment_begin[unit + 1]):
@@ -443,7 +452,7 @@ def follow(
         step[1] = (-y1 - f[4] * step[2]) / f[2]
         step[0] = (-y0 - f[1] * step[1] - f[3] * step[2]) / f[0]
         tangent_basis(vector[j], basis)
-        limit = _SURPRISE * reduced.cost[j] + _SURPRISE_COST
+        limit = SURPRISE * reduced.cost[j] + SURPRISE_COST
         cost[j] = np.inf
         moved[j] = vector[j]
         for share in (1.0, 0.5, 0.25, 0.0625, 0.0):

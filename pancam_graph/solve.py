@@ -9,6 +9,7 @@ from pancam_graph._optimise import Iteration
 from pancam_graph.initialise import Start
 from pancam_graph.options import SolveOptions
 from pancam_graph.solution import Seconds, Solution
+from pancam_graph.threads import blas_on_one_thread
 from pancam_graph.traverse import Traverse
 
 __all__ = ["SolveOptions", "solve"]
@@ -31,10 +32,9 @@ def solve(
     has a direction that neither observations nor priors hold.
     """
     begin = time.perf_counter()
-    adjustment = Adjustment(traverse, options or SolveOptions(), start, on_iteration)
-    initialised = time.perf_counter()
-    solution = adjustment.run()
-    return replace(
-        solution,
-        seconds=Seconds(initialise=initialised - begin, solve=time.perf_counter() - initialised),
-    )
+    with blas_on_one_thread():
+        adjustment = Adjustment(traverse, options or SolveOptions(), start, on_iteration)
+        initialised = time.perf_counter()
+        solution = adjustment.run()
+    seconds = Seconds(initialise=initialised - begin, solve=time.perf_counter() - initialised)
+    return replace(solution, seconds=seconds)

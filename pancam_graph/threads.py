@@ -4,13 +4,16 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import AbstractContextManager
 from functools import cache
 from itertools import islice
 from typing import TypeVar
 
+from threadpoolctl import ThreadpoolController
+
 from pancam_graph.errors import InputError
 
-__all__ = ["in_parallel", "n_workers", "ordered"]
+__all__ = ["blas_on_one_thread", "in_parallel", "n_workers", "ordered"]
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -73,6 +76,20 @@ def ordered(function: Callable[[T], R], items: Iterable[T], *, ahead: int) -> It
             yield pending.popleft().result()
     finally:
         wait(pending)
+
+
+def blas_on_one_thread() -> AbstractContextManager[object]:
+    """While it lasts, BLAS leaves the cores to the compiled loops.
+
+    Matrices here have a few hundred rows. On these, BLAS threads cost more by waiting for each other than
+    they gain, and with both cores in use they took twice the time of one.
+    """
+    return _blas().limit(limits=1, user_api="blas")
+
+
+@cache
+def _blas() -> ThreadpoolController:
+    return ThreadpoolController()
 
 
 @cache

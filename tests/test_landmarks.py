@@ -16,7 +16,6 @@ from landmark_scenes import (
 )
 from scipy.optimize import least_squares
 
-from pancam_graph._rejection import rays_of
 from pancam_graph.geometry import FloatArray
 from pancam_graph.landmarks import (
     CameraViews,
@@ -25,6 +24,7 @@ from pancam_graph.landmarks import (
     evaluate,
     free_derivatives,
     point_sigma_m,
+    rays_of,
     refine,
     residual_cofactor,
     triangulate,

@@ -7,9 +7,9 @@ import pytest
 from landmark_scenes import measure, random_points, random_views, unit, views_at
 from scipy.stats import norm
 
-from pancam_graph._rejection import Screening, rays_of, screen
+from pancam_graph._rejection import Screening, screen
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray
-from pancam_graph.landmarks import CameraViews, Measurements, evaluate, triangulate
+from pancam_graph.landmarks import CameraViews, Measurements, evaluate, rays_of, triangulate
 
 
 def screened(

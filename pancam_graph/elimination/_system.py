@@ -10,7 +10,15 @@ from pancam_graph import kernel
 from pancam_graph.elimination._linkage import Linkage, Posture
 from pancam_graph.elimination._panels import Covariance, Panels, pattern
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray
-from pancam_graph.landmarks import Landmarks, Measurements
+from pancam_graph.landmarks import (
+    CameraViews,
+    Landmarks,
+    Measurements,
+    rays_of,
+    refine,
+    residuals,
+    triangulate,
+)
 from pancam_graph.losses import SQUARED, Loss
 from pancam_graph.threads import in_parallel, n_workers, ordered
 
@@ -18,6 +26,8 @@ __all__ = ["LandmarkSystem"]
 
 _PARTS = 8
 """A chunk has at most this share of all observations, so that two cores, or eight, have even work."""
+_STRAY = 0.5 * 5.0**2
+"""A landmark with this cost per observation, as if all were 5 sigma off, is placed anew after a step."""
 _SMALLEST_CHUNK = 1000
 """Observations of a chunk that is worth its overhead."""
 
@@ -63,6 +73,7 @@ class LandmarkSystem:
     ) -> None:
         """Arrange observations and landmarks; `cliques` are groups that other factors join."""
         self.linkage, self.loss = linkage, loss
+        self._measurements = measurements
         n = len(landmarks.vector)
         first, reach = _blocks(linkage, measurements)
         self.landmark_row = np.argsort(first, kind="stable")
@@ -247,7 +258,31 @@ class LandmarkSystem:
                 )
 
         in_parallel(work, len(self.chunks), grain=1)
+        self._replace_strays(posture.views)
         return self._by_block(self._moved_cost)
+
+    def _replace_strays(self, views: CameraViews) -> None:
+        """Place anew what is behind a camera or was left far off; elsewhere the linear step is good."""
+        counts = np.diff(self.sights.occurrence_begin[self.sights.landmark_begin])
+        strays = np.flatnonzero(self._moved_cost > _STRAY * counts)
+        if len(strays) == 0:
+            return
+        rows = self.landmark_row[strays]
+        taken = np.argsort(rows)
+        strays, rows = strays[taken], rows[taken]
+        begin = self._measurements.begin
+        part = self._measurements.part(
+            np.concatenate([np.arange(begin[j], begin[j + 1]) for j in rows.tolist()])
+        )
+        weight = np.ones(len(part.image))
+        found = triangulate(*rays_of(part, views), part.landmark, weight).about(self.origin_m[strays])
+        found = refine(found, part, views, weight, self.loss, beyond_infinity=True)
+        residual, in_front = residuals(found, part, views)
+        each = np.where(in_front, self.loss.cost(residual), kernel.BEHIND_COST)
+        cost = np.add.reduceat(each, part.starts)
+        better = cost < self._moved_cost[strays]
+        self._moved[strays[better]] = found.vector[better]
+        self._moved_cost[strays[better]] = cost[better]
 
     def adopt(self) -> None:
         """Take the landmarks of the last step tried as the next point of linearisation."""
