@@ -81,15 +81,19 @@ class Setting:
     ceres: Path | NotRun
     """The compiled Ceres program."""
     numba_cache: Path
-    """Where compiled code is kept; empty before the first solve ever."""
+    """Where compiled code is kept, a folder per engine; empty before the first solve ever."""
     environment: Mapping[str, str] = field(default_factory=lambda: dict(os.environ))
     """Variables that the engines' processes start from."""
 
-    def child_environment(self) -> dict[str, str]:
-        """Variables of the engines' processes."""
+    def child_environment(self, engine: str) -> dict[str, str]:
+        """Variables of an engine's processes."""
         kept = {k: v for k, v in self.environment.items() if k not in _SLOWS_BLAS}
         paths = [str(_SCRIPTS), *filter(None, [kept.get("PYTHONPATH")])]
-        return {**kept, "PYTHONPATH": os.pathsep.join(paths), "NUMBA_CACHE_DIR": str(self.numba_cache)}
+        return {
+            **kept,
+            "PYTHONPATH": os.pathsep.join(paths),
+            "NUMBA_CACHE_DIR": str(self.numba_cache / engine),
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,6 +105,8 @@ class Engine:
     """For the table."""
     command: Callable[[Files, Setting, int], list[str] | NotRun]
     """Module of this package and its arguments, for a case, a setting and a number of repeats."""
+    compiles: bool = False
+    """Whether its first solve ever compiles code that all later ones find on disk."""
     same_problem: bool = True
     """Whether its final cost must be that of the others."""
 
@@ -134,8 +140,13 @@ def _pycolmap(files: Files, setting: Setting, repeats: int) -> list[str] | NotRu
 ENGINES = {
     engine.name: engine
     for engine in (
-        Engine(name="eliminated", title="pancam_graph", command=_ours("eliminated")),
-        Engine(name="explicit", title="pancam_graph, explicit landmarks", command=_ours("explicit")),
+        Engine(name="eliminated", title="pancam_graph", command=_ours("eliminated"), compiles=True),
+        Engine(
+            name="explicit",
+            title="pancam_graph, explicit landmarks",
+            command=_ours("explicit"),
+            compiles=True,
+        ),
         Engine(name="ceres", title="Ceres, C++", command=_ceres),
         Engine(name="pycolmap", title="COLMAP, rig", command=_pycolmap, same_problem=False),
     )
@@ -148,7 +159,7 @@ def measure(engine: Engine, files: Files, setting: Setting, repeats: int) -> Mea
     command = engine.command(files, setting, repeats)
     if isinstance(command, NotRun):
         return command
-    found = _run(command, setting)
+    found = _run(command, setting.child_environment(engine.name))
     if isinstance(found, NotRun):
         return found
     return Measured(**{**found, "seconds": tuple(found["seconds"])})
@@ -159,18 +170,19 @@ def solve_first_ever(engine: Engine, files: Files, setting: Setting) -> float | 
 
     Raises ValueError where the cache of compiled code is not empty.
     """
-    if setting.numba_cache.exists() and any(setting.numba_cache.iterdir()):
-        raise ValueError(f"{setting.numba_cache}: expected an empty folder for compiled code, found files")
+    cache = setting.numba_cache / engine.name
+    if cache.exists() and any(cache.iterdir()):
+        raise ValueError(f"{cache}: expected an empty folder for compiled code, found files")
     found = measure(engine, files, setting, 1)
     if isinstance(found, NotRun):
         return found
     return found.first_s if found.first_s is not None else NotRun(reason="not measured", failed=False)
 
 
-def _run(command: list[str], setting: Setting) -> dict[str, Any] | NotRun:
+def _run(command: list[str], environment: dict[str, str]) -> dict[str, Any] | NotRun:
     done = subprocess.run(
         [sys.executable, "-m", *command],
-        env=setting.child_environment(),
+        env=environment,
         text=True,
         capture_output=True,
         check=False,

@@ -31,25 +31,26 @@ def run_cases(
     setting: Setting,
     folder: Path,
     *,
-    first_ever: bool = True,
     say: Callable[[str], None] = lambda _: None,
 ) -> Report:
     """Make each case in a new folder under `folder` and let its engines solve it, one after the other.
 
-    `first_ever`: measure the first solve with nothing compiled, on the smallest case that the compiled
-    solver solves; it leaves the compiled code for all others. `say` is told what goes on.
+    Before that, an engine that compiles code solves its smallest case with nothing compiled, which leaves
+    the code for all others. `say` is told what goes on.
     """
     made = {}
     for case in cases:
         say(f"{case.name}: simulating")
         made[case.name] = make(case, folder / case.name)
-    compiled = [c for c in cases if "eliminated" in c.engines]
-    first_ever_s: float | None = None
-    if first_ever and compiled:
-        smallest = min(compiled, key=lambda c: made[c.name][1].observations)
-        say(f"{smallest.name}: first solve ever")
-        found = solve_first_ever(ENGINES["eliminated"], made[smallest.name][0], setting)
-        first_ever_s = None if isinstance(found, NotRun) else found
+    first_ever_s = {}
+    for name in [n for n, engine in ENGINES.items() if engine.compiles]:
+        solved = [made[case.name] for case in cases if name in case.engines]
+        if solved:
+            say(f"{name}: first solve ever")
+            files, _ = min(solved, key=lambda files_size: files_size[1].observations)
+            found = solve_first_ever(ENGINES[name], files, setting)
+            if not isinstance(found, NotRun):  # if it failed, it fails again below and is reported there
+                first_ever_s[name] = found
     results = []
     for case in cases:
         files, size = made[case.name]
