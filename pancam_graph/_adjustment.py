@@ -129,13 +129,14 @@ class Adjustment:
 
     # --- the rounds ---
 
-    def run(self) -> Solution:
-        """Screen, adjust, and collect."""
+    def solve(self) -> None:
+        """Screen, adjust, and say how sure it is."""
         if self.options.loss != "none":
             self._screen_at_start()
             self._screening_rounds()
-        outcome = self._final_rounds()
-        return self._collect(outcome)
+        self.outcome = self._final_rounds()
+        self.final = _state(self.problem)
+        self.uncertainty = self._uncertainty()
 
     def _screen_at_start(self) -> None:
         """Gross outliers, judged with what telemetry may be wrong by added to the noise."""
@@ -282,7 +283,9 @@ class Adjustment:
 
     # --- results ---
 
-    def _collect(self, outcome: Outcome) -> Solution:
+    def solution(self) -> Solution:
+        """What `solve` found, beside what was there before."""
+        outcome, found = self.outcome, self.uncertainty
         t, p, m = self.traverse, self.problem, self.problem.measurements
         present, kept = p.present, p.kept
         used = np.zeros(len(self.observations), dtype=bool)
@@ -294,8 +297,6 @@ class Adjustment:
         first = self.first
         if m is not first.measurements or not p.accepted.all():
             first = _triangulated(replace(first, measurements=m, accepted=p.accepted)).placed()
-        final = _state(p)
-        found = self._uncertainty(final)
         return Solution(
             traverse=t,
             model=self.options.model,
@@ -307,7 +308,7 @@ class Adjustment:
             cost_initial=first.cost(),
             cost_final=p.cost(),
             initial=_state(first),
-            final=final,
+            final=self.final,
             landmark_track=self.landmark_track,
             used=used,
             reason=tuple(self.reason.tolist()),
@@ -320,11 +321,11 @@ class Adjustment:
             warnings=(*self.warnings, *self._late_warnings(used), *connection_warnings(t, used)),
         )
 
-    def _uncertainty(self, final: State) -> Uncertainty:
+    def _uncertainty(self) -> Uncertainty:
         """Covariances; NaN and a warning where a direction is free. Warns of landmarks without a place."""
-        t = self.traverse
+        t, wanted = self.traverse, self.options.landmark_covariances
         try:
-            found = uncertainty(self.problem, final, landmarks=self.options.landmark_covariances)
+            found = uncertainty(self.problem, self.final, *self.solver.system(self.problem), landmarks=wanted)
         except SolveError as error:
             self.warnings.append(f"no uncertainties: {error}")
             n = len(self.landmark_track)

@@ -6,9 +6,8 @@ import gtsam
 import numpy as np
 from scipy.sparse import coo_array, csc_array
 
-from pancam_graph._eliminated import system_of
 from pancam_graph._problem import Problem
-from pancam_graph.elimination import Linkage, Panels
+from pancam_graph.elimination import LandmarkSystem, Linkage, Panels
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.solution import State
 
@@ -29,10 +28,14 @@ class Uncertainty:
     """(landmarks,) whether rays leave a direction free that the weak prior alone holds"""
 
 
-def uncertainty(problem: Problem, state: State, *, landmarks: bool) -> Uncertainty:
-    """Covariances, everything else marginalised. Raises SolveError where a direction is held by nothing."""
+def uncertainty(
+    problem: Problem, state: State, system: LandmarkSystem, rows: IntArray, *, landmarks: bool
+) -> Uncertainty:
+    """Covariances, everything else marginalised, from the landmark system of what takes part.
+
+    `rows` are the system's landmarks among all. Raises SolveError where a direction is held by nothing.
+    """
     template, m = problem.template, problem.measurements
-    system, rows = system_of(problem)
     panels = system.linearise(template.posture(problem.values))
     _add(panels, template.linkage, problem.factors.linearize(problem.values))
     held = _columns(template.linkage, template.held_columns())

@@ -7,16 +7,14 @@ import gtsam
 import numpy as np
 
 from pancam_graph._optimise import InOrder, Iteration, Outcome, StopRule, optimise
-from pancam_graph._problem import Problem, Solver
+from pancam_graph._problem import Problem, Solver, system_of
 from pancam_graph.elimination import LandmarkSystem
-from pancam_graph.errors import SolveError
 from pancam_graph.factors import LandmarkBlocks
 from pancam_graph.geometry import IntArray
 from pancam_graph.graph import HardTemplate, SoftTemplate, read_variable
-from pancam_graph.landmarks import Landmarks
 from pancam_graph.losses import SQUARED, Loss
 
-__all__ = ["EliminatedSolver", "system_of"]
+__all__ = ["EliminatedSolver"]
 
 
 class EliminatedSolver(Solver):
@@ -25,6 +23,7 @@ class EliminatedSolver(Solver):
     def __init__(self, on_iteration: Callable[[Iteration], None] | None) -> None:
         super().__init__(on_iteration)
         self._is_near = False
+        self._last: tuple[Problem, LandmarkSystem, IntArray] | None = None
 
     def approach(self, problem: Problem, rule: StopRule, loss: Loss, stage: str) -> Problem:
         """The same as `adjust`, but for the loss: unit 4-vectors do not go astray from afar."""
@@ -84,24 +83,15 @@ class EliminatedSolver(Solver):
         blocks.settle(outcome.values)
         vector = problem.landmarks.vector.copy()
         vector[rows] = system.landmarks().vector
-        return problem.at(outcome.values, replace(problem.landmarks, vector=vector)), outcome
+        found = problem.at(outcome.values, replace(problem.landmarks, vector=vector))
+        self._last = found, system, rows
+        return found, outcome
 
-
-def system_of(problem: Problem, loss: Loss = SQUARED) -> tuple[LandmarkSystem, IntArray]:
-    """The landmark system of what takes part, and its rows among the landmarks.
-
-    Raises SolveError where nothing is left.
-    """
-    m = problem.measurements
-    take = problem.kept
-    if not take.any():
-        raise SolveError("observations: expected tracks that agree in two or more images, found none")
-    rows = np.flatnonzero(np.bincount(m.landmark, take, minlength=m.n_landmarks))
-    if not take.all():
-        m = m.part(np.flatnonzero(take))
-    landmarks = Landmarks(vector=problem.landmarks.vector[rows], origin_m=problem.landmarks.origin_m[rows])
-    template = problem.template
-    return LandmarkSystem(template.linkage, m, landmarks, loss, cliques=template.cliques), rows
+    def system(self, problem: Problem) -> tuple[LandmarkSystem, IntArray]:
+        """The landmark system of what takes part, and its rows among the landmarks: that of the last fit."""
+        if self._last is not None and self._last[0] is problem:
+            return self._last[1:]
+        return system_of(problem)
 
 
 def _only_landmarks(problem: Problem, loss: Loss) -> tuple[Problem, Outcome]:

@@ -8,12 +8,14 @@ import gtsam
 import numpy as np
 
 from pancam_graph._optimise import Iteration, Outcome, StopRule
-from pancam_graph.geometry import BoolArray, FloatArray
+from pancam_graph.elimination import LandmarkSystem
+from pancam_graph.errors import SolveError
+from pancam_graph.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.graph import FactorTemplate
 from pancam_graph.landmarks import CameraViews, Landmarks, Measurements, refine, residuals
 from pancam_graph.losses import SQUARED, Loss
 
-__all__ = ["Problem", "Solver", "reach_m", "typical_sigma_px"]
+__all__ = ["Problem", "Solver", "reach_m", "system_of", "typical_sigma_px"]
 
 _FURTHEST_PARALLAX_SIGMAS = 0.01
 """Points are placed no further out than where their parallax is this many sigmas of a pixel."""
@@ -101,3 +103,24 @@ class Solver(ABC):
     @abstractmethod
     def adjust(self, problem: Problem, rule: StopRule) -> tuple[Problem, Outcome]:
         """The problem at the least-squares optimum near by."""
+
+    def system(self, problem: Problem) -> tuple[LandmarkSystem, IntArray]:
+        """The landmark system of what takes part, and its rows among the landmarks."""
+        return system_of(problem)
+
+
+def system_of(problem: Problem, loss: Loss = SQUARED) -> tuple[LandmarkSystem, IntArray]:
+    """The landmark system of what takes part, and its rows among the landmarks.
+
+    Raises SolveError where nothing is left.
+    """
+    m = problem.measurements
+    take = problem.kept
+    if not take.any():
+        raise SolveError("observations: expected tracks that agree in two or more images, found none")
+    rows = np.flatnonzero(np.bincount(m.landmark, take, minlength=m.n_landmarks))
+    if not take.all():
+        m = m.part(np.flatnonzero(take))
+    landmarks = Landmarks(vector=problem.landmarks.vector[rows], origin_m=problem.landmarks.origin_m[rows])
+    template = problem.template
+    return LandmarkSystem(template.linkage, m, landmarks, loss, cliques=template.cliques), rows

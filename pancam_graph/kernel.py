@@ -21,6 +21,7 @@ __all__ = [
     "Sights",
     "arrange",
     "compiled",
+    "costs",
     "eliminate_calibrations",
     "eliminate_poses",
     "follow",
@@ -241,6 +242,38 @@ def _chain(
 
 
 @compiled
+def _subtract(
+    arms: FloatArray, column: IntArray, gamma: FloatArray, paired: bool, S: FloatArray, s: FloatArray
+) -> None:
+    """Take W'W and W'gamma of one landmark from the upper triangle of S and from s.
+
+    Where columns come in pairs of neighbours, 2 x 2 entries are done at once, which halves the time; below
+    the diagonal this leaves numbers that mean nothing.
+    """
+    n = len(column)
+    for p in range(n):
+        s[column[p]] -= arms[0, p] * gamma[0] + arms[1, p] * gamma[1] + arms[2, p] * gamma[2]
+    if not paired:
+        for p in range(n):
+            for q in range(p, n):
+                product = arms[0, p] * arms[0, q] + arms[1, p] * arms[1, q] + arms[2, p] * arms[2, q]
+                S[column[p], column[q]] -= product
+        return
+    for p in range(0, n, 2):
+        row = column[p]
+        a0, a1, a2 = arms[0, p], arms[1, p], arms[2, p]
+        b0, b1, b2 = arms[0, p + 1], arms[1, p + 1], arms[2, p + 1]
+        for q in range(p, n, 2):
+            c = column[q]
+            x0, x1, x2 = arms[0, q], arms[1, q], arms[2, q]
+            y0, y1, y2 = arms[0, q + 1], arms[1, q + 1], arms[2, q + 1]
+            S[row, c] -= a0 * x0 + a1 * x1 + a2 * x2
+            S[row, c + 1] -= a0 * y0 + a1 * y1 + a2 * y2
+            S[row + 1, c] -= b0 * x0 + b1 * x1 + b2 * x2
+            S[row + 1, c + 1] -= b0 * y0 + b1 * y1 + b2 * y2
+
+
+@compiled
 def _by_calibration(
     bearings: Bearings, image: int, uv_px: FloatArray, whitening: FloatArray, root: float, jac: FloatArray
 ) -> None:
@@ -268,6 +301,7 @@ def _eliminating(rows: int) -> Callable[..., None]:
         end: int,
         segment_column: IntArray,
         n_units: int,
+        paired: bool,
         reduced: Reduced,
         S: FloatArray,
         s: FloatArray,
@@ -394,12 +428,7 @@ def _eliminating(rows: int) -> Callable[..., None]:
                 a1 = (arms[1, q] - l10 * a0) / l11
                 a2 = (arms[2, q] - l20 * a0 - l21 * a1) / l22
                 arms[0, q], arms[1, q], arms[2, q] = a0, a1, a2
-            for p in range(n):
-                a0, a1, a2 = arms[0, p], arms[1, p], arms[2, p]
-                line = S[column[p]]
-                s[column[p]] -= a0 * y0 + a1 * y1 + a2 * y2
-                for q in range(p, n):
-                    line[column[q]] -= a0 * arms[0, q] + a1 * arms[1, q] + a2 * arms[2, q]
+            _subtract(arms, column, reduced.gamma[j], paired, S, s)
         _chain(unit_H, unit_s, unit_of, bearings, segment_column, S, s)
 
     return eliminate
@@ -498,6 +527,23 @@ def _landmark_cost(
         else:
             cost += BEHIND_COST
     return cost
+
+
+@compiled
+def costs(
+    sights: Sights,
+    bearings: Bearings,
+    which: IntArray,
+    vector: FloatArray,
+    origin_m: FloatArray,
+    kind: int,
+    width: float,
+    cost: FloatArray,
+) -> None:
+    """True costs (m,) of the landmarks `which` (m,) if these were at `vector` (m, 4)."""
+    for i in range(len(which)):
+        j = which[i]
+        cost[i] = _landmark_cost(sights, bearings, vector[i], origin_m[j], kind, width, j)
 
 
 @compiled

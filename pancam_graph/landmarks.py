@@ -206,8 +206,11 @@ def refine(
     loss: Loss = SQUARED,
     *,
     beyond_infinity: bool = False,
+    only: IntArray | None = None,
 ) -> Landmarks:
     """Best landmarks with all cameras held: Levenberg-Marquardt for each on its own.
+
+    `only` are the rows of those to refine; default: all.
 
     `weight` (n,) multiplies each observation's cost; 0 leaves it out. A step that would raise a landmark's
     cost or move it behind a camera is not taken; directions that its rays leave free are not moved along.
@@ -216,7 +219,7 @@ def refine(
     seen = seen_by(measurements, views)
     start, origin = _arrays(landmarks, measurements)
     own, vector = as_floats(weight, (len(measurements.image),)), start.copy()
-    which = np.arange(len(vector))
+    which = np.arange(len(vector)) if only is None else only
     loops.over(loops.refine, which, seen, origin, own, loss.kind, loss.width, beyond_infinity, vector)
     return replace(landmarks, vector=vector)
 

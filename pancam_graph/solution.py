@@ -34,8 +34,11 @@ class Seconds:
 
     read: float = 0.0
     initialise: float = 0.0
+    """First values of cameras and landmarks."""
     solve: float = 0.0
+    """Screening, adjustment and uncertainties."""
     report: float = 0.0
+    """Tables of residuals, warnings, and writing the results."""
 
 
 def rms_px(residuals_px: FloatArray) -> float:

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 
 from pancam_graph._adjustment import Adjustment
 from pancam_graph._optimise import Iteration
@@ -31,10 +32,13 @@ def solve(
     traverse without observations or unknown options, SolveError where no track is seen twice or the system
     has a direction that neither observations nor priors hold.
     """
-    begin = time.perf_counter()
+    times = [time.perf_counter()]
     with blas_on_one_thread():
         adjustment = Adjustment(traverse, options or SolveOptions(), start, on_iteration)
-        initialised = time.perf_counter()
-        solution = adjustment.run()
-    seconds = Seconds(initialise=initialised - begin, solve=time.perf_counter() - initialised)
-    return replace(solution, seconds=seconds)
+        times.append(time.perf_counter())
+        adjustment.solve()
+        times.append(time.perf_counter())
+        solution = adjustment.solution()
+    times.append(time.perf_counter())
+    initialise, solving, report = (after - before for before, after in pairwise(times))
+    return replace(solution, seconds=Seconds(initialise=initialise, solve=solving, report=report))

@@ -123,7 +123,8 @@ def test_covariances_agree_with_gtsam_marginals() -> None:
     distance = np.linalg.norm(simulation.truth.landmarks_m, axis=1)
     near = t.with_observations(t.observations.select((distance < 20.0)[t.observations.track]))
     adjustment = Adjustment(near, SolveOptions(loss="none", landmarks="explicit"), None, None)
-    solution = adjustment.run()
+    adjustment.solve()
+    solution = adjustment.solution()
     problem = adjustment.problem
     assert isinstance(problem.template, SoftTemplate)
     explicit = ExplicitLandmarks(problem.template, problem.measurements)

@@ -3,8 +3,10 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pancam_graph import kernel
 from pancam_graph.elimination._linkage import Linkage, Posture
@@ -16,7 +18,6 @@ from pancam_graph.landmarks import (
     Measurements,
     rays_of,
     refine,
-    residuals,
     triangulate,
 )
 from pancam_graph.losses import SQUARED, Loss
@@ -24,11 +25,13 @@ from pancam_graph.threads import in_parallel, n_workers, ordered
 
 __all__ = ["LandmarkSystem"]
 
+_T = TypeVar("_T", bound=np.generic)
+
 _PARTS = 8
 """A chunk has at most this share of all observations, so that two cores, or eight, have even work."""
 _STRAY = 0.5 * 5.0**2
 """A landmark with this cost per observation, as if all were 5 sigma off, is placed anew after a step."""
-_SMALLEST_CHUNK = 1000
+_SMALLEST_CHUNK = 2000
 """Observations of a chunk that is worth its overhead."""
 
 
@@ -188,6 +191,7 @@ class LandmarkSystem:
         bearings = self.bearings(posture)
         eliminate = kernel.eliminate_poses if bearings.chain.shape[1] == 6 else kernel.eliminate_calibrations
         n_buffers = n_workers() + 2
+        paired = not np.any(self.linkage.segment_width % 2) and not np.any(self.linkage.segment_column % 2)
         largest = max(int(b.begin[-1]) for b in self.blocks)
         free = [(np.empty(largest * largest), np.empty(largest)) for _ in range(n_buffers)]
 
@@ -209,6 +213,7 @@ class LandmarkSystem:
                 chunk.end,
                 block.segment_column,
                 block.n_units,
+                paired,
                 self.reduced,
                 S,
                 s,
@@ -258,31 +263,46 @@ class LandmarkSystem:
                 )
 
         in_parallel(work, len(self.chunks), grain=1)
-        self._replace_strays(posture.views)
+        self._replace_strays(posture.views, bearings)
         return self._by_block(self._moved_cost)
 
-    def _replace_strays(self, views: CameraViews) -> None:
-        """Place anew what is behind a camera or was left far off; elsewhere the linear step is good."""
+    def _replace_strays(self, views: CameraViews, bearings: kernel.Bearings) -> None:
+        """Place anew what is behind a camera or was left far off; elsewhere the linear step is good.
+
+        First from where the step led; what is far off even then, from nothing but its rays.
+        """
         counts = np.diff(self.sights.occurrence_begin[self.sights.landmark_begin])
         strays = np.flatnonzero(self._moved_cost > _STRAY * counts)
         if len(strays) == 0:
             return
+        m, ones = self._measurements, np.ones(len(self.sights.image))
+        moved = Landmarks(vector=self._given(self._moved), origin_m=self._given(self.origin_m))
         rows = self.landmark_row[strays]
-        taken = np.argsort(rows)
-        strays, rows = strays[taken], rows[taken]
-        begin = self._measurements.begin
-        part = self._measurements.part(
-            np.concatenate([np.arange(begin[j], begin[j + 1]) for j in rows.tolist()])
-        )
-        weight = np.ones(len(part.image))
-        found = triangulate(*rays_of(part, views), part.landmark, weight).about(self.origin_m[strays])
-        found = refine(found, part, views, weight, self.loss, beyond_infinity=True)
-        residual, in_front = residuals(found, part, views)
-        each = np.where(in_front, self.loss.cost(residual), kernel.BEHIND_COST)
-        cost = np.add.reduceat(each, part.starts)
+        refined = refine(moved, m, views, ones, self.loss, beyond_infinity=True, only=np.sort(rows))
+        self._take_if_better(strays, refined.vector[rows], bearings)
+
+        strays = strays[self._moved_cost[strays] > _STRAY * counts[strays]]
+        if len(strays) == 0:
+            return
+        lost = np.zeros(len(counts), dtype=bool)
+        lost[self.landmark_row[strays]] = True
+        part, rows = m.part(np.flatnonzero(lost[m.landmark])), np.cumsum(lost)[self.landmark_row[strays]] - 1
+        origin = moved.origin_m[lost]
+        placed = triangulate(*rays_of(part, views), part.landmark, ones[: len(part.image)]).about(origin)
+        placed = refine(placed, part, views, ones[: len(part.image)], self.loss, beyond_infinity=True)
+        self._take_if_better(strays, placed.vector[rows], bearings)
+
+    def _take_if_better(self, strays: IntArray, vector: FloatArray, bearings: kernel.Bearings) -> None:
+        cost, loss = np.empty(len(strays)), self.loss
+        kernel.costs(self.sights, bearings, strays, vector, self.origin_m, loss.kind, loss.width, cost)
         better = cost < self._moved_cost[strays]
-        self._moved[strays[better]] = found.vector[better]
-        self._moved_cost[strays[better]] = cost[better]
+        self._moved[strays[better]], self._moved_cost[strays[better]] = vector[better], cost[better]
+
+    def _given(self, array: NDArray[_T]) -> NDArray[_T]:
+        """Rows in the order that landmarks were given in."""
+        out = np.empty_like(array)
+        out[self.landmark_row] = array
+        return out
 
     def adopt(self) -> None:
         """Take the landmarks of the last step tried as the next point of linearisation."""
@@ -300,9 +320,7 @@ class LandmarkSystem:
 
     def landmarks(self) -> Landmarks:
         """Landmarks at the point of linearisation, in the order they were given in."""
-        vector, origin = np.empty_like(self.vector), np.empty_like(self.origin_m)
-        vector[self.landmark_row], origin[self.landmark_row] = self.vector, self.origin_m
-        return Landmarks(vector=vector, origin_m=origin)
+        return Landmarks(vector=self._given(self.vector), origin_m=self._given(self.origin_m))
 
     def landmark_covariance_m2(self, covariance: Covariance) -> FloatArray:
         """Covariance (landmarks, 3, 3) of world points X / w, cameras marginalised, in the order given.
@@ -319,16 +337,12 @@ class LandmarkSystem:
                 else np.zeros((0, 0))
             )
             kernel.spread(self.sights, self.reduced, self.vector, joint, chunk.begin, chunk.end, out)
-        found = np.empty_like(out)
-        found[self.landmark_row] = out
-        return found
+        return self._given(out)
 
     @property
     def undetermined(self) -> BoolArray:
         """(landmarks,) which the weak prior alone held at the last linearisation, in the order given."""
-        out = np.zeros(len(self.landmark_row), dtype=bool)
-        out[self.landmark_row] = self.reduced.undetermined
-        return out
+        return self._given(self.reduced.undetermined)
 
 
 def _blocks(linkage: Linkage, m: Measurements) -> tuple[IntArray, dict[int, tuple[int, ...]]]:
