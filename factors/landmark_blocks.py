@@ -111,7 +111,8 @@ class LandmarkBlocks:
             return error
 
         # No noise model: everything is whitened, and the number of rows is the rank found.
-        return gtsam.CustomFactor(None, [link.key[v] for v in variables], evaluate)
+        no_noise: Any = None
+        return gtsam.CustomFactor(no_noise, [link.key[v] for v in variables], evaluate)
 
     def _evaluate(self, values: gtsam.Values, variables: Sequence[int]) -> None:
         """Bring costs to these values, unless the given variables are as they were."""

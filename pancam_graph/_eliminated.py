@@ -32,9 +32,9 @@ class EliminatedSolver(Solver):
     def adjust(self, problem: Problem, rule: StopRule) -> tuple[Problem, Outcome]:
         """Levenberg-Marquardt; observations of landmarks behind their camera are no longer accepted."""
         problem, outcome = self._fit(problem, rule, SQUARED, "solve")
-        _, in_front = problem.residuals()
-        if np.all(in_front[problem.kept]):
+        if self._last is None or not self._last[1].any_behind:
             return problem, outcome
+        _, in_front = problem.residuals()
         problem, again = self._fit(
             replace(problem, accepted=problem.accepted & in_front), rule, SQUARED, "solve"
         )

@@ -10,9 +10,17 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2, norm
 
-from pancam_graph import _landmark_loops as loops
+from pancam_graph import kernel
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray
-from pancam_graph.landmarks import CameraViews, Landmarks, Measurements, as_floats, rays_of, seen_by
+from pancam_graph.landmarks import (
+    CameraViews,
+    Landmarks,
+    Measurements,
+    as_floats,
+    over_landmarks,
+    rays_of,
+    seen_by,
+)
 from pancam_graph.losses import SQUARED
 
 __all__ = ["Screening", "screen"]
@@ -63,17 +71,17 @@ def screen(
     which = np.arange(n_landmarks)
     fresh = np.flatnonzero(np.minimum.reduceat(weight, starts) > 0)
     for sweep in range(_SWEEPS):
-        loops.over(loops.triangulate, fresh, begin, centre, direction, weight, vector, origin)
-        loops.over(loops.refine, which, seen, origin, weight, SQUARED.kind, SQUARED.width, False, vector)
-        loops.over(loops.evaluate, which, seen, vector, origin, residual, b, in_front)
-        loops.over(loops.free_derivatives, which, begin, vector, b)
-        loops.over(loops.cofactors, which, begin, b, weight, cofactor)
-        loops.over(loops.tests, which, begin, residual, cofactor, test, freedom)
+        over_landmarks(kernel.triangulate, fresh, begin, centre, direction, weight, vector, origin)
+        over_landmarks(kernel.refine, which, seen, origin, weight, SQUARED.kind, SQUARED.width, False, vector)
+        over_landmarks(kernel.evaluate, which, seen, vector, origin, residual, b, in_front)
+        over_landmarks(kernel.free_derivatives, which, begin, vector, b)
+        over_landmarks(kernel.cofactors, which, begin, b, weight, cofactor)
+        over_landmarks(kernel.tests, which, begin, residual, cofactor, test, freedom)
         if sweep == 0:
             counts = (weight > 0) & in_front
             scale = max(min_scale, _robust_scale(test[counts], freedom[counts]))
-        loops.over(
-            loops.reject,
+        over_landmarks(
+            kernel.reject,
             which,
             begin,
             residual,

@@ -6,17 +6,19 @@ for its division, so a ridge on the horizon (w near 0) is an ordinary landmark, 
 infinity (w below 0) can come back.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pancam_graph import _landmark_loops as loops
+from pancam_graph import kernel
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.losses import SQUARED, Loss
 from pancam_graph.threads import in_parallel
 
+_GRAIN = 1024
 _RAY_GRAIN = 16384
 
 __all__ = [
@@ -143,7 +145,9 @@ def triangulate(
     centre_m, direction = as_floats(centre_m, (n, 3)), as_floats(direction, (n, 3))
     weight = as_floats(weight, (n,))
     vector, origin = np.empty((len(begin) - 1, 4)), np.empty((len(begin) - 1, 3))
-    loops.over(loops.triangulate, np.arange(len(vector)), begin, centre_m, direction, weight, vector, origin)
+    over_landmarks(
+        kernel.triangulate, np.arange(len(vector)), begin, centre_m, direction, weight, vector, origin
+    )
     return Landmarks(vector=vector, origin_m=origin)
 
 
@@ -154,7 +158,9 @@ def rays_of(measurements: Measurements, views: CameraViews) -> tuple[FloatArray,
     calibration = as_floats(views.calibration, (n_images, 3, 3))
     rotation = as_floats(views.world_R_camera, (n_images, 3, 3))
     in_parallel(
-        lambda first, last: loops.rays(seen.image, seen.uv_px, calibration, rotation, first, last, direction),
+        lambda first, last: kernel.rays(
+            seen.image, seen.uv_px, calibration, rotation, first, last, direction
+        ),
         len(direction),
         grain=_RAY_GRAIN,
     )
@@ -171,7 +177,7 @@ def evaluate(
     seen, n = seen_by(measurements, views), len(measurements.image)
     vector, origin = _arrays(landmarks, measurements)
     residual, b, in_front = np.empty((n, 2)), np.empty((n, 2, 3)), np.empty(n, dtype=bool)
-    loops.over(loops.evaluate, np.arange(len(vector)), seen, vector, origin, residual, b, in_front)
+    over_landmarks(kernel.evaluate, np.arange(len(vector)), seen, vector, origin, residual, b, in_front)
     return residual, b, in_front
 
 
@@ -182,7 +188,7 @@ def residuals(
     seen, n = seen_by(measurements, views), len(measurements.image)
     vector, origin = _arrays(landmarks, measurements)
     residual, in_front = np.empty((n, 2)), np.empty(n, dtype=bool)
-    loops.over(loops.residuals, np.arange(len(vector)), seen, vector, origin, residual, in_front)
+    over_landmarks(kernel.residuals, np.arange(len(vector)), seen, vector, origin, residual, in_front)
     return residual, in_front
 
 
@@ -194,7 +200,7 @@ def free_derivatives(b: FloatArray, landmarks: Landmarks, measurements: Measurem
     """
     vector, _ = _arrays(landmarks, measurements)
     free: FloatArray = as_floats(b, (len(measurements.image), 2, 3)).copy()
-    loops.over(loops.free_derivatives, np.arange(len(vector)), measurements.begin, vector, free)
+    over_landmarks(kernel.free_derivatives, np.arange(len(vector)), measurements.begin, vector, free)
     return free
 
 
@@ -220,7 +226,7 @@ def refine(
     start, origin = _arrays(landmarks, measurements)
     own, vector = as_floats(weight, (len(measurements.image),)), start.copy()
     which = np.arange(len(vector)) if only is None else only
-    loops.over(loops.refine, which, seen, origin, own, loss.kind, loss.width, beyond_infinity, vector)
+    over_landmarks(kernel.refine, which, seen, origin, own, loss.kind, loss.width, beyond_infinity, vector)
     return replace(landmarks, vector=vector)
 
 
@@ -234,7 +240,7 @@ def residual_cofactor(b: FloatArray, measurements: Measurements, weight: FloatAr
     n = len(measurements.image)
     derivatives, own, out = as_floats(b, (n, 2, 3)), as_floats(weight, (n,)), np.empty((n, 2, 2))
     which = np.arange(measurements.n_landmarks)
-    loops.over(loops.cofactors, which, measurements.begin, derivatives, own, out)
+    over_landmarks(kernel.cofactors, which, measurements.begin, derivatives, own, out)
     return out
 
 
@@ -249,9 +255,14 @@ def point_sigma_m(
     seen, n = seen_by(measurements, views), measurements.n_landmarks
     points, weight = as_floats(points_m, (n, 3)), as_floats(accepted, (len(measurements.image),))
     smallest = np.empty(n)
-    loops.over(loops.smallest_information, np.arange(n), seen, points, weight, smallest)
+    over_landmarks(kernel.smallest_information, np.arange(n), seen, points, weight, smallest)
     few = np.bincount(measurements.landmark, weight, minlength=n) < 2
     return np.where(few | (smallest <= 0), np.inf, 1 / np.sqrt(smallest.clip(1e-300)))
+
+
+def over_landmarks(loop: Callable[..., None], which: IntArray, *arguments: object) -> None:
+    """Call loop(part, *arguments) for parts of the landmarks `which`, over all threads."""
+    in_parallel(lambda first, last: loop(which[first:last], *arguments), len(which), grain=_GRAIN)
 
 
 # --- arrays as the compiled loops take them ---
@@ -268,13 +279,13 @@ def as_floats(array: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
     return floats
 
 
-def seen_by(measurements: Measurements, views: CameraViews) -> loops.Seen:
+def seen_by(measurements: Measurements, views: CameraViews) -> kernel.Seen:
     """Measurements with the cameras that made them. Raises IndexError for an image without a camera."""
     n, n_images = len(measurements.image), len(views.world_t_camera)
     image = np.require(measurements.image, np.int64, ["C", "W"])
     if n and not 0 <= image.min() <= image.max() < n_images:
         raise IndexError(f"image: expected 0 to {n_images - 1}, found {image.min()} to {image.max()}")
-    return loops.Seen(
+    return kernel.Seen(
         begin=measurements.begin,
         image=image,
         uv_px=as_floats(measurements.uv_px, (n, 2)),

@@ -10,7 +10,6 @@ from typing import Literal
 import gtsam
 import numpy as np
 
-from pancam_graph import _landmark_loops as loops
 from pancam_graph import kernel
 from pancam_graph.errors import InputError
 from pancam_graph.geometry import FloatArray
@@ -46,11 +45,11 @@ class Loss:
 
     def cost(self, residual: FloatArray) -> FloatArray:
         """Costs (n,) of whitened residuals (n, m)."""
-        return self._each(loops.loss_costs, residual)
+        return self._each(kernel.loss_costs, residual)
 
     def weight(self, residual: FloatArray) -> FloatArray:
         """Weights (n,) that make the square's gradient that of the loss."""
-        return self._each(loops.loss_weights, residual)
+        return self._each(kernel.loss_weights, residual)
 
     def _each(self, loop: Callable[..., None], residual: FloatArray) -> FloatArray:
         squared = np.einsum("ni,ni->n", residual, residual)

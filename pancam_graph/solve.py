@@ -1,10 +1,12 @@
 """Solve a traverse: screen the observations, adjust everything, and say how sure it is."""
 
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 
+from pancam_graph import kernel
 from pancam_graph._adjustment import Adjustment
 from pancam_graph._optimise import Iteration
 from pancam_graph.initialise import Start
@@ -13,7 +15,11 @@ from pancam_graph.solution import Seconds, Solution
 from pancam_graph.threads import blas_on_one_thread
 from pancam_graph.traverse import Traverse
 
-__all__ = ["SolveOptions", "solve"]
+__all__ = ["COMPILING", "SolveOptions", "solve"]
+
+_LOG = logging.getLogger(__name__)
+COMPILING = "compiling the kernel for this machine: about 20 seconds, once"
+"""What the first solve of an installation logs."""
 
 
 def solve(
@@ -32,6 +38,8 @@ def solve(
     traverse without observations or unknown options, SolveError where no track is seen twice or the system
     has a direction that neither observations nor priors hold.
     """
+    if kernel.must_compile():
+        _LOG.info(COMPILING)
     times = [time.perf_counter()]
     with blas_on_one_thread():
         adjustment = Adjustment(traverse, options or SolveOptions(), start, on_iteration)

@@ -45,15 +45,22 @@ def in_parallel(function: Callable[[int, int], None], n: int, *, grain: int) -> 
     """
     n_ranges = max(min(n, 1), round(n / grain))
     ranges = [(n * i // n_ranges, n * (i + 1) // n_ranges) for i in range(n_ranges)]
+    waiting, failed = iter(enumerate(ranges)), dict[int, Exception]()
+
+    def drain() -> None:
+        for i, (begin, end) in waiting:  # drawn under the interpreter's lock: each range once
+            try:
+                function(begin, end)
+            except Exception as error:  # noqa: PERF203  a range is worth far more than a try
+                failed[i] = error  # raised below, in the caller's thread
+
+    # The caller works too: to wake one thread less is a good part of a small range's time.
     workers = n_workers()
-    if len(ranges) <= 1 or workers == 1:
-        for begin, end in ranges:
-            function(begin, end)
-        return
-    futures = [_pool(workers).submit(function, begin, end) for begin, end in ranges]
-    for error in [future.exception() for future in futures]:
-        if error is not None:
-            raise error
+    others = [_pool(workers).submit(drain) for _ in range(min(workers, len(ranges)) - 1)]
+    drain()
+    wait(others)
+    if failed:
+        raise failed[min(failed)]
 
 
 def ordered(function: Callable[[T], R], items: Iterable[T], *, ahead: int) -> Iterator[R]:
@@ -84,7 +91,8 @@ def blas_on_one_thread() -> AbstractContextManager[object]:
     Matrices here have a few hundred rows. On these, BLAS threads cost more by waiting for each other than
     they gain, and with both cores in use they took twice the time of one.
     """
-    return _blas().limit(limits=1, user_api="blas")
+    limited: AbstractContextManager[object] = _blas().limit(limits=1, user_api="blas")
+    return limited
 
 
 @cache

@@ -12,7 +12,9 @@ from pathlib import Path
 
 from pancam_graph import SolveOptions, find_observations, read_input, solve
 from pancam_graph.io import check_out
+from pancam_graph.kernel import must_compile
 from pancam_graph.program import Parser, Progress, print_summary, run, show_log
+from pancam_graph.solve import COMPILING
 
 
 def main() -> int:
@@ -51,6 +53,8 @@ def main() -> int:
         if traverse.observations is None:
             traverse = find_observations(traverse, progress=progress.images)
         read_s = time.perf_counter() - begin
+        if must_compile():
+            progress.say(COMPILING)
         options = SolveOptions(model=arguments.model, landmarks=arguments.landmarks, loss=arguments.loss)
         solution = solve(traverse, options, on_iteration=progress.iteration).with_seconds(read=read_s)
         progress.say("writing the results")

@@ -9,7 +9,7 @@ import pytest
 from landmark_scenes import measure, random_points, random_views, unit, views_at
 from scipy.spatial.transform import Rotation
 
-from pancam_graph import _landmark_loops as loops
+from pancam_graph import kernel
 from pancam_graph._rejection import Screening, screen
 from pancam_graph.geometry import FloatArray
 from pancam_graph.landmarks import (
@@ -32,7 +32,7 @@ from pancam_graph.losses import Loss, LossName, loss_of
 def eigen(a: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Eigenvalues in ascending order, and eigenvectors."""
     a, turn = a.copy(), np.empty_like(a)
-    loops.eigen(a, turn)
+    kernel.eigen(a, turn)
     order = np.argsort(np.diag(a))
     return np.diag(a)[order], turn[:, order]
 
@@ -408,7 +408,14 @@ def test_loops_are_compiled_once_whatever_arrays_come() -> None:
     second = everything(read_only, strange, loss_of("huber", 1e9))
     for one, two in zip(first, second, strict=True):
         assert np.array_equal(one, two)
-    compiled = [loops.triangulate, loops.evaluate, loops.refine, loops.cofactors, loops.tests, loops.reject]
+    compiled = [
+        kernel.triangulate,
+        kernel.evaluate,
+        kernel.refine,
+        kernel.cofactors,
+        kernel.tests,
+        kernel.reject,
+    ]
     assert [len(loop.signatures) for loop in compiled] == [1] * len(compiled)
 
 

@@ -31,7 +31,7 @@ _PARTS = 8
 """A chunk has at most this share of all observations, so that two cores, or eight, have even work."""
 _STRAY = 0.5 * 5.0**2
 """A landmark with this cost per observation, as if all were 5 sigma off, is placed anew after a step."""
-_SMALLEST_CHUNK = 2000
+_SMALLEST_CHUNK = 4000
 """Observations of a chunk that is worth its overhead."""
 
 
@@ -307,6 +307,11 @@ class LandmarkSystem:
     def adopt(self) -> None:
         """Take the landmarks of the last step tried as the next point of linearisation."""
         self.vector, self._moved = self._moved, self.vector
+
+    @property
+    def any_behind(self) -> bool:
+        """Whether an observation's landmark was behind its camera where the last step led."""
+        return bool(self._moved_cost.max() >= kernel.BEHIND_COST)
 
     def block_costs(self) -> FloatArray:
         """Costs (blocks,) at the last linearisation."""

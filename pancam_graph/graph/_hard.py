@@ -109,7 +109,7 @@ class HardTemplate(FactorTemplate):
         return self.views_of(*compose(head[0][image], head[1][image], mounts[0][eye], mounts[1][eye]))
 
     def _angles(self, values: gtsam.Values) -> FloatArray:
-        angles = self.traverse.pan_tilt_rad.copy()
+        angles: FloatArray = self.traverse.pan_tilt_rad.copy()
         for stop, frames in enumerate(self._frames):
             if len(frames):
                 angles[frames] = values.atVector(self.angles_key(stop)).reshape(-1, 2)
