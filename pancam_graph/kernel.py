@@ -62,7 +62,9 @@ def compiled(function: _F) -> _F:
 
 def must_compile() -> bool:
     """Whether the elimination is not on disk yet, as compiled from this file: the first run takes longer."""
-    stats: Any = getattr(eliminate_poses, "stats")  # noqa: B009  of numba's, unknown to the type checker
+    stats: Any = getattr(eliminate_poses, "stats", None)
+    if stats is None:  # compilation is switched off (NUMBA_DISABLE_JIT)
+        return False
     source = Path(__file__).stat().st_mtime
     stored = Path(stats.cache_path).glob("kernel._eliminating*.nbi")
     return not any(index.stat().st_mtime >= source for index in stored)
