@@ -324,8 +324,12 @@ class Adjustment:
     def _uncertainty(self) -> Uncertainty:
         """Covariances; NaN and a warning where a direction is free. Warns of landmarks without a place."""
         t, wanted = self.traverse, self.options.landmark_covariances
+        problem = self.problem
+        if self.options.firm_tie == "hard" and isinstance(problem.template, SoftTemplate):
+            # The inverse of a system with a tie of 1e-8 would have lost half its digits.
+            problem = problem.on(HardTemplate(t))
         try:
-            found = uncertainty(self.problem, self.final, *self.solver.system(self.problem), landmarks=wanted)
+            found = uncertainty(problem, self.final, *self.solver.system(problem), landmarks=wanted)
         except SolveError as error:
             self.warnings.append(f"no uncertainties: {error}")
             n = len(self.landmark_track)

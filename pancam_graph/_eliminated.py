@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import gtsam
-import numpy as np
 
 from pancam_graph._optimise import InOrder, Iteration, Outcome, StopRule, optimise
 from pancam_graph._problem import Problem, Solver, system_of
@@ -54,14 +53,11 @@ class EliminatedSolver(Solver):
 
         A step from afar bends a firm tie by more than its sigma: a straight step of poses leaves the circle.
         """
-        no_landmarks = np.zeros((0, 3))
-        rigid = HardTemplate(problem.template.traverse)
-        values = rigid.values(problem.template.state(problem.values, no_landmarks))
-        start = replace(problem, template=rigid, factors=rigid.factors(), values=values)
         rule = StopRule(max_iterations=20, relative_decrease=1e-4)
-        found, outcome = self._minimise(start, rule, loss, stage)
-        values = problem.template.values(rigid.state(found.values, no_landmarks))
-        return problem.at(values, found.landmarks), outcome
+        found, outcome = self._minimise(
+            problem.on(HardTemplate(problem.template.traverse)), rule, loss, stage
+        )
+        return found.on(problem.template), outcome
 
     def _minimise(self, problem: Problem, rule: StopRule, loss: Loss, stage: str) -> tuple[Problem, Outcome]:
         template = problem.template

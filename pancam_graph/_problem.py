@@ -70,6 +70,11 @@ class Problem:
         best = refine(self.landmarks, self.measurements, self.views, weight, loss, beyond_infinity=True)
         return replace(self, landmarks=best)
 
+    def on(self, template: FactorTemplate) -> "Problem":
+        """The same with other variables, cameras as near to where they are as these allow."""
+        values = template.values(self.template.state(self.values, np.zeros((0, 3))))
+        return replace(self, template=template, factors=template.factors(), values=values)
+
     def at(self, values: gtsam.Values, landmarks: Landmarks) -> "Problem":
         """The same elsewhere."""
         return replace(self, values=values, landmarks=landmarks)

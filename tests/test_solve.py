@@ -122,7 +122,9 @@ def test_covariances_agree_with_gtsam_marginals() -> None:
     assert t.observations is not None
     distance = np.linalg.norm(simulation.truth.landmarks_m, axis=1)
     near = t.with_observations(t.observations.select((distance < 20.0)[t.observations.track]))
-    adjustment = Adjustment(near, SolveOptions(loss="none", landmarks="explicit"), None, None)
+    flex = Flex(rotation_rad=1e-7, translation_m=1e-6)
+    options = SolveOptions(loss="none", landmarks="explicit", tie="soft", flex=flex)
+    adjustment = Adjustment(near, options, None, None)
     adjustment.solve()
     solution = adjustment.solution()
     problem = adjustment.problem

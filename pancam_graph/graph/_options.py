@@ -32,8 +32,8 @@ class Flex:
                 raise InputError(f"flex: {name}: expected a number above 0, found {value}")
 
 
-RIGID = Flex(rotation_rad=1e-7, translation_m=1e-6)
-"""A hundredth of what the images of a panorama can tell: the optimum is that of a rigid mast."""
+RIGID = Flex(rotation_rad=1e-8, translation_m=1e-7)
+"""Far below what images can tell: the optimum is that of a rigid mast to 1e-8 of its cost."""
 
 DEFAULT_FLEX: dict[Model, Flex] = {
     # A tenth of a pixel of a rover's Navcam, and the millimetre to which mounts are known.
