@@ -7,8 +7,10 @@ import numpy as np
 from scipy.sparse import coo_array, csc_array
 
 from pancam_graph._problem import Problem
-from pancam_graph.elimination import LandmarkSystem, Linkage, Panels
+from pancam_graph.elimination import FreeDirectionError, LandmarkSystem, Linkage, Panels
+from pancam_graph.errors import SolveError
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.graph import FactorTemplate
 from pancam_graph.solution import State
 
 __all__ = ["Uncertainty", "uncertainty"]
@@ -37,10 +39,14 @@ def uncertainty(
     """
     template, m = problem.template, problem.measurements
     panels = system.linearise(template.posture(problem.values))
-    _add(panels, template.linkage, problem.factors.linearize(problem.values))
+    if template.linkage.key:
+        _add(panels, template.linkage, problem.factors.linearize(problem.values))
     held = _columns(template.linkage, template.held_columns())
     panels.hold(held)
-    covariance = panels.root().covariance()
+    try:
+        covariance = panels.root().covariance()
+    except FreeDirectionError as error:
+        raise SolveError(f"nothing holds {_name(template, error)}") from error
     covariance.release(held)
     undetermined = np.zeros(m.n_landmarks, dtype=bool)
     undetermined[rows] = system.undetermined
@@ -81,3 +87,19 @@ def _columns(linkage: Linkage, held: dict[int, IntArray]) -> dict[int, IntArray]
             columns = linkage.columns_of(key).start + components
             out[g] = np.concatenate([out.get(g, np.zeros(0, dtype=np.int64)), columns])
     return out
+
+
+def _name(template: FactorTemplate, free: FreeDirectionError) -> str:
+    """What a column of a group is, for a user."""
+    t, link = template.traverse, template.linkage
+    for key in link.key:
+        columns = link.columns_of(key)
+        if link.group[link.row[key]] != free.group or not columns.start <= free.column < columns.stop:
+            continue
+        component, kind = free.column - columns.start, chr(gtsam.symbolChr(key))
+        if kind in "MX":
+            what = ("rotation about x", "rotation about y", "rotation about z", "x", "y", "z")[component]
+            entries = t.stops if kind == "M" else t.images
+            return f"the {what} of {entries[gtsam.symbolIndex(key)].id}, with what moves along"
+        return f"pan or tilt at {t.stops[free.group].id}" if kind == "A" else "the radius of a circle"
+    return "a direction of the solution"

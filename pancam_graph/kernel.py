@@ -215,7 +215,7 @@ class Reduced(NamedTuple):
 WEAK_PRIOR = 1e-12
 """Weak prior of a landmark: its information, over the trace of what the landmark's observations know."""
 _UNDETERMINED = 1e-9
-"""A pivot below this share of the trace is called undetermined."""
+"""A direction with a pivot below this share of the trace is called undetermined, and gets the weak prior."""
 BEHIND_COST = 0.5 * 1000.0**2
 """What an observation of a landmark behind its camera costs: as much as one that is 1000 sigma off. It pulls
 nowhere, so that one bad match holds back nobody; the solver sets aside and counts what ends there."""
@@ -434,15 +434,16 @@ def _eliminating(rows: int) -> Callable[..., None]:
                         arms[1, first + q] += a1
                         arms[2, first + q] += a2
             trace = v00 + v11 + v22
-            prior = WEAK_PRIOR * trace + 1e-300
-            l00 = np.sqrt(v00 + prior)
+            # The weak prior goes to pivots that need it: on all landmarks together it would hold the world.
+            floor, prior = _UNDETERMINED * trace, WEAK_PRIOR * trace + 1e-300
+            l00 = np.sqrt(v00 if v00 > floor else v00 + prior)
             l10, l20 = v10 / l00, v20 / l00
-            p1 = max(v11 + prior - l10 * l10, prior)
-            l11 = np.sqrt(p1)
+            p1 = max(v11 - l10 * l10, 0.0)
+            l11 = np.sqrt(p1 if p1 > floor else p1 + prior)
             l21 = (v21 - l20 * l10) / l11
-            p2 = max(v22 + prior - l20 * l20 - l21 * l21, prior)
-            l22 = np.sqrt(p2)
-            reduced.undetermined[j] = min(v00, p1, p2) < _UNDETERMINED * trace
+            p2 = max(v22 - l20 * l20 - l21 * l21, 0.0)
+            l22 = np.sqrt(p2 if p2 > floor else p2 + prior)
+            reduced.undetermined[j] = min(v00, p1, p2) <= floor
             factor = reduced.factor[j]
             factor[0], factor[1], factor[2], factor[3], factor[4], factor[5] = l00, l10, l11, l20, l21, l22
             y0 = g0 / l00
@@ -466,7 +467,7 @@ eliminate_poses = _eliminating(6)
 
 Exact Schur complement of the whitened, robustly weighted system: S = A'A - sum E V^-1 E' and
 s = A'r - sum E V^-1 g with E = A'B, V = B'B, g = B'r for the cameras' Jacobian A and each landmark's B.
-V gets the weak prior and no damping."""
+V gets the weak prior where it needs one, and no damping."""
 eliminate_calibrations = _eliminating(11)
 """The same for chains with calibrations."""
 

@@ -3,6 +3,7 @@
 from pancam_graph.elimination._linkage import Linkage as Linkage
 from pancam_graph.elimination._linkage import Posture as Posture
 from pancam_graph.elimination._panels import Covariance as Covariance
+from pancam_graph.elimination._panels import FreeDirectionError as FreeDirectionError
 from pancam_graph.elimination._panels import Panels as Panels
 from pancam_graph.elimination._panels import Root as Root
 from pancam_graph.elimination._panels import pattern as pattern

@@ -9,10 +9,10 @@ from scipy.linalg import blas, lapack
 from pancam_graph.errors import SolveError
 from pancam_graph.geometry import FloatArray, IntArray
 
-__all__ = ["Covariance", "Panels", "Pattern", "Root", "pattern"]
+__all__ = ["Covariance", "FreeDirectionError", "Panels", "Pattern", "Root", "pattern"]
 
-_RANK_TOLERANCE = 1e-13
-"""A pivot of the system scaled to a unit diagonal that is below this is taken for zero."""
+_RANK_TOLERANCE = 1e-12
+"""A pivot is zero where no more than this is left of what was summed."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -56,6 +56,14 @@ def pattern(dim: IntArray, cliques: Iterable[Iterable[int]]) -> Pattern:
     after = tuple((g, *sorted(reach[g], key=lambda h: int(position[h]))) for g in range(n))
     begin = tuple(np.concatenate([[0], np.cumsum(dim[list(a)])]) for a in after)
     return Pattern(dim=dim, order=tuple(order), after=after, begin=begin)
+
+
+class FreeDirectionError(SolveError):
+    """A direction that nothing holds; `group` and `column` have most of it."""
+
+    def __init__(self, group: int, column: int) -> None:
+        super().__init__("nothing holds a direction of the solution")
+        self.group, self.column = group, column
 
 
 class Panels:
@@ -127,8 +135,10 @@ class Panels:
         """
         st = self.structure
         rows: list[FloatArray] = [np.zeros((0, 0))] * len(st.dim)
+        # What is left of a diagonal that was summed up tells rounding from information.
+        summed = [np.diag(panel).copy() for panel in self.panel]
         for g in st.order:
-            rows[g] = _root_of_panel(self.panel[g], int(st.dim[g]))
+            rows[g] = _root_of_panel(self.panel[g], summed[g])
             self._pass_on(g, rows[g])
         return Root(structure=st, rows=tuple(rows))
 
@@ -155,17 +165,17 @@ class Panels:
                 j = k
 
 
-def _root_of_panel(panel: FloatArray, n: int) -> FloatArray:
+def _root_of_panel(panel: FloatArray, summed: FloatArray) -> FloatArray:
     """Rows (rank, columns) of the square root of a panel whose own block comes first.
 
-    Pivoted Cholesky P'S P = U'U of the block scaled to a unit diagonal: radians and metres differ by much.
+    Pivoted Cholesky P'S P = U'U of the block, scaled by the diagonal (n,) as it was before other groups were
+    eliminated: radians and metres differ by much, and a pivot tiny beside what was summed is rounding.
     """
-    diagonal = np.diag(panel)
-    unit = np.sqrt(np.maximum(diagonal, 0.0))
+    n, unit = len(summed), np.sqrt(np.maximum(summed, 0.0))
     scale = np.where(unit > 0, 1 / np.maximum(unit, 1e-150), 0.0)
-    upper, pivot, rank, _ = lapack.dpstrf(panel[:, :n] * scale[:, None] * scale, tol=_RANK_TOLERANCE)
-    if not np.all(np.isfinite(upper[:rank, :rank])):
+    if not np.all(np.isfinite(panel)):
         raise SolveError("the linearised system is not finite: a camera or a landmark has left the domain")
+    upper, pivot, rank, _ = lapack.dpstrf(panel[:, :n] * scale[:, None] * scale, tol=_RANK_TOLERANCE)
     pivot -= 1  # LAPACK counts from 1
     rows = np.zeros((rank, panel.shape[1]))
     if rank > 0:
@@ -187,14 +197,14 @@ class Root:
     def covariance(self) -> "Covariance":
         """The blocks of the inverse of R'R where R is filled (Takahashi's recursion).
 
-        Raises SolveError where R leaves a direction free.
+        Raises FreeDirectionError where R leaves a direction free.
         """
         st = self.structure
         blocks: dict[tuple[int, int], FloatArray] = {}
         for g in reversed(st.order):
             n, rows = int(st.dim[g]), self.rows[g]
             if len(rows) < n:
-                raise SolveError("covariances: nothing holds a direction of the solution")
+                raise FreeDirectionError(g, _loosest(rows[:, :n]))
             half = np.linalg.inv(rows[:, :n])
             blocks[g, g] = half @ half.T
             rest = st.after[g][1:]
@@ -207,6 +217,15 @@ class Root:
             for h, first, last in zip(rest, st.begin[g][1:-1] - n, st.begin[g][2:] - n, strict=True):
                 blocks[g, h] = across[:, first:last]
         return Covariance(blocks)
+
+
+def _loosest(rows: FloatArray) -> int:
+    """The column that has most of the directions which rows (rank, n), rank below n, leave free."""
+    unit = np.sqrt(np.sum(rows**2, axis=0))
+    scaled = rows / np.where(unit > 0, unit, 1.0)
+    _, _, turn = np.linalg.svd(scaled, full_matrices=True)
+    free: FloatArray = turn[len(rows) :]
+    return int(np.argmax(np.sum(free**2, axis=0)))
 
 
 def _block(blocks: dict[tuple[int, int], FloatArray], g: int, h: int) -> FloatArray:
