@@ -103,12 +103,7 @@ def solved(model: str) -> tuple[Problem, Solution, gtsam.Marginals]:
     return problem, adjustment.solution(), gtsam.Marginals(graph, values)
 
 
-LOOSENED = pytest.mark.xfail(
-    strict=True, reason="the weak prior of every landmark counts as knowledge: kernel.WEAK_PRIOR"
-)
-
-
-@pytest.mark.parametrize("model", ["mast", "circle", pytest.param("free", marks=LOOSENED)])
+@pytest.mark.parametrize("model", ["mast", "circle", "free"])
 def test_covariance_of_a_stop_is_gtsams(model: str) -> None:
     _, solution, marginals = solved(model)
     assert not solution.stop_covariance[0].any()
@@ -157,7 +152,7 @@ def test_covariance_of_a_landmark_is_gtsams(model: str) -> None:
         assert found == pytest.approx(expected, rel=1e-4, abs=2e-5 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("sigma_m", [1.0, pytest.param(100.0, marks=LOOSENED)])
+@pytest.mark.parametrize("sigma_m", [1.0, 100.0])
 def test_what_telemetry_alone_holds_is_no_surer_than_telemetry(sigma_m: float) -> None:
     """Where two stops stand together no image tells: half the variance of either one."""
     t = small().traverse
@@ -385,9 +380,6 @@ def test_rays_from_one_centre_tell_pointing_and_a_warning_names_their_tracks(los
     assert np.all(solution.angle_sigma_rad < 1.3e-3)  # of telemetry: 1.34e-3
 
 
-@pytest.mark.xfail(
-    strict=True, raises=ValueError, reason="_covariance._add concatenates nothing where there is no variable"
-)
 @pytest.mark.parametrize("loss", ["none", "huber"])
 def test_where_telemetry_holds_everything_landmarks_are_placed(loss: LossName) -> None:
     held = replace(SMALL, sigma_stop_m=0.0, sigma_stop_rad=0.0, pointing_scale=0.0)

@@ -175,8 +175,11 @@ def _root_of_panel(panel: FloatArray, summed: FloatArray) -> FloatArray:
     scale = np.where(unit > 0, 1 / np.maximum(unit, 1e-150), 0.0)
     if not np.all(np.isfinite(panel)):
         raise SolveError("the linearised system is not finite: a camera or a landmark has left the domain")
-    upper, pivot, rank, _ = lapack.dpstrf(panel[:, :n] * scale[:, None] * scale, tol=_RANK_TOLERANCE)
-    pivot -= 1  # LAPACK counts from 1
+    own = panel[:, :n] * scale[:, None] * scale
+    upper, pivot, rank, _ = lapack.dpstrf(own, tol=_RANK_TOLERANCE)
+    pivot -= 1  # LAPACK counts from 1, and takes the first pivot whatever it is
+    if np.max(np.diag(own), initial=0.0) <= _RANK_TOLERANCE:
+        rank = 0
     rows = np.zeros((rank, panel.shape[1]))
     if rank > 0:
         upper = np.triu(upper)[:rank]
