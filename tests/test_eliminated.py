@@ -108,7 +108,7 @@ def test_covariance_of_a_stop_is_gtsams(model: str) -> None:
     _, solution, marginals = solved(model)
     assert not solution.stop_covariance[0].any()
     expected = marginals.marginalCovariance(gtsam.symbol("M", 1))
-    assert solution.stop_covariance[1] == pytest.approx(expected, rel=1e-6, abs=1e-6 * np.abs(expected).max())
+    assert solution.stop_covariance[1] == pytest.approx(expected, rel=1e-6, abs=1e-8 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -139,7 +139,9 @@ def test_sigmas_of_pan_and_tilt_are_gtsams(model: str) -> None:
         covariance = np.block([[joint.at(a, b) for b in keys] for a in keys])
         jacobian = np.array(columns).T
         sigma = np.sqrt(np.diag(jacobian @ covariance @ jacobian.T))
-        assert solution.angle_sigma_rad[frame] == pytest.approx(sigma, rel=1e-5)
+        assert solution.angle_sigma_rad[frame] == pytest.approx(
+            sigma, rel=1e-5
+        )  # a twist of mrad is left out
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -149,7 +151,7 @@ def test_covariance_of_a_landmark_is_gtsams(model: str) -> None:
     for j in range(0, len(solution.landmark_track), 7):
         expected = marginals.marginalCovariance(gtsam.symbol("L", j))
         found = solution.landmark_covariance_m2[j]
-        assert found == pytest.approx(expected, rel=1e-4, abs=2e-5 * np.abs(expected).max())
+        assert found == pytest.approx(expected, rel=1e-6, abs=1e-8 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("sigma_m", [1.0, 100.0])

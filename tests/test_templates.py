@@ -1,0 +1,227 @@
+"""Rigs as factor templates: chain matrices by differences, what is held, values and states."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from pancam_graph import Frame, Image, Stop, Traverse
+from pancam_graph.elimination import Covariance
+from pancam_graph.factors import Fixed, Key
+from pancam_graph.geometry import FloatArray
+from pancam_graph.graph import DEFAULT_FLEX, FactorTemplate, HardTemplate, SoftTemplate, read_variable
+from pancam_graph.rigs import Rig, exomars_pancam, mer_navcam
+from pancam_graph.solution import State
+
+PAN_T_TILT = gtsam.Pose3(gtsam.Rot3.Rodrigues(0.2, -0.1, 0.3), np.array([0.03, -0.02, 0.05]))
+
+
+def bent() -> Rig:
+    """A tilt axis that stands askew and off the pan axis."""
+    return replace(exomars_pancam(), pan_T_tilt=PAN_T_TILT)
+
+
+def traverse_of(rig: Rig, stop_sigmas: list[tuple[float, float]], angle_sigmas: list[float]) -> Traverse:
+    """Stops of two frames each; frames are listed in turns of the stops, so that no order is natural."""
+    rng = np.random.default_rng(0)
+    stops = tuple(
+        Stop(
+            id=f"s{i}",
+            world_T_mast=gtsam.Pose3(gtsam.Rot3.Expmap(rng.normal(0, 0.5, 3)), rng.normal(0, 5, 3)),
+            sigma_rotation_rad=rotation,
+            sigma_translation_m=translation,
+        )
+        for i, (rotation, translation) in enumerate(stop_sigmas)
+    )
+    n = len(stops)
+    frames = tuple(
+        Frame(
+            id=f"f{i}",
+            stop=f"s{i % n}",
+            pan_rad=float(rng.uniform(-2, 2)),
+            tilt_rad=float(rng.uniform(-0.6, 0.6)),
+            sigma_pan_rad=angle_sigmas[2 * i],
+            sigma_tilt_rad=angle_sigmas[2 * i + 1],
+        )
+        for i in range(2 * n)
+    )
+    images = tuple(Image(id=f"{f.id}{e.name}", frame=f.id, camera=e.name) for e in rig.eyes for f in frames)
+    return Traverse(name="t", rig=rig, stops=stops, frames=frames, images=images)
+
+
+FREE = [1e-3] * 8
+TRAVERSES: dict[str, Callable[[], Traverse]] = {
+    "all free": lambda: traverse_of(bent(), [(0.01, 0.1), (0.01, 0.1)], FREE),
+    "a stop held": lambda: traverse_of(bent(), [(0.0, 0.0), (0.01, 0.1)], FREE),
+    "a stop's rotation held": lambda: traverse_of(bent(), [(0.0, 0.1), (0.01, 0.1)], FREE),
+    "frames held": lambda: traverse_of(bent(), [(0.01, 0.1)] * 2, [0, 0, 1e-3, 1e-3, 1e-3, 0, 1e-3, 1e-3]),
+    "all frames of a stop held": lambda: traverse_of(bent(), [(0.01, 0.1)] * 2, [0, 0, 1e-3, 1e-3] * 2),
+    "a stop held with its frames": lambda: traverse_of(bent(), [(0, 0), (0.01, 0.1)], [0, 0, 1e-3, 1e-3] * 2),
+    "a tilt held": lambda: traverse_of(mer_navcam(), [(0.01, 0.1)] * 2, [1e-3, 0, *[1e-3] * 6]),
+}
+
+
+def state_of(t: Traverse, seed: int = 1) -> State:
+    """Near telemetry, what telemetry holds as it is; cameras on the chain."""
+    rng = np.random.default_rng(seed)
+    masts = tuple(
+        s.world_T_mast.retract(
+            np.repeat([s.sigma_rotation_rad, s.sigma_translation_m], 3) * rng.normal(size=6)
+        )
+        for s in t.stops
+    )
+    sigmas = np.array([[f.sigma_pan_rad, f.sigma_tilt_rad] for f in t.frames])
+    angles = t.pan_tilt_rad + sigmas * rng.normal(size=sigmas.shape)
+    rotations, centres = t.camera_poses(masts, angles)
+    return State(
+        world_T_mast=masts,
+        pan_tilt_rad=angles,
+        world_R_camera=rotations,
+        world_t_camera=centres,
+        landmarks_m=np.zeros((0, 3)),
+    )
+
+
+def templates(t: Traverse) -> dict[str, FactorTemplate]:
+    soft = {m: SoftTemplate(t, m, DEFAULT_FLEX[m]) for m in ("mast", "circle", "free")}  # type: ignore[arg-type,index]  # literals
+    return {"hard": HardTemplate(t), **soft}
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [*((name, "hard") for name in TRAVERSES), ("all free", "mast"), ("a stop held", "circle")],
+)
+def test_chains_move_cameras_as_values_do(name: str, kind: str) -> None:
+    """A unit's twist moves all its cameras as one body: world_R (w x (c - base) + v), by differences."""
+    t = TRAVERSES[name]()
+    template = templates(t)[kind]
+    link, values = template.linkage, template.values(state_of(t))
+    posture = template.posture(values)
+    h = 1e-6
+    for key, dim in zip(link.key, link.dim, strict=True):
+        for k in range(int(dim)):
+            views = []
+            for sign in (1, -1):
+                step = gtsam.VectorValues()
+                step.insert(key, sign * h * np.eye(int(dim))[k])
+                views.append(template.views(values.retract(step)))
+            velocity = (views[0].world_t_camera - views[1].world_t_camera) / (2 * h)
+            turning = (views[0].world_R_camera - views[1].world_R_camera) / (2 * h)
+            twist = np.zeros((len(link.segment_begin) - 1, 6))
+            for unit in range(len(twist)):
+                for s in range(link.segment_begin[unit], link.segment_begin[unit + 1]):
+                    column = k - link.segment_column[s]
+                    if link.segment_variable[s] == link.row[key] and 0 <= column < link.segment_width[s]:
+                        twist[unit] += posture.chain[s][:, column]
+            for image, unit in enumerate(link.image_unit):
+                R, base = posture.unit_R[unit], posture.unit_t[unit]
+                w, v = R @ twist[unit, :3], R @ twist[unit, 3:]
+                centre = posture.views.world_t_camera[image]
+                assert velocity[image] == pytest.approx(v + np.cross(w, centre - base), abs=2e-8)
+                spin = np.cross(w, posture.views.world_R_camera[image], axisb=0, axisc=0)
+                assert turning[image] == pytest.approx(spin, abs=2e-8)
+
+
+@pytest.mark.parametrize("name", TRAVERSES)
+def test_hard_cameras_stand_where_the_rig_says(name: str) -> None:
+    t = TRAVERSES[name]()
+    template, state = HardTemplate(t), state_of(t)
+    views = template.posture(template.values(state)).views
+    assert views.world_R_camera == pytest.approx(state.world_R_camera, abs=1e-14)
+    assert views.world_t_camera == pytest.approx(state.world_t_camera, abs=1e-13)
+    for i in range(len(t.images)):
+        k = t.rig.pinholes[t.image_eye[i]].calibration_matrix
+        assert np.array_equal(views.calibration[i], k)
+
+
+@pytest.mark.parametrize("kind", ["hard", "mast", "circle", "free"])
+@pytest.mark.parametrize("name", TRAVERSES)
+def test_values_and_states_are_each_others_inverse(name: str, kind: str) -> None:
+    t = TRAVERSES[name]()
+    template, state = templates(t)[kind], state_of(t)
+    values = template.values(state)
+    back = template.state(values, state.landmarks_m)
+    for found, given in zip(back.world_T_mast, state.world_T_mast, strict=True):
+        assert found.matrix() == pytest.approx(given.matrix(), abs=1e-14)
+    assert back.pan_tilt_rad == pytest.approx(state.pan_tilt_rad, abs=1e-12)
+    assert back.world_R_camera == pytest.approx(state.world_R_camera, abs=1e-13)
+    assert back.world_t_camera == pytest.approx(state.world_t_camera, abs=1e-13)
+    again = template.values(back)
+    assert set(again.keys()) == set(values.keys()) == set(template.linkage.key)
+    for key in template.linkage.key:
+        a, b = read_variable(values, key), read_variable(again, key)
+        same = a.equals(b, 1e-12) if isinstance(a, gtsam.Pose3) else np.allclose(a, b, atol=1e-12)
+        assert same
+
+
+@pytest.mark.parametrize("kind", ["hard", "mast", "circle", "free"])
+@pytest.mark.parametrize("name", TRAVERSES)
+def test_what_is_held_is_no_variable_or_a_held_column(name: str, kind: str) -> None:
+    t = TRAVERSES[name]()
+    template = templates(t)[kind]
+    link, held = template.linkage, template.held_columns()
+    for i, stop in enumerate(t.stops):
+        sigmas = np.repeat([stop.sigma_rotation_rad, stop.sigma_translation_m], 3)
+        key = gtsam.symbol("M", i)
+        assert (key in link.row) == bool(sigmas.any())
+        assert isinstance(template.mast(i), Key if sigmas.any() else Fixed)
+        if key in link.row:
+            assert held[key].tolist() == np.flatnonzero(sigmas == 0).tolist()
+    sigmas = np.array([[f.sigma_pan_rad, f.sigma_tilt_rad] for f in t.frames])
+    n_angles = sum(int(d) for k, d in zip(link.key, link.dim, strict=True) if chr(gtsam.symbolChr(k)) == "A")
+    n_held = sum(len(columns) for k, columns in held.items() if chr(gtsam.symbolChr(k)) == "A")
+    assert n_angles == 2 * np.sum(sigmas.any(axis=1))
+    assert n_angles - n_held == np.count_nonzero(sigmas)
+
+
+@pytest.mark.parametrize("kind", ["hard", "mast"])
+@pytest.mark.parametrize("name", TRAVERSES)
+def test_factors_cost_what_telemetry_says(name: str, kind: str) -> None:
+    """On the chain the ties cost nothing; the priors of masts and angles are left, whatever the tie."""
+    t = TRAVERSES[name]()
+    template, state = templates(t)[kind], state_of(t)
+    expected = 0.0
+    for stop, found in zip(t.stops, state.world_T_mast, strict=True):
+        sigma = np.repeat([stop.sigma_rotation_rad, stop.sigma_translation_m], 3)
+        off = stop.world_T_mast.localCoordinates(found)
+        expected += 0.5 * float(np.sum((off[sigma > 0] / sigma[sigma > 0]) ** 2))
+    sigmas = np.array([[f.sigma_pan_rad, f.sigma_tilt_rad] for f in t.frames])
+    off = state.pan_tilt_rad - t.pan_tilt_rad
+    expected += 0.5 * float(np.sum((off[sigmas > 0] / sigmas[sigmas > 0]) ** 2))
+    assert template.factors().error(template.values(state)) == pytest.approx(expected, rel=1e-6)
+
+
+class Known(Covariance):
+    """Covariances that tell their group and place."""
+
+    def __init__(self, dims: FloatArray) -> None:
+        self.dims = dims
+
+    def block(self, g: int, h: int) -> FloatArray:
+        return np.diag(100.0 * (g + 1) + np.arange(int(self.dims[g]))) if g == h else np.zeros(0)
+
+
+@pytest.mark.parametrize("name", TRAVERSES)
+def test_sigmas_are_handed_to_their_own_frames_and_stops(name: str) -> None:
+    """Frames of a stop do not follow each other, and held ones have no columns."""
+    t = TRAVERSES[name]()
+    template = HardTemplate(t)
+    link, state = template.linkage, state_of(t)
+    covariance = Known(link.group_dim)
+    stops, angles = template.stop_covariance(covariance), template.angle_sigma_rad(covariance, state)
+    for i in range(len(t.stops)):
+        key = gtsam.symbol("M", i)
+        begin = link.columns_of(key).start if key in link.row else None
+        expected = np.zeros(6) if begin is None else 100.0 * (i + 1) + begin + np.arange(6)
+        assert np.array_equal(stops[i], np.diag(expected))
+        place = 0
+        for f in np.flatnonzero(t.frame_stop == i):
+            frame = t.frames[f]
+            if frame.sigma_pan_rad == 0 and frame.sigma_tilt_rad == 0:
+                assert not angles[f].any()
+                continue
+            first = link.columns_of(HardTemplate.angles_key(i)).start + 2 * place
+            assert angles[f] == pytest.approx(np.sqrt(100.0 * (i + 1) + first + np.arange(2)))
+            place += 1
