@@ -363,6 +363,12 @@ class Adjustment:
         behind = int(np.sum(self.reason == "behind"))
         if behind:
             warnings.append(f"{behind} observations of landmarks behind a camera: left out")
+        diverging = [str(track) for track in self.landmark_track[_diverging(self.problem)]]
+        if diverging:
+            warnings.append(
+                f"{listed(diverging, 'track')}: rays diverge by more than noise, as wrong matches do; "
+                "kept, as points beyond infinity"
+            )
         share = 1 - used.sum() / len(used)
         if self.options.loss != "none" and share > 0.3:
             warnings.append(
@@ -401,3 +407,17 @@ def _state(problem: Problem) -> State:
     """What a solution says of a problem; points that take no part are NaN."""
     points = np.where(problem.present[:, None], problem.points_m(), np.nan)
     return problem.template.state(problem.values, points)
+
+
+def _diverging(problem: Problem) -> BoolArray:
+    """Landmarks (landmarks,) that would fit worse by 3 sigma if they were no further than infinity."""
+    beyond = problem.present & (problem.landmarks.vector[:, 3] < 0)
+    if beyond.any():
+        m, rows = problem.measurements, np.flatnonzero(beyond)
+        weight = problem.accepted.astype(float)
+        bound = replace(
+            problem, landmarks=refine(problem.landmarks, m, problem.views, weight, only=rows)
+        ).residuals()[0]
+        excess = weight * np.sum(bound**2 - problem.residuals()[0] ** 2, axis=1)
+        beyond &= np.bincount(m.landmark, excess, minlength=m.n_landmarks) > 9.0
+    return beyond
