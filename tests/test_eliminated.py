@@ -321,6 +321,9 @@ def test_a_pair_whose_rays_diverge_goes_and_harms_nobody() -> None:
     assert {solution.reason[i] for i in np.flatnonzero(spoilt)} <= {"outlier", "behind"}
     assert solution.used[~spoilt].tolist() == without.used.tolist()
     assert moved(solution, without) < 1e-6
+    kept = solve(traverse.with_observations(replace(obs, uv_px=uv)), SolveOptions(loss="none"))
+    named = next(w for w in kept.warnings if "diverge" in w)
+    assert str(obs.track[pairs[0][0]]) in named
 
 
 @pytest.mark.parametrize("loss", ["none", "huber"])
