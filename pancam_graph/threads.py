@@ -1,22 +1,16 @@
 """Ranges of items over all cores, for compiled loops that release the interpreter's lock."""
 
 import os
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager
 from functools import cache
-from itertools import islice
-from typing import TypeVar
 
 from threadpoolctl import ThreadpoolController
 
 from pancam_graph.errors import InputError
 
-__all__ = ["blas_on_one_thread", "in_parallel", "n_workers", "ordered"]
-
-T = TypeVar("T")
-R = TypeVar("R")
+__all__ = ["blas_on_one_thread", "in_parallel", "n_workers"]
 
 _VARIABLE = "PANCAM_GRAPH_THREADS"
 
@@ -61,28 +55,6 @@ def in_parallel(function: Callable[[int, int], None], n: int, *, grain: int) -> 
     wait(others)
     if failed:
         raise failed[min(failed)]
-
-
-def ordered(function: Callable[[T], R], items: Iterable[T], *, ahead: int) -> Iterator[R]:
-    """Results of function(item) in the order of the items, of which `ahead` at most are under way.
-
-    An item is drawn only when there is room for it, so that items may carry buffers that the consumer of a
-    result gives back. Raises the exception of the first item that failed.
-    """
-    workers, waiting = n_workers(), iter(items)
-    if workers == 1:
-        yield from map(function, waiting)
-        return
-    pending: deque[Future[R]] = deque()
-    try:
-        while True:
-            for item in islice(waiting, ahead - len(pending)):
-                pending.append(_pool(workers).submit(function, item))
-            if not pending:
-                return
-            yield pending.popleft().result()
-    finally:
-        wait(pending)
 
 
 def blas_on_one_thread() -> AbstractContextManager[object]:

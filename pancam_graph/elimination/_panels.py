@@ -91,21 +91,24 @@ class Panels:
 
     def add(self, groups: Sequence[int], S: FloatArray, s: FloatArray) -> None:
         """Add a dense system over groups in the order of elimination; of S the upper triangle counts."""
-        dim = self.structure.dim
-        begin = np.concatenate([[0], np.cumsum(dim[list(groups)])])
-        for i, g in enumerate(groups):
-            panel, place = self.panel[g], self._place[g]
-            rows = slice(begin[i], begin[i + 1])
-            panel[:, -1] += s[rows]
-            # Runs of groups that are neighbours in the panel too are added at once.
-            j = i
-            while j < len(groups):
-                k, first = j + 1, place[groups[j]]
-                while k < len(groups) and place[groups[k]] - first == begin[k] - begin[j]:
-                    k += 1
-                width = begin[k] - begin[j]
-                panel[:, first : first + width] += S[rows, begin[j] : begin[k]]
-                j = k
+        begin = np.concatenate([[0], np.cumsum(self.structure.dim[list(groups)])])
+        for i in range(len(groups)):
+            self.add_rows(i, groups, begin, S, s)
+
+    def add_rows(self, i: int, groups: Sequence[int], begin: IntArray, S: FloatArray, s: FloatArray) -> None:
+        """Add the rows of groups[i]; `begin` (groups + 1,) are the columns of S where the groups begin."""
+        panel, place = self.panel[groups[i]], self._place[groups[i]]
+        rows = slice(begin[i], begin[i + 1])
+        panel[:, -1] += s[rows]
+        # Runs of groups that are neighbours in the panel too are added at once.
+        j = i
+        while j < len(groups):
+            k, first = j + 1, place[groups[j]]
+            while k < len(groups) and place[groups[k]] - first == begin[k] - begin[j]:
+                k += 1
+            width = begin[k] - begin[j]
+            panel[:, first : first + width] += S[rows, begin[j] : begin[k]]
+            j = k
 
     def add_entries(
         self, g: IntArray, row: IntArray, h: IntArray, column: IntArray, entry: FloatArray

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import TypeVar
 
@@ -21,7 +22,7 @@ from pancam_graph.landmarks import (
     triangulate,
 )
 from pancam_graph.losses import SQUARED, Loss
-from pancam_graph.threads import in_parallel, n_workers, ordered
+from pancam_graph.threads import in_parallel
 
 __all__ = ["LandmarkSystem"]
 
@@ -29,6 +30,8 @@ _T = TypeVar("_T", bound=np.generic)
 
 _PARTS = 8
 """A chunk has at most this share of all observations, so that two cores, or eight, have even work."""
+_ROOM = 6_000_000
+"""Numbers in the dense systems of a wave of chunks: 48 MB."""
 _STRAY = 0.5 * 5.0**2
 """A landmark with this cost per observation, as if all were 5 sigma off, is placed anew after a step."""
 _SMALLEST_CHUNK = 4000
@@ -55,6 +58,11 @@ class _Chunk:
     block: int
     begin: int
     end: int
+
+
+_Wave = list[_Chunk]
+_Systems = list[tuple[FloatArray, FloatArray]]
+"""(S, s) of each chunk of a wave, over the columns of its block."""
 
 
 class LandmarkSystem:
@@ -95,6 +103,7 @@ class LandmarkSystem:
             cost=np.zeros(n),
             undetermined=np.zeros(n, dtype=bool),
         )
+        self._memory = np.empty(0)
         self._moved, self._moved_cost = np.empty_like(self.vector), np.zeros(n)
 
     def _arrange(
@@ -190,46 +199,70 @@ class LandmarkSystem:
         """
         bearings = self.bearings(posture)
         eliminate = kernel.eliminate_poses if bearings.chain.shape[1] == 6 else kernel.eliminate_calibrations
-        n_buffers = n_workers() + 2
         paired = not np.any(self.linkage.segment_width % 2) and not np.any(self.linkage.segment_column % 2)
-        largest = max(int(b.begin[-1]) for b in self.blocks)
-        free = [(np.empty(largest * largest), np.empty(largest)) for _ in range(n_buffers)]
-
-        def work(job: tuple[_Chunk, FloatArray, FloatArray]) -> tuple[_Chunk, FloatArray, FloatArray]:
-            chunk, S_buffer, s_buffer = job
-            block = self.blocks[chunk.block]
-            n = int(block.begin[-1])
-            S, s = S_buffer[: n * n].reshape(n, n), s_buffer[:n]
-            S.fill(0.0)
-            s.fill(0.0)
-            eliminate(
-                self.sights,
-                bearings,
-                self.vector,
-                self.origin_m,
-                self.loss.kind,
-                self.loss.width,
-                chunk.begin,
-                chunk.end,
-                block.segment_column,
-                block.n_units,
-                paired,
-                self.reduced,
-                S,
-                s,
-            )
-            return job
-
         self._panels.clear()
-        # Sums are taken in the order of the chunks, so that no bit depends on the number of threads.
-        for chunk, S_buffer, s_buffer in ordered(
-            work, ((c, *free.pop()) for c in self.chunks), ahead=n_buffers
-        ):
-            block = self.blocks[chunk.block]
-            n = int(block.begin[-1])
-            self._panels.add(block.groups, S_buffer[: n * n].reshape(n, n), s_buffer[:n])
-            free.append((S_buffer, s_buffer))
+        for wave in self._waves:
+            systems = self._room(wave)
+
+            def eliminated(first: int, last: int, wave: _Wave = wave, systems: _Systems = systems) -> None:
+                for chunk, (S, s) in zip(wave[first:last], systems[first:last], strict=True):
+                    S.fill(0.0)
+                    s.fill(0.0)
+                    block = self.blocks[chunk.block]
+                    eliminate(
+                        self.sights,
+                        bearings,
+                        self.vector,
+                        self.origin_m,
+                        self.loss.kind,
+                        self.loss.width,
+                        chunk.begin,
+                        chunk.end,
+                        block.segment_column,
+                        block.n_units,
+                        paired,
+                        self.reduced,
+                        S,
+                        s,
+                    )
+
+            def summed(first: int, last: int, wave: _Wave = wave, systems: _Systems = systems) -> None:
+                # In the order of the chunks, so that no bit depends on the number of threads.
+                for chunk, (S, s) in zip(wave, systems, strict=True):
+                    block = self.blocks[chunk.block]
+                    for i, g in enumerate(block.groups):
+                        if first <= g < last:
+                            self._panels.add_rows(i, block.groups, block.begin, S, s)
+
+            in_parallel(eliminated, len(wave), grain=1)
+            in_parallel(summed, self.linkage.n_groups, grain=1 + self.linkage.n_groups // 8)
         return self._panels
+
+    @cached_property
+    def _waves(self) -> list[list[_Chunk]]:
+        """Chunks whose dense systems are in memory at once."""
+        waves: list[list[_Chunk]] = [[]]
+        room = 0
+        for chunk in self.chunks:
+            need = int(self.blocks[chunk.block].begin[-1]) ** 2
+            if waves[-1] and room + need > _ROOM:
+                waves.append([])
+                room = 0
+            waves[-1].append(chunk)
+            room += need
+        return waves
+
+    def _room(self, wave: list[_Chunk]) -> _Systems:
+        """A dense system (S, s) for each chunk of a wave, in memory that is used again."""
+        dims = [int(self.blocks[chunk.block].begin[-1]) for chunk in wave]
+        need = sum(n * n + n for n in dims)
+        if len(self._memory) < need:
+            self._memory = np.empty(need)
+        out, begin = [], 0
+        for n in dims:
+            out.append((self._memory[begin : begin + n * n].reshape(n, n), self._memory[begin + n * n :][:n]))
+            begin += n * n + n
+        return out
 
     def try_step(self, posture: Posture, step: FloatArray) -> FloatArray:
         """Costs (blocks,) where a step of all variables (columns,) leads, landmarks moved along.
