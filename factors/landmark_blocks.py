@@ -41,7 +41,7 @@ class LandmarkBlocks:
         link, structure = system.linkage, system.structure
         self._touched = np.flatnonzero(link.touched).tolist()
         self._read = read
-        begin = np.concatenate([[0], np.cumsum(link.group_dim)])
+        begin = link.group_column
         self._slice = {
             v: slice(c, c + int(link.dim[v]))
             for v in self._touched

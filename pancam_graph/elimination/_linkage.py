@@ -60,6 +60,11 @@ class Linkage:
         return np.bincount(self.group, self.dim, minlength=self.n_groups).astype(np.int64)
 
     @cached_property
+    def group_column(self) -> IntArray:
+        """(groups + 1,) first column of each group among all columns."""
+        return np.concatenate([[0], np.cumsum(self.group_dim)])
+
+    @cached_property
     def row(self) -> dict[int, int]:
         """Variable of each key."""
         return {key: i for i, key in enumerate(self.key)}

@@ -151,21 +151,10 @@ class Panels:
         rest = rows[:, n:]
         if rest.shape[1] == 1 or len(rows) == 0:
             return
-        update = rest.T @ rest
+        update = -(rest.T @ rest)
         begin, after = st.begin[g] - n, st.after[g]
         for i in range(1, len(after)):
-            h = after[i]
-            panel, place = self.panel[h], self._place[h]
-            own = slice(begin[i], begin[i + 1])
-            panel[:, -1] -= update[own, -1]
-            j = i
-            while j < len(after):
-                k, first = j + 1, place[after[j]]
-                while k < len(after) and place[after[k]] - first == begin[k] - begin[j]:
-                    k += 1
-                width = begin[k] - begin[j]
-                panel[:, first : first + width] -= update[own, begin[j] : begin[k]]
-                j = k
+            self.add_rows(i, after, begin, update, update[:, -1])
 
 
 def _root_of_panel(panel: FloatArray, summed: FloatArray) -> FloatArray:

@@ -128,7 +128,7 @@ class LandmarkSystem:
             column_begin=np.empty(n + 1, dtype=np.int64),
             column=np.empty(int(widths[unit].sum()), dtype=np.int64),
         )
-        begin = np.append(m.starts, n_obs)
+        begin = m.begin
         rows, cursor = np.empty(n_obs, dtype=np.int64), np.zeros(4, dtype=np.int64)
         most = max(n_obs // _PARTS, _SMALLEST_CHUNK)
         self.blocks: list[_Block] = []
@@ -271,8 +271,7 @@ class LandmarkSystem:
         kernel.BEHIND_COST.
         """
         bearings = self.bearings(posture)
-        link = self.linkage
-        column = np.concatenate([[0], np.cumsum(link.group_dim)])
+        column = self.linkage.group_column
         steps = [
             np.concatenate([step[:0], *(step[column[g] : column[g + 1]] for g in b.groups)])
             for b in self.blocks
