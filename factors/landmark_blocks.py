@@ -17,7 +17,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from pancam_graph.elimination import LandmarkSystem, Posture, Root
+from pancam_graph.elimination import LandmarkSystem, Panels, Posture, Root
 from pancam_graph.geometry import FloatArray
 
 __all__ = ["LandmarkBlocks"]
@@ -57,6 +57,7 @@ class LandmarkBlocks:
         self._here: dict[int, Any] = {}
         self._there: dict[int, Any] = {}
         self._cost = np.zeros(0)
+        self._panels: Panels | None = None
         self._root: Root | None = None
 
     def factors(self) -> list[gtsam.CustomFactor]:
@@ -72,13 +73,24 @@ class LandmarkBlocks:
             for v in range(link.group_begin[g], link.group_begin[g + 1])
         ]
 
-    def settle(self, values: gtsam.Values) -> float:
-        """Move the landmarks to where a step to these values leads them; the true cost of all there."""
+    def settle(self, values: gtsam.Values) -> bool:
+        """Move the landmarks to where a step to these values leads them; whether they were elsewhere."""
         self._evaluate(values, self._touched)
-        if self._here is not self._there:
+        moved = self._here is not self._there
+        if moved:
             self.system.adopt()
-            self._here, self._root = {}, None
-        return float(self._cost.sum())
+            self._here = self._there = {}
+            self._panels, self._root = None, None
+        return moved
+
+    def panels(self, values: gtsam.Values) -> Panels:
+        """The system (S, s) that is left of all landmarks at these values; theirs are moved there."""
+        self._evaluate(values, self._touched)
+        self._adopt()
+        if self._panels is None:
+            self._linearise(self._posture(values))
+        assert self._panels is not None
+        return self._panels.copy()
 
     def _factor(self, group: int) -> gtsam.CustomFactor:
         link, structure = self.system.linkage, self.system.structure
@@ -136,7 +148,9 @@ class LandmarkBlocks:
     def _linearised(self) -> Root:
         """The square root at the last values evaluated."""
         self._adopt()
-        assert self._root is not None
+        if self._root is None:
+            assert self._panels is not None
+            self._root, self._panels = self._panels.root(), None
         return self._root
 
     def _adopt(self) -> None:
@@ -145,14 +159,13 @@ class LandmarkBlocks:
             self._linearise(self._pending)
 
     def _linearise(self, posture: Posture) -> None:
-        self._root = self.system.linearise(posture).root()
+        self._panels, self._root = self.system.linearise(posture), None
         self._cost = self.system.block_costs()
         self._here = self._there
 
     def _remainder(self, root: Root) -> float:
         """What the cost has beyond the squares of all e, as one more row."""
-        explained = sum(float(rows[:, -1] @ rows[:, -1]) for rows in root.rows)
-        return float(np.sqrt(max(2 * float(self._cost.sum()) - explained, 0.0)))
+        return float(np.sqrt(max(2 * (float(self._cost.sum()) - root.gain()), 0.0)))
 
 
 def _same(a: Any, b: Any) -> bool:

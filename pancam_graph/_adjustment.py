@@ -12,6 +12,7 @@ from pancam_graph._eliminated import EliminatedSolver
 from pancam_graph._explicit import ExplicitSolver
 from pancam_graph._optimise import Iteration, Outcome, StopRule
 from pancam_graph._problem import Problem, Solver, reach_m
+from pancam_graph._reduced import ReducedSystem
 from pancam_graph._rejection import screen
 from pancam_graph.cameras import carry_to_pinhole
 from pancam_graph.errors import InputError, SolveError
@@ -329,7 +330,7 @@ class Adjustment:
             # The inverse of a system with a tie of 1e-8 would have lost half its digits.
             problem = problem.on(HardTemplate(t))
         try:
-            found = uncertainty(problem, self.final, *self.solver.system(problem), landmarks=wanted)
+            found = uncertainty(problem, self.final, self._reduced(problem), landmarks=wanted)
         except SolveError as error:
             self.warnings.append(f"no uncertainties: {error}")
             n = len(self.landmark_track)
@@ -348,6 +349,11 @@ class Adjustment:
                 "they tell where cameras point, and a weak prior holds the point"
             )
         return found
+
+    def _reduced(self, problem: Problem) -> ReducedSystem:
+        """The problem with landmarks eliminated; that of the last fit where this was one of it."""
+        known = isinstance(self.solver, EliminatedSolver) and self.solver.reduced(problem)
+        return known or ReducedSystem.of(problem)
 
     def _raw_residuals(self, problem: Problem, present: BoolArray) -> FloatArray:
         """Projected minus measured (observations, 2) in raw pixels; NaN where there is no landmark."""

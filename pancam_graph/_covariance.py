@@ -4,12 +4,12 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from scipy.sparse import coo_array, csc_array
 
 from pancam_graph._problem import Problem
-from pancam_graph.elimination import FreeDirectionError, LandmarkSystem, Linkage, Panels
+from pancam_graph._reduced import ReducedSystem, held_columns
+from pancam_graph.elimination import FreeDirectionError
 from pancam_graph.errors import SolveError
-from pancam_graph.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.geometry import BoolArray, FloatArray
 from pancam_graph.graph import FactorTemplate
 from pancam_graph.solution import State
 
@@ -30,24 +30,17 @@ class Uncertainty:
     """(landmarks,) whether rays leave a direction free that the weak prior alone holds"""
 
 
-def uncertainty(
-    problem: Problem, state: State, system: LandmarkSystem, rows: IntArray, *, landmarks: bool
-) -> Uncertainty:
-    """Covariances, everything else marginalised, from the landmark system of what takes part.
+def uncertainty(problem: Problem, state: State, reduced: ReducedSystem, *, landmarks: bool) -> Uncertainty:
+    """Covariances, everything else marginalised, from what is left of the landmarks at the problem's values.
 
-    `rows` are the system's landmarks among all. Raises SolveError where a direction is held by nothing.
+    Raises SolveError where a direction is held by nothing.
     """
-    template, m = problem.template, problem.measurements
-    panels = system.linearise(template.posture(problem.values))
-    if template.linkage.key:
-        _add(panels, template.linkage, problem.factors.linearize(problem.values))
-    held = _columns(template.linkage, template.held_columns())
-    panels.hold(held)
+    template, m, system, rows = problem.template, problem.measurements, reduced.system, reduced.rows
     try:
-        covariance = panels.root().covariance()
+        covariance = reduced.root.covariance()
     except FreeDirectionError as error:
         raise SolveError(f"nothing holds {_name(template, error)}") from error
-    covariance.release(held)
+    covariance.release(held_columns(template))
     undetermined = np.zeros(m.n_landmarks, dtype=bool)
     undetermined[rows] = system.undetermined
     spread = None
@@ -60,33 +53,6 @@ def uncertainty(
         landmark_covariance_m2=spread,
         undetermined=undetermined,
     )
-
-
-def _add(panels: Panels, linkage: Linkage, linear: gtsam.GaussianFactorGraph) -> None:
-    """Add priors and ties, as GTSAM linearises them."""
-    row, column, entry = linear.sparseJacobian_()
-    # GTSAM counts from 1, takes keys in ascending order, and appends the right-hand side as a last column.
-    keys = sorted(linkage.key)
-    dims = [int(linkage.dim[linkage.row[key]]) for key in keys]
-    shape = (int(row.max(initial=0)), sum(dims) + 1)
-    jacobian = csc_array((entry, (row.astype(int) - 1, column.astype(int) - 1)), shape=shape)[:, :-1]
-    own = [linkage.columns_of(key) for key in keys]
-    group = np.repeat([int(linkage.group[linkage.row[key]]) for key in keys], dims)
-    within = np.concatenate([np.arange(s.start, s.stop) for s in own])
-    information = coo_array(jacobian.T @ jacobian)
-    i, j = information.coords
-    panels.add_entries(group[i], within[i], group[j], within[j], information.data)
-
-
-def _columns(linkage: Linkage, held: dict[int, IntArray]) -> dict[int, IntArray]:
-    """Columns by group, from components by key."""
-    out: dict[int, IntArray] = {}
-    for key, components in held.items():
-        if len(components):
-            g = int(linkage.group[linkage.row[key]])
-            columns = linkage.columns_of(key).start + components
-            out[g] = np.concatenate([out.get(g, np.zeros(0, dtype=np.int64)), columns])
-    return out
 
 
 def _name(template: FactorTemplate, free: FreeDirectionError) -> str:

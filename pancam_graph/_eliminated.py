@@ -1,13 +1,14 @@
 """Landmarks eliminated: Levenberg-Marquardt on the cameras' variables, landmarks follow."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import gtsam
 
 from pancam_graph._optimise import InOrder, Iteration, Outcome, StopRule, optimise
 from pancam_graph._problem import Problem, Solver, system_of
-from pancam_graph.elimination import LandmarkSystem
+from pancam_graph._reduced import ReducedSystem, joint_root
+from pancam_graph.elimination import LandmarkSystem, Root
 from pancam_graph.factors import LandmarkBlocks
 from pancam_graph.geometry import IntArray
 from pancam_graph.graph import HardTemplate, SoftTemplate, read_variable
@@ -16,13 +17,17 @@ from pancam_graph.losses import SQUARED, Loss
 __all__ = ["EliminatedSolver"]
 
 
+_FOLLOWING = 1e-4
+"""Landmarks follow the cameras where placing strays anew lowers the cost by no more than this share."""
+
+
 class EliminatedSolver(Solver):
     """Landmark blocks (factors/landmark_blocks.py): landmarks follow the variables of the graph."""
 
     def __init__(self, on_iteration: Callable[[Iteration], None] | None) -> None:
         super().__init__(on_iteration)
         self._is_near = False
-        self._last: tuple[Problem, LandmarkSystem, IntArray] | None = None
+        self._last: _Fit | None = None
 
     def approach(self, problem: Problem, rule: StopRule, loss: Loss, stage: str) -> Problem:
         """The same as `adjust`, but for the loss: unit 4-vectors do not go astray from afar."""
@@ -31,7 +36,7 @@ class EliminatedSolver(Solver):
     def adjust(self, problem: Problem, rule: StopRule) -> tuple[Problem, Outcome]:
         """Levenberg-Marquardt; observations of landmarks behind their camera are no longer accepted."""
         problem, outcome = self._fit(problem, rule, SQUARED, "solve")
-        if self._last is None or not self._last[1].any_behind:
+        if self._last is None or not self._last.system.any_behind:
             return problem, outcome
         _, in_front = problem.residuals()
         problem, again = self._fit(
@@ -68,6 +73,16 @@ class EliminatedSolver(Solver):
         graph = gtsam.NonlinearFactorGraph(problem.factors)
         for factor in blocks.factors():
             graph.push_back(factor)
+        joint: Root | None = None
+
+        def gain_ahead(values: gtsam.Values) -> float | None:
+            """As the linearised system has it; told once landmarks follow without being placed anew."""
+            nonlocal joint
+            if system.regained > _FOLLOWING * system.moved_cost:
+                return None
+            joint = joint_root(template, problem.factors, values, blocks.panels(values))
+            return joint.gain() + system.gain_alone
+
         outcome = optimise(
             graph,
             problem.values,
@@ -75,19 +90,37 @@ class EliminatedSolver(Solver):
             InOrder(blocks.ordering()),
             stage=stage,
             on_iteration=self.on_iteration,
+            gain_ahead=gain_ahead,
         )
-        blocks.settle(outcome.values)
+        if blocks.settle(outcome.values):
+            joint = None  # it was that of another point
         vector = problem.landmarks.vector.copy()
         vector[rows] = system.landmarks().vector
         found = problem.at(outcome.values, replace(problem.landmarks, vector=vector))
-        self._last = found, system, rows
+        self._last = _Fit(problem=found, system=system, rows=rows, joint=joint)
         return found, outcome
 
-    def system(self, problem: Problem) -> tuple[LandmarkSystem, IntArray]:
-        """The landmark system of what takes part, and its rows among the landmarks: that of the last fit."""
-        if self._last is not None and self._last[0] is problem:
-            return self._last[1:]
-        return system_of(problem)
+    def reduced(self, problem: Problem) -> ReducedSystem | None:
+        """The problem with landmarks eliminated, from the last fit; None if this did not end there."""
+        last = self._last
+        if last is None or last.problem is not problem:
+            return None
+        if last.joint is None:
+            return ReducedSystem.of(problem, (last.system, last.rows))
+        return ReducedSystem(system=last.system, rows=last.rows, root=last.joint)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Fit:
+    """Where a fit ended."""
+
+    problem: Problem
+    system: LandmarkSystem
+    rows: IntArray
+    """The system's landmarks among all."""
+    joint: Root | None
+    """Of the whole system at the problem's values, where the iterations ended by it; the system is
+    linearised there then."""
 
 
 def _only_landmarks(problem: Problem, loss: Loss) -> tuple[Problem, Outcome]:

@@ -7,7 +7,7 @@ import gtsam
 import numpy as np
 
 from pancam_graph._optimise import Elimination, Iteration, Outcome, StopRule, optimise
-from pancam_graph._problem import Problem, Solver, typical_sigma_px
+from pancam_graph._problem import Problem, Solver
 from pancam_graph.errors import SolveError
 from pancam_graph.geometry import BoolArray, FloatArray
 from pancam_graph.graph import ExplicitLandmarks, SoftTemplate
@@ -147,7 +147,7 @@ def _weak(problem: Problem) -> _Weak:
     m, views, points, present = problem.measurements, problem.views, problem.points_m(), problem.present
     distance = np.linalg.norm(points - problem.landmarks.origin_m, axis=1)
     sigma = point_sigma_m(points, m, views, problem.accepted)
-    sideways = distance * typical_sigma_px(m) / float(np.median(views.calibration[:, 0, 0]))
+    sideways = distance * m.typical_sigma_px / float(np.median(views.calibration[:, 0, 0]))
     return _Weak(
         needs_prior=present & (sigma > _WEAK_RANGE_SIGMA * distance),
         prior_m=10 * distance,

@@ -13,6 +13,8 @@ __all__ = ["Elimination", "InOrder", "Iteration", "Outcome", "StopRule", "optimi
 _LOG = logging.getLogger(__name__)
 _INDETERMINATE = "ndeterminate"
 """Part of GTSAM's message for a system without a unique solution."""
+_FAR = 100.0
+"""Gains that shrink, and will end so many times above the limit, need no closer look at the one ahead."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,8 +57,12 @@ def optimise(
     *,
     stage: str = "solve",
     on_iteration: Callable[[Iteration], None] | None = None,
+    gain_ahead: Callable[[gtsam.Values], float | None] | None = None,
 ) -> Outcome:
     """Minimise the graph's error from the given values.
+
+    `gain_ahead` may tell by how much the next step from some values would lower the cost; None: not known.
+    Without it, that is judged by the gains so far.
 
     Raises SolveError where the linear system cannot be factorised however much it is damped; an exception
     from inside a custom factor reaches the caller as it is.
@@ -80,7 +86,12 @@ def optimise(
             if optimizer.lambda_() >= parameters.getlambdaUpperBound():
                 converged, reason = True, "no step lowers the cost"
                 break
-            if _still_to_gain(costs) <= rule.relative_decrease * costs[-1]:
+            least = rule.relative_decrease * costs[-1]
+            gain, shrinking = _still_to_gain(costs)
+            if gain_ahead is not None and gain > least and not (shrinking and gain > _FAR * least):
+                ahead = gain_ahead(optimizer.values())
+                gain = gain if ahead is None else ahead
+            if gain <= least:
                 converged, reason = True, f"relative decrease below {rule.relative_decrease:g}"
                 break
     except RuntimeError as error:
@@ -88,17 +99,17 @@ def optimise(
     return Outcome(values=optimizer.values(), converged=converged, reason=reason, costs=tuple(costs))
 
 
-def _still_to_gain(costs: list[float]) -> float:
+def _still_to_gain(costs: list[float]) -> tuple[float, bool]:
     """By how much further iterations would lower the cost, if their gains shrink as the last one did.
 
     Gauss-Newton converges linearly where residuals are not zero, so gains shrink geometrically. Where the
-    last gain did not shrink, or there is but one, it stands for all to come.
+    last gain did not shrink (the second value), or there is but one, it stands for all to come.
     """
     gain = costs[-2] - costs[-1]
     if len(costs) < 3 or gain <= 0:
-        return max(gain, 0.0)
+        return max(gain, 0.0), False
     rate = gain / max(costs[-3] - costs[-2], 1e-300)
-    return gain * rate / (1 - rate) if rate < 0.1 else gain
+    return (gain * rate / (1 - rate), True) if rate < 0.1 else (gain, False)
 
 
 class InOrder:

@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -15,10 +16,12 @@ from pancam_graph.graph import FactorTemplate
 from pancam_graph.landmarks import CameraViews, Landmarks, Measurements, refine, residuals
 from pancam_graph.losses import SQUARED, Loss
 
-__all__ = ["Problem", "Solver", "reach_m", "system_of", "typical_sigma_px"]
+__all__ = ["Problem", "Solver", "reach_m", "system_of"]
 
 _FURTHEST_PARALLAX_SIGMAS = 0.01
 """Points are placed no further out than where their parallax is this many sigmas of a pixel."""
+_LEAST_BASELINE_M = 2e-3
+"""Cameras that are nearer to each other count as if they were so far apart."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -35,7 +38,7 @@ class Problem:
     """The template's variables."""
     landmarks: Landmarks
 
-    @property
+    @cached_property
     def views(self) -> CameraViews:
         """Cameras at the values."""
         return self.template.views(self.values)
@@ -53,7 +56,13 @@ class Problem:
 
     def points_m(self) -> FloatArray:
         """World points (landmarks, 3), none further than where parallax tells nothing."""
-        return self.landmarks.points_m(reach_m(self) / _FURTHEST_PARALLAX_SIGMAS)
+        vector = self.landmarks.vector
+        distance = np.linalg.norm(vector[:, :3], axis=1)
+        # Most are nearer than any limit.
+        beyond = distance * _FURTHEST_PARALLAX_SIGMAS > vector[:, 3] * _LEAST_BASELINE_M * _resolution(self)
+        furthest = np.full(len(vector), np.inf)
+        furthest[beyond] = reach_m(self, beyond) / _FURTHEST_PARALLAX_SIGMAS
+        return self.landmarks.points_m(furthest)
 
     def cost(self, loss: Loss = SQUARED) -> float:
         """True cost: half the squares of priors and ties, and the loss of what takes part."""
@@ -80,19 +89,26 @@ class Problem:
         return replace(self, values=values, landmarks=landmarks)
 
 
-def reach_m(problem: Problem) -> FloatArray:
-    """Distance (landmarks,) where the parallax over a landmark's cameras is one sigma of a pixel."""
+def reach_m(problem: Problem, of: BoolArray | None = None) -> FloatArray:
+    """Distance where the parallax over a landmark's cameras is one sigma of a pixel.
+
+    Of the landmarks in the mask `of` (landmarks,), one after the other; of all without it.
+    """
     m, views = problem.measurements, problem.views
-    arm = np.linalg.norm(views.world_t_camera[m.image] - problem.landmarks.origin_m[m.landmark], axis=1)
-    baseline = 2 * np.maximum.reduceat(arm, m.starts).clip(1e-3)
-    focal = float(np.median(views.calibration[:, 0, 0]))
-    return np.asarray(baseline * focal / typical_sigma_px(m))
+    rows = slice(None) if of is None else np.flatnonzero(of[m.landmark])
+    landmark = m.landmark[rows]
+    if len(landmark) == 0:
+        return np.zeros(0)
+    arm = np.linalg.norm(views.world_t_camera[m.image[rows]] - problem.landmarks.origin_m[landmark], axis=1)
+    starts = np.flatnonzero(np.diff(landmark, prepend=-1))
+    baseline = (2 * np.maximum.reduceat(arm, starts)).clip(_LEAST_BASELINE_M)
+    return np.asarray(baseline * _resolution(problem))
 
 
-def typical_sigma_px(measurements: Measurements) -> float:
-    """Median standard deviation of a measurement's coordinate."""
-    w = measurements.whitening
-    return float(np.median(1 / np.sqrt(np.abs(w[:, 0, 0] * w[:, 1, 1] - w[:, 0, 1] * w[:, 1, 0]))))
+def _resolution(problem: Problem) -> float:
+    """One over the angle, radians, that a sigma of a pixel is, typically."""
+    focal_px = float(np.median(problem.views.calibration[:, 0, 0]))
+    return focal_px / problem.measurements.typical_sigma_px
 
 
 class Solver(ABC):
@@ -108,10 +124,6 @@ class Solver(ABC):
     @abstractmethod
     def adjust(self, problem: Problem, rule: StopRule) -> tuple[Problem, Outcome]:
         """The problem at the least-squares optimum near by."""
-
-    def system(self, problem: Problem) -> tuple[LandmarkSystem, IntArray]:
-        """The landmark system of what takes part, and its rows among the landmarks."""
-        return system_of(problem)
 
 
 def system_of(problem: Problem, loss: Loss = SQUARED) -> tuple[LandmarkSystem, IntArray]:

@@ -147,9 +147,11 @@ def pan_tilt_rotation(pan_rad: ArrayLike, tilt_rad: ArrayLike) -> FloatArray:
     """Rotation of the head, `Rz(pan) Ry(-tilt)`, for scalars or arrays: (...,) to (..., 3, 3)."""
     pan, tilt = np.broadcast_arrays(np.asarray(pan_rad, dtype=float), np.asarray(tilt_rad, dtype=float))
     cp, sp, ct, st = np.cos(pan), np.sin(pan), np.cos(tilt), np.sin(tilt)
-    zero = np.zeros_like(pan)
-    rows = [[cp * ct, -sp, -cp * st], [sp * ct, cp, -sp * st], [st, zero, ct]]
-    return np.stack([np.stack(r, -1) for r in rows], -2)
+    out = np.empty((*pan.shape, 3, 3))
+    out[..., 0, 0], out[..., 0, 1], out[..., 0, 2] = cp * ct, -sp, -cp * st
+    out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = sp * ct, cp, -sp * st
+    out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = st, 0.0, ct
+    return out
 
 
 def d_pan_tilt_rotation(tilt_rad: float) -> FloatArray:

@@ -6,10 +6,14 @@ Everything else of the package works on whole arrays or once per image, frame or
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, TypeAlias, TypeVar, cast
 
 import numba
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
 
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray
 
@@ -32,6 +36,7 @@ __all__ = [
     "evaluate",
     "follow",
     "free_derivatives",
+    "gather",
     "loss_cost",
     "loss_costs",
     "loss_weight",
@@ -40,10 +45,9 @@ __all__ = [
     "rays",
     "refine",
     "reject",
-    "sight",
+    "residuals",
     "smallest_information",
     "spread",
-    "tangent_basis",
     "tests",
     "triangulate",
 ]
@@ -70,6 +74,12 @@ def must_compile() -> bool:
     return not any(index.stat().st_mtime >= source for index in stored)
 
 
+# In the loops below small vectors are numbers and tuples, never views of arrays: to make and drop a view
+# costs as much as the arithmetic on it.
+
+Tangents: TypeAlias = tuple[float, ...]
+"""Basis (4, 3) of the tangent space of S^3 at a landmark, by rows."""
+
 NONE, HUBER, CAUCHY = 0, 1, 2
 """Kinds of losses."""
 
@@ -95,62 +105,97 @@ def loss_weight(kind: int, width: float, squared: float) -> float:
 
 
 @compiled
-def tangent_basis(vector: FloatArray, basis: FloatArray) -> None:
+def tangents(a0: float, a1: float, a2: float, a3: float) -> Tangents:
     """Orthonormal basis (4, 3) of the tangent space of S^3 at a unit vector, by a Householder reflection.
 
     The reflection takes the vector to the first axis (or its opposite); the images of the other three
     axes span the tangent space.
     """
-    a0, a1, a2, a3 = vector[0], vector[1], vector[2], vector[3]
     a0 += 1.0 if a0 >= 0 else -1.0
-    scale = 2.0 / (a0 * a0 + a1 * a1 + a2 * a2 + a3 * a3)
-    basis[0, 0], basis[0, 1], basis[0, 2] = -scale * a0 * a1, -scale * a0 * a2, -scale * a0 * a3
-    basis[1, 0], basis[1, 1], basis[1, 2] = 1 - scale * a1 * a1, -scale * a1 * a2, -scale * a1 * a3
-    basis[2, 0], basis[2, 1], basis[2, 2] = -scale * a2 * a1, 1 - scale * a2 * a2, -scale * a2 * a3
-    basis[3, 0], basis[3, 1], basis[3, 2] = -scale * a3 * a1, -scale * a3 * a2, 1 - scale * a3 * a3
+    s = 2.0 / (a0 * a0 + a1 * a1 + a2 * a2 + a3 * a3)
+    s1, s2, s3 = s * a1, s * a2, s * a3
+    return (
+        *(-s1 * a0, -s2 * a0, -s3 * a0),
+        *(1.0 - s1 * a1, -s1 * a2, -s1 * a3),
+        *(-s1 * a2, 1.0 - s2 * a2, -s2 * a3),
+        *(-s1 * a3, -s2 * a3, 1.0 - s3 * a3),
+    )
+
+
+@compiled
+def along(t: Tangents, d0: float, d1: float, d2: float, d3: float) -> tuple[float, float, float]:
+    """A derivative by (X, w), taken to one by the tangents."""
+    return (
+        d0 * t[0] + d1 * t[3] + d2 * t[6] + d3 * t[9],
+        d0 * t[1] + d1 * t[4] + d2 * t[7] + d3 * t[10],
+        d0 * t[2] + d1 * t[5] + d2 * t[8] + d3 * t[11],
+    )
+
+
+@compiled
+def retracted(
+    t: Tangents, a0: float, a1: float, a2: float, a3: float, s0: float, s1: float, s2: float
+) -> tuple[float, float, float, float]:
+    """A unit vector moved by a step along its tangents, and brought back to the sphere."""
+    x0 = a0 + t[0] * s0 + t[1] * s1 + t[2] * s2
+    x1 = a1 + t[3] * s0 + t[4] * s1 + t[5] * s2
+    x2 = a2 + t[6] * s0 + t[7] * s1 + t[8] * s2
+    x3 = a3 + t[9] * s0 + t[10] * s1 + t[11] * s2
+    per_length = 1.0 / np.sqrt(x0 * x0 + x1 * x1 + x2 * x2 + x3 * x3)
+    return x0 * per_length, x1 * per_length, x2 * per_length, x3 * per_length
 
 
 @compiled
 def sight(
     to_pixel: FloatArray,
-    offset: FloatArray,
-    vector: FloatArray,
+    image: int,
+    y0: float,
+    y1: float,
+    y2: float,
     uv_px: FloatArray,
     whitening: FloatArray,
-    residual: FloatArray,
-    d_ray: FloatArray,
-) -> bool:
-    """Whitened residual (2,) of one observation and its derivative (2, 3) by the world ray; whether in front.
+    i: int,
+) -> tuple[bool, float, float, float, float, float]:
+    """Observation i of an image along a world ray y: in front, whitened residual, u, v and 1 / depth.
 
     The ray is X - w offset, the camera's centre being at `offset` from the landmark's origin. What is behind
     the camera gives the residual of the mirrored point, which means nothing.
     """
-    y0 = vector[0] - vector[3] * offset[0]
-    y1 = vector[1] - vector[3] * offset[1]
-    y2 = vector[2] - vector[3] * offset[2]
-    p2 = to_pixel[2, 0] * y0 + to_pixel[2, 1] * y1 + to_pixel[2, 2] * y2
-    in_front = bool(p2 > 1e-12)
+    p2 = to_pixel[image, 2, 0] * y0 + to_pixel[image, 2, 1] * y1 + to_pixel[image, 2, 2] * y2
     per_depth = 1.0 / (p2 if abs(p2) > 1e-12 else 1e-12)
-    u = (to_pixel[0, 0] * y0 + to_pixel[0, 1] * y1 + to_pixel[0, 2] * y2) * per_depth
-    v = (to_pixel[1, 0] * y0 + to_pixel[1, 1] * y1 + to_pixel[1, 2] * y2) * per_depth
-    du, dv = u - uv_px[0], v - uv_px[1]
-    w00, w01, w10, w11 = whitening[0, 0], whitening[0, 1], whitening[1, 0], whitening[1, 1]
-    residual[0] = w00 * du + w01 * dv
-    residual[1] = w10 * du + w11 * dv
-    for k in range(3):
-        gu = (to_pixel[0, k] - u * to_pixel[2, k]) * per_depth
-        gv = (to_pixel[1, k] - v * to_pixel[2, k]) * per_depth
-        d_ray[0, k] = w00 * gu + w01 * gv
-        d_ray[1, k] = w10 * gu + w11 * gv
-    return in_front
+    u = (to_pixel[image, 0, 0] * y0 + to_pixel[image, 0, 1] * y1 + to_pixel[image, 0, 2] * y2) * per_depth
+    v = (to_pixel[image, 1, 0] * y0 + to_pixel[image, 1, 1] * y1 + to_pixel[image, 1, 2] * y2) * per_depth
+    du, dv = u - uv_px[i, 0], v - uv_px[i, 1]
+    r0 = whitening[i, 0, 0] * du + whitening[i, 0, 1] * dv
+    r1 = whitening[i, 1, 0] * du + whitening[i, 1, 1] * dv
+    return p2 > 1e-12, r0, r1, u, v, per_depth
+
+
+@compiled
+def by_ray(
+    to_pixel: FloatArray, image: int, u: float, v: float, scale: float, whitening: FloatArray, i: int
+) -> tuple[float, float, float, float, float, float]:
+    """Derivative (2, 3), by rows, of a whitened residual by the world ray, times scale over 1 / depth."""
+    a00, a01 = scale * whitening[i, 0, 0], scale * whitening[i, 0, 1]
+    a10, a11 = scale * whitening[i, 1, 0], scale * whitening[i, 1, 1]
+    gu0 = to_pixel[image, 0, 0] - u * to_pixel[image, 2, 0]
+    gu1 = to_pixel[image, 0, 1] - u * to_pixel[image, 2, 1]
+    gu2 = to_pixel[image, 0, 2] - u * to_pixel[image, 2, 2]
+    gv0 = to_pixel[image, 1, 0] - v * to_pixel[image, 2, 0]
+    gv1 = to_pixel[image, 1, 1] - v * to_pixel[image, 2, 1]
+    gv2 = to_pixel[image, 1, 2] - v * to_pixel[image, 2, 2]
+    return (
+        *(a00 * gu0 + a01 * gv0, a00 * gu1 + a01 * gv1, a00 * gu2 + a01 * gv2),
+        *(a10 * gu0 + a11 * gv0, a10 * gu1 + a11 * gv1, a10 * gu2 + a11 * gv2),
+    )
 
 
 class Sights(NamedTuple):
     """Observations of landmarks in the order of elimination; structure that no step changes.
 
-    An *occurrence* is one unit (images moved alike by all variables) that sees a landmark. A landmark touches
-    columns of its block's variables: its `column`s, ascending; `place` says where among them each segment of
-    an occurrence's chain begins.
+    An *occurrence* is one unit (images moved alike by all variables) that sees a landmark. Columns of a block
+    come in *pairs*, each segment beginning with one. A landmark touches some pairs, ascending; `place` says
+    which of them each segment of an occurrence's chain begins with.
     """
 
     image: IntArray
@@ -170,9 +215,10 @@ class Sights(NamedTuple):
     place: IntArray
     landmark_begin: IntArray
     """(landmarks + 1,) first occurrence of each"""
-    column_begin: IntArray
-    """(landmarks + 1,) first entry in `column` of each"""
-    column: IntArray
+    pair_begin: IntArray
+    """(landmarks + 1,) first pair of each"""
+    pair: IntArray
+    """(pairs,) number of the pair in the block"""
 
 
 class Bearings(NamedTuple):
@@ -192,6 +238,8 @@ class Bearings(NamedTuple):
     """(units + 1,)"""
     segment_width: IntArray
     """(segments,) columns of each"""
+    plain: BoolArray
+    """(segments,) whether the chain is the unit matrix: the variable's tangent is the base's twist"""
     chain: FloatArray
     """(segments, rows, widest): takes a variable's tangent to the base's twist (6 rows, rotation first), and
     where calibrations are free to changes of fx, fy, skew, cx, cy (5 more)"""
@@ -205,7 +253,7 @@ class Reduced(NamedTuple):
     gamma: FloatArray
     """(landmarks, 3) L^-1 g"""
     arms: FloatArray
-    """(3 len(column),) L^-1 E' of each landmark, three rows of its columns"""
+    """(6 pairs,) L^-1 E' of each landmark: three rows of two columns for each pair"""
     cost: FloatArray
     """(landmarks,) true robust cost"""
     undetermined: BoolArray
@@ -230,10 +278,11 @@ def _chain(
     unit_of: IntArray,
     bearings: Bearings,
     segment_column: IntArray,
-    S: FloatArray,
+    tiles: FloatArray,
     s: FloatArray,
 ) -> None:
     """Add the units' own information, taken through their chains, to the upper triangle of S and to s."""
+    n_pairs = len(s) // 2
     rows, widest = bearings.chain.shape[1], bearings.chain.shape[2]
     half = np.empty((rows, widest))
     for row in range(len(unit_of)):
@@ -265,56 +314,104 @@ def _chain(
                         total = 0.0
                         for k in range(rows):
                             total += chain_b[k, p] * half[k, q]
-                        S[column_b + p, column_a + q] += total
+                        tiles[_tile(column_b + p, column_a + q, n_pairs)] += total
 
 
 @compiled
-def _subtract(
-    arms: FloatArray, column: IntArray, gamma: FloatArray, paired: bool, S: FloatArray, s: FloatArray
-) -> None:
-    """Take W'W and W'gamma of one landmark from the upper triangle of S and from s.
+def _tile(row: int, column: int, n_pairs: int) -> int:
+    """Where an entry of a matrix of 2 x 2 tiles is: these by rows, and so each one's entries."""
+    return 4 * ((row >> 1) * n_pairs + (column >> 1)) + 2 * (row & 1) + (column & 1)
 
-    Where columns come in pairs of neighbours, 2 x 2 entries are done at once, which halves the time; below
-    the diagonal this leaves numbers that mean nothing.
+
+def subtract_row_plainly(
+    tiles: FloatArray, row: int, arms: FloatArray, first: int, last: int, pair: IntArray
+) -> None:
+    """Take the products of pair `first` with the pairs first to last of a landmark from a row of tiles."""
+    for q in range(first, last):
+        for h in range(2):
+            for m in range(2):
+                for k in range(0, 6, 2):
+                    tiles[4 * (row + pair[q]) + 2 * h + m] -= arms[6 * first + k + h] * arms[6 * q + k + m]
+
+
+def _subtract_row_in_vectors(
+    typing: Any, tiles: Any, row: Any, arms: Any, first: Any, last: Any, pair: Any
+) -> Any:
+    """`subtract_row_plainly` in vectors of four: a tile is one, and takes three multiply-adds.
+
+    The innermost loop of the elimination. The compiler, left to itself, takes each entry alone: three times
+    as long.
     """
-    n = len(column)
-    for p in range(n):
-        s[column[p]] -= arms[0, p] * gamma[0] + arms[1, p] * gamma[1] + arms[2, p] * gamma[2]
-    if not paired:
-        for p in range(n):
-            for q in range(p, n):
-                product = arms[0, p] * arms[0, q] + arms[1, p] * arms[1, q] + arms[2, p] * arms[2, q]
-                S[column[p], column[q]] -= product
-        return
-    for p in range(0, n, 2):
-        row = column[p]
-        a0, a1, a2 = arms[0, p], arms[1, p], arms[2, p]
-        b0, b1, b2 = arms[0, p + 1], arms[1, p + 1], arms[2, p + 1]
-        for q in range(p, n, 2):
-            c = column[q]
-            x0, x1, x2 = arms[0, q], arms[1, q], arms[2, q]
-            y0, y1, y2 = arms[0, q + 1], arms[1, q + 1], arms[2, q + 1]
-            S[row, c] -= a0 * x0 + a1 * x1 + a2 * x2
-            S[row, c + 1] -= a0 * y0 + a1 * y1 + a2 * y2
-            S[row + 1, c] -= b0 * x0 + b1 * x1 + b2 * x2
-            S[row + 1, c + 1] -= b0 * y0 + b1 * y1 + b2 * y2
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        tiles, row, arms, first, last, pair = (
+            context.make_array(kind)(context, builder, value).data if isinstance(kind, types.Array) else value
+            for kind, value in zip(signature.args, arguments, strict=True)
+        )
+        word, number = row.type, ir.DoubleType()
+        four = ir.VectorType(number, 4)
+        contract = ("contract",)
+
+        def spread(pair_row: Any, k: int, order: tuple[int, ...]) -> Any:
+            """Row k of a pair's arms, its two numbers in the given order."""
+            at = builder.add(builder.mul(pair_row, word(6)), word(2 * k))
+            two = builder.load(
+                builder.bitcast(builder.gep(arms, [at]), ir.VectorType(number, 2).as_pointer()), align=8
+            )
+            return builder.shuffle_vector(two, two, ir.Constant(ir.VectorType(ir.IntType(32), 4), order))
+
+        own = [spread(first, k, (0, 0, 1, 1)) for k in range(3)]
+        with cgutils.for_range_slice(builder, first, last, word(1), word) as (q, _):
+            column = builder.load(builder.gep(pair, [q]))
+            at = builder.mul(builder.add(row, column), word(4))
+            tile = builder.bitcast(builder.gep(tiles, [at]), four.as_pointer())
+            left = builder.load(tile, align=8)
+            for k in range(3):
+                product = builder.fmul(own[k], spread(q, k, (0, 1, 0, 1)), flags=contract)
+                left = builder.fsub(left, product, flags=contract)
+            builder.store(left, tile, align=8)
+        return context.get_dummy_value()
+
+    return types.void(tiles, types.intp, arms, types.intp, types.intp, pair), generate
+
+
+_config: Any = numba.config
+subtract_row: Any = subtract_row_plainly if _config.DISABLE_JIT else intrinsic(_subtract_row_in_vectors)
+"""The one that is called."""
 
 
 @compiled
 def _by_calibration(
-    bearings: Bearings, image: int, uv_px: FloatArray, whitening: FloatArray, root: float, jac: FloatArray
+    calibration: FloatArray,
+    image: int,
+    u: float,
+    v: float,
+    whitening: FloatArray,
+    i: int,
+    root: float,
+    jac: FloatArray,
 ) -> None:
-    """Columns 6 to 10 of an observation's Jacobian: by fx, fy, skew, cx and cy (thesis eq. 4.2)."""
-    K = bearings.calibration[image]
-    y = (uv_px[1] - K[1, 2]) / K[1, 1]
-    x = (uv_px[0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
+    """An observation's Jacobian (2, 5) by fx, fy, skew, cx and cy (thesis eq. 4.2), at the pixel u, v."""
+    y = (v - calibration[image, 1, 2]) / calibration[image, 1, 1]
+    x = (u - calibration[image, 0, 2] - calibration[image, 0, 1] * y) / calibration[image, 0, 0]
     for m in range(2):
-        wu, wv = root * whitening[m, 0], root * whitening[m, 1]
-        jac[m, 6], jac[m, 7], jac[m, 8], jac[m, 9], jac[m, 10] = wu * x, wv * y, wu * y, wu, wv
+        wu, wv = root * whitening[i, m, 0], root * whitening[i, m, 1]
+        jac[m, 0], jac[m, 1], jac[m, 2], jac[m, 3], jac[m, 4] = wu * x, wv * y, wu * y, wu, wv
+
+
+@compiled
+def _add_six(
+    to: FloatArray, at: int, a0: float, a1: float, a2: float, a3: float, a4: float, a5: float
+) -> None:
+    """Add six numbers to neighbours of an array."""
+    b0, b1, b2, b3, b4, b5 = to[at], to[at + 1], to[at + 2], to[at + 3], to[at + 4], to[at + 5]
+    to[at], to[at + 1], to[at + 2] = b0 + a0, b1 + a1, b2 + a2
+    to[at + 3], to[at + 4], to[at + 5] = b3 + a3, b4 + a4, b5 + a5
 
 
 def _eliminating(rows: int) -> Callable[..., None]:
     """The elimination kernel for chains of 6 rows (poses) or 11 (poses and calibrations)."""
+    more = rows - 6
 
     @compiled
     def eliminate(
@@ -328,111 +425,190 @@ def _eliminating(rows: int) -> Callable[..., None]:
         end: int,
         segment_column: IntArray,
         n_units: int,
-        paired: bool,
         reduced: Reduced,
-        S: FloatArray,
+        tiles: FloatArray,
         s: FloatArray,
     ) -> None:
         unit_H = np.zeros((n_units, rows, rows))
         unit_s = np.zeros((n_units, rows))
         unit_of = np.full(n_units, -1)
-        basis, residual, d_ray = np.empty((4, 3)), np.empty(2), np.empty((2, 3))
-        b, jac = np.empty((2, 3)), np.empty((2, rows))
-        x, offset, uv = np.empty(3), np.empty(3), np.empty(2)
-        cross = np.empty((rows, 3))
+        to_pixel, centre_m = bearings.to_pixel, bearings.centre_m
+        unit_R, unit_t, chain = bearings.unit_R, bearings.unit_t, bearings.chain
+        uv_px, whitening, arms = sights.uv_px, sights.whitening, reduced.arms
+        pair_begin, pair, n_pairs = sights.pair_begin, sights.pair, len(s) // 2
+        # Beyond the pose: an observation's Jacobian, and an occurrence's products with landmark, base.
+        jac, cross, with_base = np.empty((2, more)), np.empty((more, 3)), np.empty((3, more))
         for j in range(begin, end):
-            tangent_basis(vector[j], basis)
-            w = vector[j, 3]
+            X0, X1, X2, w = vector[j, 0], vector[j, 1], vector[j, 2], vector[j, 3]
+            O0, O1, O2 = origin_m[j, 0], origin_m[j, 1], origin_m[j, 2]
+            t = tangents(X0, X1, X2, w)
             v00 = v10 = v11 = v20 = v21 = v22 = g0 = g1 = g2 = 0.0
             cost = 0.0
-            c0 = sights.column_begin[j]
-            n = sights.column_begin[j + 1] - c0
-            arms = reduced.arms[3 * c0 : 3 * (c0 + n)].reshape(3, n)
-            arms[:] = 0.0
-            column = sights.column[c0 : c0 + n]
+            first_pair, last_pair = pair_begin[j], pair_begin[j + 1]
+            for q in range(6 * first_pair, 6 * last_pair):
+                arms[q] = 0.0
             for o in range(sights.landmark_begin[j], sights.landmark_begin[j + 1]):
-                unit = sights.occurrence_unit[o]
-                R = bearings.unit_R[unit]
-                for k in range(3):
-                    offset[k] = vector[j, k] - w * (bearings.unit_t[unit, k] - origin_m[j, k])
-                for k in range(3):
-                    x[k] = R[0, k] * offset[0] + R[1, k] * offset[1] + R[2, k] * offset[2]
-                cross[:] = 0.0
-                row = sights.occurrence_row[o]
+                unit, row = sights.occurrence_unit[o], sights.occurrence_row[o]
                 unit_of[row] = unit
-                H, h = unit_H[row], unit_s[row]
+                R00, R01, R02 = unit_R[unit, 0, 0], unit_R[unit, 0, 1], unit_R[unit, 0, 2]
+                R10, R11, R12 = unit_R[unit, 1, 0], unit_R[unit, 1, 1], unit_R[unit, 1, 2]
+                R20, R21, R22 = unit_R[unit, 2, 0], unit_R[unit, 2, 1], unit_R[unit, 2, 2]
+                # With e the residual's derivative by the ray in the base's frame and b that by the landmark:
+                # the sums over the occurrence of e'e, e'b and e'r.
+                m00 = m01 = m02 = m11 = m12 = m22 = 0.0
+                n00 = n01 = n02 = n10 = n11 = n12 = n20 = n21 = n22 = 0.0
+                k0 = k1 = k2 = 0.0
+                if more:
+                    cross[:] = 0.0
+                    with_base[:] = 0.0
                 for i in range(sights.occurrence_begin[o], sights.occurrence_begin[o + 1]):
                     image = sights.image[i]
-                    for k in range(3):
-                        offset[k] = bearings.centre_m[image, k] - origin_m[j, k]
-                    in_front = sight(
-                        bearings.to_pixel[image],
-                        offset,
-                        vector[j],
-                        sights.uv_px[i],
-                        sights.whitening[i],
-                        residual,
-                        d_ray,
+                    c0, c1, c2 = centre_m[image, 0] - O0, centre_m[image, 1] - O1, centre_m[image, 2] - O2
+                    in_front, r0, r1, u, v, per_depth = sight(
+                        to_pixel, image, X0 - w * c0, X1 - w * c1, X2 - w * c2, uv_px, whitening, i
                     )
                     if not in_front:
                         cost += BEHIND_COST
                         continue
-                    squared = residual[0] * residual[0] + residual[1] * residual[1]
+                    squared = r0 * r0 + r1 * r1
                     cost += loss_cost(kind, width, squared)
                     root = np.sqrt(loss_weight(kind, width, squared))
-                    for m in range(2):
-                        residual[m] *= root
-                        d0, d1, d2 = root * d_ray[m, 0], root * d_ray[m, 1], root * d_ray[m, 2]
-                        d3 = -(d0 * offset[0] + d1 * offset[1] + d2 * offset[2])
-                        for k in range(3):
-                            b[m, k] = (
-                                d0 * basis[0, k] + d1 * basis[1, k] + d2 * basis[2, k] + d3 * basis[3, k]
-                            )
-                        e0 = d0 * R[0, 0] + d1 * R[1, 0] + d2 * R[2, 0]
-                        e1 = d0 * R[0, 1] + d1 * R[1, 1] + d2 * R[2, 1]
-                        e2 = d0 * R[0, 2] + d1 * R[1, 2] + d2 * R[2, 2]
-                        jac[m, 0] = e1 * x[2] - e2 * x[1]
-                        jac[m, 1] = e2 * x[0] - e0 * x[2]
-                        jac[m, 2] = e0 * x[1] - e1 * x[0]
-                        jac[m, 3], jac[m, 4], jac[m, 5] = -w * e0, -w * e1, -w * e2
-                    if rows > 6:
-                        # The projection, from the whitened residual before the loss.
-                        wh = sights.whitening[i]
-                        det = (wh[0, 0] * wh[1, 1] - wh[0, 1] * wh[1, 0]) * root
-                        uv[0] = sights.uv_px[i, 0] + (wh[1, 1] * residual[0] - wh[0, 1] * residual[1]) / det
-                        uv[1] = sights.uv_px[i, 1] + (wh[0, 0] * residual[1] - wh[1, 0] * residual[0]) / det
-                        _by_calibration(bearings, image, uv, wh, root, jac)
-                    r0, r1 = residual[0], residual[1]
-                    v00 += b[0, 0] * b[0, 0] + b[1, 0] * b[1, 0]
-                    v10 += b[0, 1] * b[0, 0] + b[1, 1] * b[1, 0]
-                    v11 += b[0, 1] * b[0, 1] + b[1, 1] * b[1, 1]
-                    v20 += b[0, 2] * b[0, 0] + b[1, 2] * b[1, 0]
-                    v21 += b[0, 2] * b[0, 1] + b[1, 2] * b[1, 1]
-                    v22 += b[0, 2] * b[0, 2] + b[1, 2] * b[1, 2]
-                    g0 += b[0, 0] * r0 + b[1, 0] * r1
-                    g1 += b[0, 1] * r0 + b[1, 1] * r1
-                    g2 += b[0, 2] * r0 + b[1, 2] * r1
-                    for p in range(rows):
-                        ja, jb = jac[0, p], jac[1, p]
-                        h[p] += ja * r0 + jb * r1
-                        for k in range(3):
-                            cross[p, k] += ja * b[0, k] + jb * b[1, k]
-                        for q in range(p, rows):
-                            H[p, q] += ja * jac[0, q] + jb * jac[1, q]
+                    r0, r1 = root * r0, root * r1
+                    d00, d01, d02, d10, d11, d12 = by_ray(
+                        to_pixel, image, u, v, root * per_depth, whitening, i
+                    )
+                    b00, b01, b02 = along(t, d00, d01, d02, -(d00 * c0 + d01 * c1 + d02 * c2))
+                    b10, b11, b12 = along(t, d10, d11, d12, -(d10 * c0 + d11 * c1 + d12 * c2))
+                    e00 = d00 * R00 + d01 * R10 + d02 * R20
+                    e01 = d00 * R01 + d01 * R11 + d02 * R21
+                    e02 = d00 * R02 + d01 * R12 + d02 * R22
+                    e10 = d10 * R00 + d11 * R10 + d12 * R20
+                    e11 = d10 * R01 + d11 * R11 + d12 * R21
+                    e12 = d10 * R02 + d11 * R12 + d12 * R22
+                    v00 += b00 * b00 + b10 * b10
+                    v10 += b01 * b00 + b11 * b10
+                    v11 += b01 * b01 + b11 * b11
+                    v20 += b02 * b00 + b12 * b10
+                    v21 += b02 * b01 + b12 * b11
+                    v22 += b02 * b02 + b12 * b12
+                    g0 += b00 * r0 + b10 * r1
+                    g1 += b01 * r0 + b11 * r1
+                    g2 += b02 * r0 + b12 * r1
+                    m00 += e00 * e00 + e10 * e10
+                    m01 += e00 * e01 + e10 * e11
+                    m02 += e00 * e02 + e10 * e12
+                    m11 += e01 * e01 + e11 * e11
+                    m12 += e01 * e02 + e11 * e12
+                    m22 += e02 * e02 + e12 * e12
+                    n00, n01, n02 = (
+                        n00 + e00 * b00 + e10 * b10,
+                        n01 + e00 * b01 + e10 * b11,
+                        n02 + e00 * b02 + e10 * b12,
+                    )
+                    n10, n11, n12 = (
+                        n10 + e01 * b00 + e11 * b10,
+                        n11 + e01 * b01 + e11 * b11,
+                        n12 + e01 * b02 + e11 * b12,
+                    )
+                    n20, n21, n22 = (
+                        n20 + e02 * b00 + e12 * b10,
+                        n21 + e02 * b01 + e12 * b11,
+                        n22 + e02 * b02 + e12 * b12,
+                    )
+                    k0 += e00 * r0 + e10 * r1
+                    k1 += e01 * r0 + e11 * r1
+                    k2 += e02 * r0 + e12 * r1
+                    if more:
+                        _by_calibration(bearings.calibration, image, u, v, whitening, i, root, jac)
+                        for p in range(more):
+                            ja, jb = jac[0, p], jac[1, p]
+                            cross[p, 0] += ja * b00 + jb * b10
+                            cross[p, 1] += ja * b01 + jb * b11
+                            cross[p, 2] += ja * b02 + jb * b12
+                            with_base[0, p] += ja * e00 + jb * e10
+                            with_base[1, p] += ja * e01 + jb * e11
+                            with_base[2, p] += ja * e02 + jb * e12
+                            unit_s[row, 6 + p] += ja * r0 + jb * r1
+                            for q in range(p, more):
+                                unit_H[row, 6 + p, 6 + q] += ja * jac[0, q] + jb * jac[1, q]
+                # A twist of the base moves the ray by [x]_x times its rotation and -w times its translation,
+                # x being the ray from the base to the landmark.
+                y0 = X0 - w * (unit_t[unit, 0] - O0)
+                y1 = X1 - w * (unit_t[unit, 1] - O1)
+                y2 = X2 - w * (unit_t[unit, 2] - O2)
+                x0 = R00 * y0 + R10 * y1 + R20 * y2
+                x1 = R01 * y0 + R11 * y1 + R21 * y2
+                x2 = R02 * y0 + R12 * y1 + R22 * y2
+                q00, q01, q02 = m01 * x2 - m02 * x1, m02 * x0 - m00 * x2, m00 * x1 - m01 * x0
+                q10, q11, q12 = m11 * x2 - m12 * x1, m12 * x0 - m01 * x2, m01 * x1 - m11 * x0
+                q20, q21, q22 = m12 * x2 - m22 * x1, m22 * x0 - m02 * x2, m02 * x1 - m12 * x0
+                unit_H[row, 0, 0] += x2 * q10 - x1 * q20
+                unit_H[row, 0, 1] += x2 * q11 - x1 * q21
+                unit_H[row, 0, 2] += x2 * q12 - x1 * q22
+                unit_H[row, 1, 1] += x0 * q21 - x2 * q01
+                unit_H[row, 1, 2] += x0 * q22 - x2 * q02
+                unit_H[row, 2, 2] += x1 * q02 - x0 * q12
+                unit_H[row, 0, 3] -= w * q00
+                unit_H[row, 0, 4] -= w * q10
+                unit_H[row, 0, 5] -= w * q20
+                unit_H[row, 1, 3] -= w * q01
+                unit_H[row, 1, 4] -= w * q11
+                unit_H[row, 1, 5] -= w * q21
+                unit_H[row, 2, 3] -= w * q02
+                unit_H[row, 2, 4] -= w * q12
+                unit_H[row, 2, 5] -= w * q22
+                unit_H[row, 3, 3] += w * w * m00
+                unit_H[row, 3, 4] += w * w * m01
+                unit_H[row, 3, 5] += w * w * m02
+                unit_H[row, 4, 4] += w * w * m11
+                unit_H[row, 4, 5] += w * w * m12
+                unit_H[row, 5, 5] += w * w * m22
+                unit_s[row, 0] += x2 * k1 - x1 * k2
+                unit_s[row, 1] += x0 * k2 - x2 * k0
+                unit_s[row, 2] += x1 * k0 - x0 * k1
+                unit_s[row, 3] -= w * k0
+                unit_s[row, 4] -= w * k1
+                unit_s[row, 5] -= w * k2
+                # The twist's part of E' (6, 3), a row each.
+                z00, z01, z02 = x2 * n10 - x1 * n20, x2 * n11 - x1 * n21, x2 * n12 - x1 * n22
+                z10, z11, z12 = x0 * n20 - x2 * n00, x0 * n21 - x2 * n01, x0 * n22 - x2 * n02
+                z20, z21, z22 = x1 * n00 - x0 * n10, x1 * n01 - x0 * n11, x1 * n02 - x0 * n12
+                z30, z31, z32 = -w * n00, -w * n01, -w * n02
+                z40, z41, z42 = -w * n10, -w * n11, -w * n12
+                z50, z51, z52 = -w * n20, -w * n21, -w * n22
+                if more:
+                    for p in range(more):
+                        f0, f1, f2 = with_base[0, p], with_base[1, p], with_base[2, p]
+                        unit_H[row, 0, 6 + p] += x2 * f1 - x1 * f2
+                        unit_H[row, 1, 6 + p] += x0 * f2 - x2 * f0
+                        unit_H[row, 2, 6 + p] += x1 * f0 - x0 * f1
+                        unit_H[row, 3, 6 + p] -= w * f0
+                        unit_H[row, 4, 6 + p] -= w * f1
+                        unit_H[row, 5, 6 + p] -= w * f2
                 place = sights.place_begin[o]
                 for segment in range(bearings.segment_begin[unit], bearings.segment_begin[unit + 1]):
-                    chain, first = bearings.chain[segment], sights.place[place]
+                    q = 6 * (first_pair + sights.place[place])
                     place += 1
-                    for q in range(bearings.segment_width[segment]):
-                        a0 = a1 = a2 = 0.0
-                        for p in range(rows):
-                            t = chain[p, q]
-                            a0 += t * cross[p, 0]
-                            a1 += t * cross[p, 1]
-                            a2 += t * cross[p, 2]
-                        arms[0, first + q] += a0
-                        arms[1, first + q] += a1
-                        arms[2, first + q] += a2
+                    if bearings.plain[segment]:
+                        _add_six(arms, q, z00, z10, z01, z11, z02, z12)
+                        _add_six(arms, q + 6, z20, z30, z21, z31, z22, z32)
+                        _add_six(arms, q + 12, z40, z50, z41, z51, z42, z52)
+                        continue
+                    for k in range(bearings.segment_width[segment]):
+                        h0, h1, h2 = chain[segment, 0, k], chain[segment, 1, k], chain[segment, 2, k]
+                        h3, h4, h5 = chain[segment, 3, k], chain[segment, 4, k], chain[segment, 5, k]
+                        a0 = h0 * z00 + h1 * z10 + h2 * z20 + h3 * z30 + h4 * z40 + h5 * z50
+                        a1 = h0 * z01 + h1 * z11 + h2 * z21 + h3 * z31 + h4 * z41 + h5 * z51
+                        a2 = h0 * z02 + h1 * z12 + h2 * z22 + h3 * z32 + h4 * z42 + h5 * z52
+                        if more:
+                            for p in range(more):
+                                a0 += chain[segment, 6 + p, k] * cross[p, 0]
+                                a1 += chain[segment, 6 + p, k] * cross[p, 1]
+                                a2 += chain[segment, 6 + p, k] * cross[p, 2]
+                        at = q + 6 * (k >> 1) + (k & 1)
+                        arms[at] += a0
+                        arms[at + 2] += a1
+                        arms[at + 4] += a2
             trace = v00 + v11 + v22
             # The weak prior goes to pivots that need it: on all landmarks together it would hold the world.
             floor, prior = _UNDETERMINED * trace, WEAK_PRIOR * trace + 1e-300
@@ -444,26 +620,34 @@ def _eliminating(rows: int) -> Callable[..., None]:
             p2 = max(v22 - l20 * l20 - l21 * l21, 0.0)
             l22 = np.sqrt(p2 if p2 > floor else p2 + prior)
             reduced.undetermined[j] = min(v00, p1, p2) <= floor
-            factor = reduced.factor[j]
-            factor[0], factor[1], factor[2], factor[3], factor[4], factor[5] = l00, l10, l11, l20, l21, l22
-            y0 = g0 / l00
-            y1 = (g1 - l10 * y0) / l11
-            y2 = (g2 - l20 * y0 - l21 * y1) / l22
-            reduced.gamma[j, 0], reduced.gamma[j, 1], reduced.gamma[j, 2] = y0, y1, y2
+            factor = reduced.factor
+            factor[j, 0], factor[j, 1], factor[j, 2] = l00, l10, l11
+            factor[j, 3], factor[j, 4], factor[j, 5] = l20, l21, l22
+            per0, per1, per2 = 1.0 / l00, 1.0 / l11, 1.0 / l22
+            g0 = g0 * per0
+            g1 = (g1 - l10 * g0) * per1
+            g2 = (g2 - l20 * g0 - l21 * g1) * per2
+            reduced.gamma[j, 0], reduced.gamma[j, 1], reduced.gamma[j, 2] = g0, g1, g2
             reduced.cost[j] = cost
-            for q in range(n):
-                a0 = arms[0, q] / l00
-                a1 = (arms[1, q] - l10 * a0) / l11
-                a2 = (arms[2, q] - l20 * a0 - l21 * a1) / l22
-                arms[0, q], arms[1, q], arms[2, q] = a0, a1, a2
-            _subtract(arms, column, reduced.gamma[j], paired, S, s)
-        _chain(unit_H, unit_s, unit_of, bearings, segment_column, S, s)
+            for p in range(first_pair, last_pair):
+                at, column = 6 * p, 2 * pair[p]
+                for q in range(at, at + 2):
+                    a0 = arms[q] * per0
+                    a1 = (arms[q + 2] - l10 * a0) * per1
+                    a2 = (arms[q + 4] - l20 * a0 - l21 * a1) * per2
+                    arms[q], arms[q + 2], arms[q + 4] = a0, a1, a2
+                    s[column] -= a0 * g0 + a1 * g1 + a2 * g2
+                    column += 1
+            # W'W: below the diagonal of a tile on it, this leaves numbers that mean nothing.
+            for p in range(first_pair, last_pair):
+                subtract_row(tiles, pair[p] * n_pairs, arms, p, last_pair, pair)
+        _chain(unit_H, unit_s, unit_of, bearings, segment_column, tiles, s)
 
     return eliminate
 
 
 eliminate_poses = _eliminating(6)
-"""Linearise and eliminate landmarks begin to end; adds to S (upper triangle) and s of their block.
+"""Linearise and eliminate landmarks begin to end; adds to S (upper triangle, in tiles) and s of their block.
 
 Exact Schur complement of the whitened, robustly weighted system: S = A'A - sum E V^-1 E' and
 s = A'r - sum E V^-1 g with E = A'B, V = B'B, g = B'r for the cameras' Jacobian A and each landmark's B.
@@ -493,40 +677,28 @@ def follow(
     joint step. Where it ends behind a camera or costs far more than before, a shorter one that costs least is
     taken, or none: a landmark that its linear prediction leads astray does not hold back all others.
     """
-    basis, step, trial = np.empty((4, 3)), np.empty(3), np.empty(4)
+    arms, factor, gamma = reduced.arms, reduced.factor, reduced.gamma
     for j in range(begin, end):
-        c0, c1 = sights.column_begin[j], sights.column_begin[j + 1]
-        n = c1 - c0
-        arms = reduced.arms[3 * c0 : 3 * c1].reshape(3, n)
-        y0, y1, y2 = reduced.gamma[j, 0], reduced.gamma[j, 1], reduced.gamma[j, 2]
-        for q in range(n):
-            d = dx[sights.column[c0 + q]]
-            y0 += arms[0, q] * d
-            y1 += arms[1, q] * d
-            y2 += arms[2, q] * d
-        f = reduced.factor[j]
-        step[2] = -y2 / f[5]
-        step[1] = (-y1 - f[4] * step[2]) / f[2]
-        step[0] = (-y0 - f[1] * step[1] - f[3] * step[2]) / f[0]
-        tangent_basis(vector[j], basis)
+        y0, y1, y2 = gamma[j, 0], gamma[j, 1], gamma[j, 2]
+        for p in range(sights.pair_begin[j], sights.pair_begin[j + 1]):
+            d0, d1, q = dx[2 * sights.pair[p]], dx[2 * sights.pair[p] + 1], 6 * p
+            y0 += arms[q] * d0 + arms[q + 1] * d1
+            y1 += arms[q + 2] * d0 + arms[q + 3] * d1
+            y2 += arms[q + 4] * d0 + arms[q + 5] * d1
+        s2 = -y2 / factor[j, 5]
+        s1 = (-y1 - factor[j, 4] * s2) / factor[j, 2]
+        s0 = (-y0 - factor[j, 1] * s1 - factor[j, 3] * s2) / factor[j, 0]
         limit = SURPRISE * reduced.cost[j] + SURPRISE_COST
+        a0, a1, a2, a3 = vector[j, 0], vector[j, 1], vector[j, 2], vector[j, 3]
+        t = tangents(a0, a1, a2, a3)
         cost[j] = np.inf
-        for k in range(4):
-            moved[j, k] = vector[j, k]
+        moved[j, 0], moved[j, 1], moved[j, 2], moved[j, 3] = a0, a1, a2, a3
         for share in (1.0, 0.5, 0.25, 0.0625, 0.0):
-            norm = 0.0
-            for k in range(4):
-                trial[k] = vector[j, k] + share * (
-                    basis[k, 0] * step[0] + basis[k, 1] * step[1] + basis[k, 2] * step[2]
-                )
-                norm += trial[k] * trial[k]
-            for k in range(4):
-                trial[k] /= np.sqrt(norm)
-            found = _landmark_cost(sights, bearings, trial, origin_m[j], kind, width, j)
+            x0, x1, x2, w = retracted(t, a0, a1, a2, a3, share * s0, share * s1, share * s2)
+            found = _landmark_cost(sights, bearings, x0, x1, x2, w, origin_m, kind, width, j)
             if found < cost[j]:
                 cost[j] = found
-                for k in range(4):  # whole rows take seconds to compile
-                    moved[j, k] = trial[k]
+                moved[j, 0], moved[j, 1], moved[j, 2], moved[j, 3] = x0, x1, x2, w
             if found <= limit:
                 break
 
@@ -535,27 +707,27 @@ def follow(
 def _landmark_cost(
     sights: Sights,
     bearings: Bearings,
-    vector: FloatArray,
+    x0: float,
+    x1: float,
+    x2: float,
+    w: float,
     origin_m: FloatArray,
     kind: int,
     width: float,
     j: int,
 ) -> float:
-    residual, d_ray, offset = np.empty(2), np.empty((2, 3)), np.empty(3)
+    """True cost of landmark j if it were at (x, w)."""
+    to_pixel, centre_m = bearings.to_pixel, bearings.centre_m
+    O0, O1, O2 = origin_m[j, 0], origin_m[j, 1], origin_m[j, 2]
     cost = 0.0
     first, last = sights.landmark_begin[j], sights.landmark_begin[j + 1]
     for i in range(sights.occurrence_begin[first], sights.occurrence_begin[last]):
         image = sights.image[i]
-        for k in range(3):
-            offset[k] = bearings.centre_m[image, k] - origin_m[k]
-        in_front = sight(
-            bearings.to_pixel[image], offset, vector, sights.uv_px[i], sights.whitening[i], residual, d_ray
-        )
-        if in_front:
-            squared = residual[0] * residual[0] + residual[1] * residual[1]
-            cost += loss_cost(kind, width, squared)
-        else:
-            cost += BEHIND_COST
+        y0 = x0 - w * (centre_m[image, 0] - O0)
+        y1 = x1 - w * (centre_m[image, 1] - O1)
+        y2 = x2 - w * (centre_m[image, 2] - O2)
+        in_front, r0, r1, _, _, _ = sight(to_pixel, image, y0, y1, y2, sights.uv_px, sights.whitening, i)
+        cost += loss_cost(kind, width, r0 * r0 + r1 * r1) if in_front else BEHIND_COST
     return cost
 
 
@@ -573,7 +745,8 @@ def costs(
     """True costs (m,) of the landmarks `which` (m,) if these were at `vector` (m, 4)."""
     for i in range(len(which)):
         j = which[i]
-        cost[i] = _landmark_cost(sights, bearings, vector[i], origin_m[j], kind, width, j)
+        x0, x1, x2, w = vector[i, 0], vector[i, 1], vector[i, 2], vector[i, 3]
+        cost[i] = _landmark_cost(sights, bearings, x0, x1, x2, w, origin_m, kind, width, j)
 
 
 @compiled
@@ -583,9 +756,9 @@ def arrange(
     image: IntArray,
     image_unit: IntArray,
     segment_begin: IntArray,
-    segment_width: IntArray,
-    segment_column: IntArray,
-    n_columns: int,
+    segment_pairs: IntArray,
+    segment_pair: IntArray,
+    n_pairs: int,
     first_landmark: int,
     rows: IntArray,
     sights: Sights,
@@ -595,13 +768,13 @@ def arrange(
 
     `landmarks` (m,) are rows in measurements whose observations of landmark j are begin[j] to begin[j + 1].
     Fills `rows` (n,), the measurement of each observation, and the structure of `sights` from where `cursor`
-    (observations, occurrences, places, columns) stands, and moves the cursor on.
+    (observations, occurrences, places, pairs) stands, and moves the cursor on.
     """
     unit_row = np.full(len(segment_begin) - 1, -1)
-    place_of = np.full(n_columns, -1)
-    starts = np.empty(n_columns, dtype=np.int64)
+    place_of = np.full(n_pairs, -1)
+    starts = np.empty(n_pairs, dtype=np.int64)
     n_units = 0
-    n_obs, n_occurrences, n_places, n_column = cursor[0], cursor[1], cursor[2], cursor[3]
+    n_obs, n_occurrences, n_places, n_touched = cursor[0], cursor[1], cursor[2], cursor[3]
     for m in range(len(landmarks)):
         j, first_occurrence = landmarks[m], n_occurrences
         first_obs, last_obs = n_obs, n_obs + begin[j + 1] - begin[j]
@@ -626,35 +799,60 @@ def arrange(
             sights.occurrence_row[n_occurrences] = unit_row[unit]
             n_occurrences += 1
             for segment in range(segment_begin[unit], segment_begin[unit + 1]):
-                column = segment_column[segment]
-                if place_of[column] < 0:
-                    place_of[column] = segment_width[segment]
+                first = segment_pair[segment]
+                if place_of[first] < 0:
+                    place_of[first] = segment_pairs[segment]
                     k = n_starts
-                    while k > 0 and starts[k - 1] > column:
+                    while k > 0 and starts[k - 1] > first:
                         starts[k] = starts[k - 1]
                         k -= 1
-                    starts[k] = column
+                    starts[k] = first
                     n_starts += 1
         sights.landmark_begin[first_landmark + m] = first_occurrence
-        sights.column_begin[first_landmark + m] = n_column
+        sights.pair_begin[first_landmark + m] = n_touched
         place = 0
         for k in range(n_starts):
-            wide = place_of[starts[k]]
+            many = place_of[starts[k]]
             place_of[starts[k]] = place
-            for q in range(wide):
-                sights.column[n_column] = starts[k] + q
-                n_column += 1
-            place += wide
+            for q in range(many):
+                sights.pair[n_touched] = starts[k] + q
+                n_touched += 1
+            place += many
         for o in range(first_occurrence, n_occurrences):
             sights.place_begin[o] = n_places
             unit = sights.occurrence_unit[o]
             for segment in range(segment_begin[unit], segment_begin[unit + 1]):
-                sights.place[n_places] = place_of[segment_column[segment]]
+                sights.place[n_places] = place_of[segment_pair[segment]]
                 n_places += 1
         for k in range(n_starts):
             place_of[starts[k]] = -1
-    cursor[0], cursor[1], cursor[2], cursor[3] = n_obs, n_occurrences, n_places, n_column
+    cursor[0], cursor[1], cursor[2], cursor[3] = n_obs, n_occurrences, n_places, n_touched
     return n_units
+
+
+@compiled
+def gather(
+    tiles: FloatArray,
+    s: FloatArray,
+    first: int,
+    last: int,
+    row: IntArray,
+    column: IntArray,
+    panel: FloatArray,
+) -> None:
+    """Add rows first to last of a block's system to a group's panel, its last column being s.
+
+    `row` and `column` say where each of the block's columns is in the panel; -1: nowhere.
+    """
+    n_pairs = len(s) // 2
+    for p in range(first, last):
+        r = row[p]
+        if r < 0:
+            continue
+        panel[r, panel.shape[1] - 1] += s[p]
+        for q in range(p, len(s)):
+            if column[q] >= 0:
+                panel[r, column[q]] += tiles[_tile(p, q, n_pairs)]
 
 
 @compiled
@@ -671,25 +869,26 @@ def spread(
 
     L^-T (I + W C W') L^-1 in the tangent space, with W the `arms`, taken through the derivative of X / w.
     """
-    basis, tangent, half, point = np.empty((4, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    arms, pair = reduced.arms, sights.pair
+    tangent, half, point = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for j in range(begin, end):
-        c0, c1 = sights.column_begin[j], sights.column_begin[j + 1]
-        n = c1 - c0
-        arms, column = reduced.arms[3 * c0 : 3 * c1].reshape(3, n), sights.column[c0:c1]
+        first, last = sights.pair_begin[j], sights.pair_begin[j + 1]
         for a in range(3):
             for b in range(3):
                 tangent[a, b] = 1.0 if a == b else 0.0
-        for p in range(n):
-            for q in range(n):
-                c = joint[column[p], column[q]]
+        for p in range(2 * first, 2 * last):
+            row, i = 2 * pair[p >> 1] + (p & 1), 6 * (p >> 1) + (p & 1)
+            for q in range(2 * first, 2 * last):
+                c, k = joint[row, 2 * pair[q >> 1] + (q & 1)], 6 * (q >> 1) + (q & 1)
                 for a in range(3):
                     for b in range(3):
-                        tangent[a, b] += arms[a, p] * c * arms[b, q]
-        tangent_basis(vector[j], basis)
+                        tangent[a, b] += arms[i + 2 * a] * c * arms[k + 2 * b]
         w = vector[j, 3]
+        t = tangents(vector[j, 0], vector[j, 1], vector[j, 2], w)
         for k in range(3):
+            far = vector[j, k] / (w * w)
             for a in range(3):
-                point[k, a] = basis[k, a] / w - vector[j, k] * basis[3, a] / (w * w)
+                point[k, a] = t[3 * k + a] / w - far * t[9 + a]
         f = reduced.factor[j]
         for k in range(3):  # rows of point L^-T
             half[k, 0] = point[k, 0] / f[0]
@@ -729,26 +928,6 @@ class Seen(NamedTuple):
     """(images, 3, 3) world directions to homogeneous pixels"""
     centre_m: FloatArray
     """(images, 3)"""
-
-
-class _Sighting(NamedTuple):
-    """One observation of one landmark: what a loop writes to in passing, allocated once."""
-
-    basis: FloatArray
-    """(4, 3) tangents of S^3 at the landmark"""
-    residual: FloatArray
-    """(2,) whitened"""
-    b: FloatArray
-    """(2, 3) its derivative by the tangents"""
-    d_ray: FloatArray
-    """(2, 3) its derivative by the world ray"""
-    offset: FloatArray
-    """(3,) from the landmark's origin to the camera"""
-
-
-@compiled
-def _sighting() -> _Sighting:
-    return _Sighting(np.empty((4, 3)), np.empty(2), np.empty((2, 3)), np.empty((2, 3)), np.empty(3))
 
 
 # --- small pieces ---
@@ -795,38 +974,47 @@ def eigen(a: FloatArray, turn: FloatArray) -> None:
 
 
 @compiled
-def _observe(seen: Seen, i: int, vector: FloatArray, origin_m: FloatArray, at: _Sighting) -> bool:
-    """Residual and derivative of one observation to `at`, by the tangents there; whether in front."""
+def _observe(
+    seen: Seen,
+    i: int,
+    t: Tangents,
+    x0: float,
+    x1: float,
+    x2: float,
+    w: float,
+    O0: float,
+    O1: float,
+    O2: float,
+) -> tuple[bool, float, float, float, float, float, float, float, float]:
+    """Observation i of a landmark (x, w) about O: in front, residual, derivative (2, 3) by the tangents."""
     image = seen.image[i]
-    offset, d_ray, basis, b = at.offset, at.d_ray, at.basis, at.b
-    for k in range(3):
-        offset[k] = seen.centre_m[image, k] - origin_m[k]
-    in_front = sight(
-        seen.to_pixel[image], offset, vector, seen.uv_px[i], seen.whitening[i], at.residual, d_ray
+    c0, c1, c2 = seen.centre_m[image, 0] - O0, seen.centre_m[image, 1] - O1, seen.centre_m[image, 2] - O2
+    in_front, r0, r1, u, v, per_depth = sight(
+        seen.to_pixel, image, x0 - w * c0, x1 - w * c1, x2 - w * c2, seen.uv_px, seen.whitening, i
     )
-    for m in range(2):
-        d0, d1, d2 = d_ray[m, 0], d_ray[m, 1], d_ray[m, 2]
-        d3 = -(d0 * offset[0] + d1 * offset[1] + d2 * offset[2])
-        for k in range(3):
-            b[m, k] = d0 * basis[0, k] + d1 * basis[1, k] + d2 * basis[2, k] + d3 * basis[3, k]
-    return in_front
+    d00, d01, d02, d10, d11, d12 = by_ray(seen.to_pixel, image, u, v, per_depth, seen.whitening, i)
+    b00, b01, b02 = along(t, d00, d01, d02, -(d00 * c0 + d01 * c1 + d02 * c2))
+    b10, b11, b12 = along(t, d10, d11, d12, -(d10 * c0 + d11 * c1 + d12 * c2))
+    return in_front, r0, r1, b00, b01, b02, b10, b11, b12
 
 
 @compiled
-def _hold_w(b: FloatArray, basis: FloatArray) -> None:
-    """Take from a derivative (2, 3) at w = 0 its part along w, where that is one of the tangents."""
-    for m in range(2):
-        along = b[m, 0] * basis[3, 0] + b[m, 1] * basis[3, 1] + b[m, 2] * basis[3, 2]
-        for k in range(3):
-            b[m, k] -= along * basis[3, k]
+def _hold_w(t: Tangents, b0: float, b1: float, b2: float) -> tuple[float, float, float]:
+    """A derivative by the tangents at w = 0, less its part along w, which is one of them."""
+    part = b0 * t[9] + b1 * t[10] + b2 * t[11]
+    return b0 - part * t[9], b1 - part * t[10], b2 - part * t[11]
 
 
 @compiled
-def _add_normal(b: FloatArray, weight: float, v: FloatArray) -> None:
-    """Add one observation's part to a normal matrix (3, 3)."""
-    for p in range(3):
-        for q in range(3):
-            v[p, q] += weight * (b[0, p] * b[0, q] + b[1, p] * b[1, q])
+def _add_normal(v: FloatArray, weight: float, b0: float, b1: float, b2: float) -> None:
+    """Add one row of a Jacobian to a normal matrix (3, 3)."""
+    v[0, 0] += weight * b0 * b0
+    v[1, 1] += weight * b1 * b1
+    v[2, 2] += weight * b2 * b2
+    v[0, 1] += weight * b0 * b1
+    v[0, 2] += weight * b0 * b2
+    v[1, 2] += weight * b1 * b2
+    v[1, 0], v[2, 0], v[2, 1] = v[0, 1], v[0, 2], v[1, 2]
 
 
 # --- per observation ---
@@ -991,16 +1179,15 @@ def evaluate(
     in_front: BoolArray,
 ) -> None:
     """Whitened residuals (n, 2), their derivatives (n, 2, 3) by the tangents, and what is in front (n,)."""
-    at = _sighting()
     for j in which:
-        tangent_basis(vector[j], at.basis)
+        x0, x1, x2, w = vector[j, 0], vector[j, 1], vector[j, 2], vector[j, 3]
+        t, O0, O1, O2 = tangents(x0, x1, x2, w), origin_m[j, 0], origin_m[j, 1], origin_m[j, 2]
         for i in range(seen.begin[j], seen.begin[j + 1]):
-            in_front[i] = _observe(seen, i, vector[j], origin_m[j], at)
-            # Entry by entry: numba compiles an assignment of whole arrays for seconds.
-            for m in range(2):
-                residual[i, m] = at.residual[m]
-                for k in range(3):
-                    b[i, m, k] = at.b[m, k]
+            in_front[i], residual[i, 0], residual[i, 1], b00, b01, b02, b10, b11, b12 = _observe(
+                seen, i, t, x0, x1, x2, w, O0, O1, O2
+            )
+            b[i, 0, 0], b[i, 0, 1], b[i, 0, 2] = b00, b01, b02
+            b[i, 1, 0], b[i, 1, 1], b[i, 1, 2] = b10, b11, b12
 
 
 @compiled
@@ -1013,22 +1200,27 @@ def residuals(
     in_front: BoolArray,
 ) -> None:
     """`evaluate` without derivatives."""
-    at = _sighting()
     for j in which:
+        x0, x1, x2, w = vector[j, 0], vector[j, 1], vector[j, 2], vector[j, 3]
         for i in range(seen.begin[j], seen.begin[j + 1]):
-            in_front[i] = _observe(seen, i, vector[j], origin_m[j], at)
-            residual[i, 0], residual[i, 1] = at.residual[0], at.residual[1]
+            image = seen.image[i]
+            y0 = x0 - w * (seen.centre_m[image, 0] - origin_m[j, 0])
+            y1 = x1 - w * (seen.centre_m[image, 1] - origin_m[j, 1])
+            y2 = x2 - w * (seen.centre_m[image, 2] - origin_m[j, 2])
+            in_front[i], residual[i, 0], residual[i, 1], _, _, _ = sight(
+                seen.to_pixel, image, y0, y1, y2, seen.uv_px, seen.whitening, i
+            )
 
 
 @compiled
 def free_derivatives(which: IntArray, begin: IntArray, vector: FloatArray, b: FloatArray) -> None:
     """Take from derivatives (n, 2, 3) their part along w where a landmark is held at infinity."""
-    basis = np.empty((4, 3))
     for j in which:
         if vector[j, 3] == 0:
-            tangent_basis(vector[j], basis)
+            t = tangents(vector[j, 0], vector[j, 1], vector[j, 2], vector[j, 3])
             for i in range(begin[j], begin[j + 1]):
-                _hold_w(b[i], basis)
+                for m in range(2):
+                    b[i, m, 0], b[i, m, 1], b[i, m, 2] = _hold_w(t, b[i, m, 0], b[i, m, 1], b[i, m, 2])
 
 
 @compiled
@@ -1038,7 +1230,8 @@ def cofactors(which: IntArray, begin: IntArray, b: FloatArray, weight: FloatArra
     for j in which:
         v[:] = 0.0
         for i in range(begin[j], begin[j + 1]):
-            _add_normal(b[i], weight[i], v)
+            for m in range(2):
+                _add_normal(v, weight[i], b[i, m, 0], b[i, m, 1], b[i, m, 2])
         eigen(v, turn)
         # Directions that the accepted rays leave free: their observations determine them, whatever they say.
         least = 1e-14 * max(v[0, 0], v[1, 1], v[2, 2]) + 1e-100
@@ -1060,18 +1253,23 @@ def smallest_information(
     which: IntArray, seen: Seen, points_m: FloatArray, weight: FloatArray, out: FloatArray
 ) -> None:
     """Smallest eigenvalue (landmarks,) of the information about world points, in 1 / m^2."""
-    v, turn, vector = np.empty((3, 3)), np.empty((3, 3)), np.ones(4)
-    residual, d_ray = np.empty(2), np.empty((2, 3))
+    v, turn = np.empty((3, 3)), np.empty((3, 3))
     for j in which:
-        for k in range(3):
-            vector[k] = points_m[j, k]
         v[:] = 0.0
         for i in range(seen.begin[j], seen.begin[j + 1]):
             if weight[i] > 0:
                 image = seen.image[i]
-                centre = seen.centre_m[image]
-                sight(seen.to_pixel[image], centre, vector, seen.uv_px[i], seen.whitening[i], residual, d_ray)
-                _add_normal(d_ray, weight[i], v)
+                y0 = points_m[j, 0] - seen.centre_m[image, 0]
+                y1 = points_m[j, 1] - seen.centre_m[image, 1]
+                y2 = points_m[j, 2] - seen.centre_m[image, 2]
+                _, _, _, u, v_px, per_depth = sight(
+                    seen.to_pixel, image, y0, y1, y2, seen.uv_px, seen.whitening, i
+                )
+                d00, d01, d02, d10, d11, d12 = by_ray(
+                    seen.to_pixel, image, u, v_px, per_depth, seen.whitening, i
+                )
+                _add_normal(v, weight[i], d00, d01, d02)
+                _add_normal(v, weight[i], d10, d11, d12)
         eigen(v, turn)
         out[j] = min(v[0, 0], v[1, 1], v[2, 2])
 
@@ -1083,50 +1281,69 @@ def smallest_information(
 def _normal(
     seen: Seen,
     j: int,
-    vector: FloatArray,
+    t: Tangents,
+    x0: float,
+    x1: float,
+    x2: float,
+    w: float,
     origin_m: FloatArray,
     weight: FloatArray,
     kind: int,
     width: float,
     held: bool,
-    at: _Sighting,
     v: FloatArray,
     g: FloatArray,
 ) -> float:
-    """Cost of landmark j at a vector (4,), its normal matrix (3, 3) and its gradient (3,)."""
-    tangent_basis(vector, at.basis)
-    b, residual = at.b, at.residual
+    """Cost of landmark j at (x, w) with its tangents, its normal matrix (3, 3) and its gradient (3,)."""
+    O0, O1, O2 = origin_m[j, 0], origin_m[j, 1], origin_m[j, 2]
     v[:] = 0.0
     g[:] = 0.0
     cost = 0.0
     for i in range(seen.begin[j], seen.begin[j + 1]):
         if weight[i] == 0:
             continue
-        in_front = _observe(seen, i, vector, origin_m, at)
+        in_front, r0, r1, b00, b01, b02, b10, b11, b12 = _observe(seen, i, t, x0, x1, x2, w, O0, O1, O2)
         if held:
-            _hold_w(b, at.basis)
-        squared = residual[0] * residual[0] + residual[1] * residual[1]
+            b00, b01, b02 = _hold_w(t, b00, b01, b02)
+            b10, b11, b12 = _hold_w(t, b10, b11, b12)
+        squared = r0 * r0 + r1 * r1
         cost += weight[i] * (loss_cost(kind, width, squared) + (0.0 if in_front else _REFINE_BEHIND_COST))
         own = weight[i] * loss_weight(kind, width, squared)
-        _add_normal(b, own, v)
-        for k in range(3):
-            g[k] += own * (b[0, k] * residual[0] + b[1, k] * residual[1])
+        _add_normal(v, own, b00, b01, b02)
+        _add_normal(v, own, b10, b11, b12)
+        g[0] += own * (b00 * r0 + b10 * r1)
+        g[1] += own * (b01 * r0 + b11 * r1)
+        g[2] += own * (b02 * r0 + b12 * r1)
     return cost
 
 
 @compiled
 def _newton(v: FloatArray, g: FloatArray, turn: FloatArray, step: FloatArray) -> float:
     """Step (3,) -V^-1 g along those directions that the rays determine; its product with g. Destroys V."""
+    floor = _UNDETERMINED * (v[0, 0] + v[1, 1] + v[2, 2])
+    if v[0, 0] > floor:
+        l10, l20 = v[1, 0] / v[0, 0], v[2, 0] / v[0, 0]
+        p1 = v[1, 1] - l10 * v[1, 0]
+        if p1 > floor:
+            l21 = (v[2, 1] - l20 * v[1, 0]) / p1
+            p2 = v[2, 2] - l20 * v[2, 0] - l21 * l21 * p1
+            if p2 > floor:  # all three are determined
+                y1 = g[1] - l10 * g[0]
+                y2 = g[2] - l20 * g[0] - l21 * y1
+                step[2] = -y2 / p2
+                step[1] = -y1 / p1 - l21 * step[2]
+                step[0] = -g[0] / v[0, 0] - l10 * step[1] - l20 * step[2]
+                return float(step[0] * g[0] + step[1] * g[1] + step[2] * g[2])
     eigen(v, turn)
     floor = 1e-13 * max(v[0, 0], v[1, 1], v[2, 2]) + 1e-300
     step[:] = 0.0
     slope = 0.0
     for k in range(3):
         if v[k, k] > floor:
-            along = turn[0, k] * g[0] + turn[1, k] * g[1] + turn[2, k] * g[2]
-            slope -= along * along / v[k, k]
+            part = turn[0, k] * g[0] + turn[1, k] * g[1] + turn[2, k] * g[2]
+            slope -= part * part / v[k, k]
             for p in range(3):
-                step[p] -= turn[p, k] * along / v[k, k]
+                step[p] -= turn[p, k] * part / v[k, k]
     return slope
 
 
@@ -1139,53 +1356,49 @@ def refine(
     kind: int,
     width: float,
     beyond_infinity: bool,
+    tolerance: float,
     vector: FloatArray,
 ) -> None:
     """Best landmarks, from `vector` (landmarks, 4) and back to it; see `landmarks.refine`."""
-    at, v, g, turn = _sighting(), np.empty((3, 3)), np.empty(3), np.empty((3, 3))
-    step, trial = np.empty(3), np.empty(4)
+    v, g, turn, step = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)
     for j in which:
-        here, origin = vector[j], origin_m[j]
+        a0, a1, a2, a3 = vector[j, 0], vector[j, 1], vector[j, 2], vector[j, 3]
         held = False
         while True:
-            cost = _normal(seen, j, here, origin, weight, kind, width, held, at, v, g)
+            t = tangents(a0, a1, a2, a3)
+            cost = _normal(seen, j, t, a0, a1, a2, a3, origin_m, weight, kind, width, held, v, g)
             slope = _newton(v, g, turn, step)
             damping = 1e-6
             for _ in range(_REFINE_STEPS):
                 length = np.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
                 share = min(1.0 / (1.0 + damping), 0.5 / max(length, 1e-300))
-                tangent_basis(here, at.basis)
-                norm = 0.0
-                for p in range(4):
-                    along = at.basis[p, 0] * step[0] + at.basis[p, 1] * step[1] + at.basis[p, 2] * step[2]
-                    trial[p] = here[p] + share * along
-                    if held and p == 3:
-                        trial[p] = 0.0
-                    norm += trial[p] * trial[p]
-                for p in range(4):
-                    trial[p] /= np.sqrt(norm)
-                trial_cost = _normal(seen, j, trial, origin, weight, kind, width, held, at, v, g)
+                x0, x1, x2, x3 = retracted(
+                    t, a0, a1, a2, a3, share * step[0], share * step[1], share * step[2]
+                )
+                if held:  # a step along the horizon leaves w at 0, but for rounding
+                    x3 = 0.0
+                tried = tangents(x0, x1, x2, x3)
+                trial_cost = _normal(
+                    seen, j, tried, x0, x1, x2, x3, origin_m, weight, kind, width, held, v, g
+                )
                 better = trial_cost < cost
                 damping = min(max(damping * (0.1 if better else 100.0), 1e-12), 1e9)
                 # A landmark stays where a step promises next to nothing, or where no damping makes one gain.
-                settled = -0.5 * share * slope <= 1e-9 * cost + 1e-12 or (not better and damping > 1e6)
+                settled = -0.5 * share * slope <= tolerance * cost + 1e-12 or (not better and damping > 1e6)
                 if better:
-                    for p in range(4):
-                        here[p] = trial[p]
-                    cost = trial_cost
+                    a0, a1, a2, a3, t, cost = x0, x1, x2, x3, tried, trial_cost
                 if settled:
                     break
                 if better:
                     slope = _newton(v, g, turn, step)
-            norm = np.sqrt(here[0] * here[0] + here[1] * here[1] + here[2] * here[2])
+            norm = np.sqrt(a0 * a0 + a1 * a1 + a2 * a2)
             # One whose vector is its origin alone has no direction in which infinity could be.
-            if held or beyond_infinity or not (here[3] < 0 and norm > 1e-9):
+            if held or beyond_infinity or not (a3 < 0 and norm > 1e-9):
                 break
             # Beyond infinity: brought to it, and refined there.
-            for k in range(3):
-                here[k] /= norm
-            here[3] = 0.0
+            a0, a1, a2, a3 = a0 / norm, a1 / norm, a2 / norm, 0.0
             held = True
+        vector[j, 0], vector[j, 1], vector[j, 2], vector[j, 3] = a0, a1, a2, a3
 
 
 # --- rejection ---

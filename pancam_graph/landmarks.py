@@ -20,6 +20,8 @@ from pancam_graph.threads import in_parallel
 
 _GRAIN = 1024
 _RAY_GRAIN = 16384
+_SETTLED = 1e-9
+"""A landmark is refined until that promises no more than this share of its cost."""
 
 __all__ = [
     "CameraViews",
@@ -83,6 +85,12 @@ class Measurements:
         """(landmarks,) first row of each landmark."""
         return self.begin[:-1]
 
+    @cached_property
+    def typical_sigma_px(self) -> float:
+        """Median standard deviation of a measurement's coordinate."""
+        w = self.whitening
+        return float(np.median(1 / np.sqrt(np.abs(w[:, 0, 0] * w[:, 1, 1] - w[:, 0, 1] * w[:, 1, 0]))))
+
     def part(self, rows: IntArray) -> "Measurements":
         """Rows of whole landmarks, these numbered anew without gaps."""
         return replace(
@@ -90,8 +98,8 @@ class Measurements:
             row=self.row[rows],
             image=self.image[rows],
             landmark=np.unique(self.landmark[rows], return_inverse=True)[1],
-            uv_px=self.uv_px[rows],
-            whitening=self.whitening[rows],
+            uv_px=self.uv_px.take(rows, axis=0),
+            whitening=self.whitening.take(rows, axis=0),
         )
 
     def scaled(self, factor: FloatArray | float) -> "Measurements":
@@ -226,7 +234,9 @@ def refine(
     start, origin = _arrays(landmarks, measurements)
     own, vector = as_floats(weight, (len(measurements.image),)), start.copy()
     which = np.arange(len(vector)) if only is None else only
-    over_landmarks(kernel.refine, which, seen, origin, own, loss.kind, loss.width, beyond_infinity, vector)
+    over_landmarks(
+        kernel.refine, which, seen, origin, own, loss.kind, loss.width, beyond_infinity, _SETTLED, vector
+    )
     return replace(landmarks, vector=vector)
 
 
@@ -260,9 +270,11 @@ def point_sigma_m(
     return np.where(few | (smallest <= 0), np.inf, 1 / np.sqrt(smallest.clip(1e-300)))
 
 
-def over_landmarks(loop: Callable[..., None], which: IntArray, *arguments: object) -> None:
+def over_landmarks(
+    loop: Callable[..., None], which: IntArray, *arguments: object, grain: int = _GRAIN
+) -> None:
     """Call loop(part, *arguments) for parts of the landmarks `which`, over all threads."""
-    in_parallel(lambda first, last: loop(which[first:last], *arguments), len(which), grain=_GRAIN)
+    in_parallel(lambda first, last: loop(which[first:last], *arguments), len(which), grain=grain)
 
 
 # --- arrays as the compiled loops take them ---

@@ -3,11 +3,13 @@
 from itertools import combinations, pairwise
 
 import gtsam
+import numba
 import numpy as np
 import pytest
 from elimination_reference import assert_systems_agree, dense_of, true_cost, whole
 from landmark_scenes import measure, random_points, random_views, unit
 
+from pancam_graph import kernel
 from pancam_graph.elimination import LandmarkSystem, Linkage, Panels, Posture, Root, pattern
 from pancam_graph.errors import SolveError
 from pancam_graph.geometry import FloatArray, IntArray
@@ -265,6 +267,7 @@ class Rigged:
             segment_variable=np.array(variable).ravel(),
             segment_column=np.zeros(2 * n, dtype=np.int64),
             segment_width=np.tile([6, 5], n),
+            segment_plain=np.tile([True, False], n),
         )
         self.begin = np.concatenate([[0], np.cumsum(dim)])
 
@@ -310,7 +313,8 @@ def test_free_calibrations_eliminate_as_dense_ones(shared: bool, far: bool, loss
 
 
 @pytest.mark.parametrize("shared", [False, True])
-def test_landmarks_follow_a_step_of_free_calibrations(shared: bool) -> None:
+def test_landmarks_follow_a_step_of_free_calibrations(shared: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pancam_graph.elimination._system._STRAY", np.inf)  # nothing is refined after it
     rigged, loss = Rigged(shared=shared), loss_of("huber")
     n = int(rigged.begin[-1])
     expected = dense_of(rigged.after, n, rigged.m, rigged.landmarks, loss)
@@ -333,3 +337,26 @@ def test_landmarks_come_back_in_the_order_they_were_given_in() -> None:
     system = LandmarkSystem(rigged.linkage, rigged.m, rigged.landmarks)
     assert not np.array_equal(system.landmark_row, np.arange(len(system.landmark_row)))
     assert np.array_equal(system.landmarks().vector, rigged.landmarks.vector)
+
+
+@pytest.mark.parametrize("pairs", [(0, 1, 2), (1, 4), (3,)])
+def test_the_innermost_loop_in_vectors_is_the_plain_one(pairs: tuple[int, ...]) -> None:
+    """`subtract_row` as compiled, and what stands for it where nothing is."""
+    rng = np.random.default_rng(3)
+    pair, n_pairs = np.array(pairs), 5
+    arms, tiles = rng.normal(size=6 * len(pair)), rng.normal(size=4 * n_pairs**2)
+    plain, arms_of = tiles.copy(), arms.reshape(-1, 3, 2)
+    S = tiles.reshape(n_pairs, n_pairs, 2, 2).copy()
+
+    @numba.njit
+    def in_vectors(tiles: FloatArray, arms: FloatArray, pair: IntArray, n_pairs: int) -> None:
+        for p in range(len(pair)):
+            kernel.subtract_row(tiles, pair[p] * n_pairs, arms, p, len(pair), pair)
+
+    in_vectors(tiles, arms, pair, n_pairs)
+    for p in range(len(pair)):
+        kernel.subtract_row_plainly(plain, pair[p] * n_pairs, arms, p, len(pair), pair)
+        for q in range(p, len(pair)):
+            S[pair[p], pair[q]] -= arms_of[p].T @ arms_of[q]
+    assert tiles == pytest.approx(S.ravel(), abs=1e-14)
+    assert plain == pytest.approx(S.ravel(), abs=1e-14)

@@ -10,13 +10,16 @@ from elimination_reference import Dense, assert_systems_agree, dense_of, true_co
 
 from pancam_graph import SimulationOptions, SolveOptions, simulate
 from pancam_graph._adjustment import Adjustment
+from pancam_graph._eliminated import EliminatedSolver
+from pancam_graph._optimise import StopRule
 from pancam_graph._problem import Problem, system_of
+from pancam_graph._reduced import joint_root
 from pancam_graph.elimination import Posture
 from pancam_graph.factors import LandmarkBlocks
 from pancam_graph.geometry import FloatArray
 from pancam_graph.graph import Flex, read_variable
 from pancam_graph.landmarks import CameraViews
-from pancam_graph.losses import Loss, LossName, loss_of
+from pancam_graph.losses import SQUARED, Loss, LossName, loss_of
 from pancam_graph.rigs import exomars_pancam
 from pancam_graph.simulate import Simulation
 
@@ -26,6 +29,8 @@ MODELS = {
     "soft": SolveOptions(loss="none", tie="soft", flex=Flex(rotation_rad=1e-4, translation_m=1e-3)),
     "circle": SolveOptions(loss="none", model="circle"),
 }
+
+RULE = StopRule(max_iterations=50, relative_decrease=1e-13)
 
 
 @cache
@@ -147,8 +152,9 @@ def test_error_where_it_is_linearised_is_half_the_squares_of_the_linear_system(
 @pytest.mark.parametrize("loss", ["none", "huber", "cauchy"])
 @pytest.mark.parametrize("model", ["hard", "soft"])
 def test_error_elsewhere_is_the_true_cost_of_the_landmarks_that_followed(
-    model: str, loss: LossName, size: float
+    model: str, loss: LossName, size: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("pancam_graph.elimination._system._STRAY", np.inf)  # nothing is refined after it
     problem, chosen = problem_of(model), loss_of(loss)
     expected, link = dense(problem, chosen), problem.template.linkage
     blocks, graph = blocks_of(problem, chosen)
@@ -159,7 +165,9 @@ def test_error_elsewhere_is_the_true_cost_of_the_landmarks_that_followed(
     dx = np.concatenate([step.at(link.key[v]) for v in np.flatnonzero(link.touched)])
     followed, views = expected.followed(dx), problem.template.views(values)
     assert error == pytest.approx(true_cost(followed, problem.measurements, views, chosen), rel=1e-7)
-    assert blocks.settle(values) == pytest.approx(error, rel=1e-13)
+    assert blocks.settle(values)
+    assert not blocks.settle(values)
+    assert graph.error(values) == pytest.approx(error, rel=1e-13)
     assert blocks.system.landmarks().vector == pytest.approx(followed.vector, abs=1e-9)
 
 
@@ -171,7 +179,9 @@ def test_error_far_off_is_that_of_landmarks_held_back_or_placed_anew(size: float
     graph.linearize(problem.values)
     values = problem.values.retract(random_step(problem, np.random.default_rng(2), size))
     error = graph.error(values)
-    assert blocks.settle(values) == pytest.approx(error, rel=1e-13)
+    assert blocks.settle(values)
+    assert not blocks.settle(values)
+    assert graph.error(values) == pytest.approx(error, rel=1e-13)
     views = problem.template.views(values)
     landmarks = blocks.system.landmarks()
     assert error == pytest.approx(true_cost(landmarks, problem.measurements, views, chosen), rel=1e-9)
@@ -263,3 +273,16 @@ def test_an_exception_of_the_posture_reaches_the_caller_of_the_optimiser() -> No
     optimiser = gtsam.LevenbergMarquardtOptimizer(graph, problem.values)
     with pytest.raises(LookupError, match="no such posture: 4711"):
         optimiser.optimize()
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_the_gain_ahead_is_what_the_iterations_to_come_gain(model: str) -> None:
+    """By it the solver ends: near the optimum the linearised system tells how far off it is."""
+    problem = EliminatedSolver(None).adjust(problem_of(model), RULE)[0]
+    nudge = random_step(problem, np.random.default_rng(4), 1e-6)
+    nudged = replace(problem, values=problem.values.retract(nudge))
+    blocks, _ = blocks_of(nudged, SQUARED)
+    panels = blocks.panels(nudged.values)
+    joint = joint_root(problem.template, problem.factors, nudged.values, panels)
+    ahead = joint.gain() + blocks.system.gain_alone
+    assert ahead == pytest.approx(nudged.cost() - problem.cost(), rel=1e-3)

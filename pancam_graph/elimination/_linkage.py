@@ -37,6 +37,9 @@ class Linkage:
     """(segments,) first column of the variable"""
     segment_width: IntArray
     """(segments,) number of columns"""
+    segment_plain: BoolArray
+    """(segments,) whether the variable's tangent is the twist of the unit's base itself: 6 columns, the chain
+    a unit matrix at all values"""
 
     @property
     def n_groups(self) -> int:

@@ -1,6 +1,7 @@
 """Symmetric block-sparse systems: order of elimination, square root, and entries of the inverse."""
 
 from collections.abc import Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,6 +90,12 @@ class Panels:
         """Groups in the order of elimination."""
         return sorted(groups, key=self._position.__getitem__)
 
+    def first_columns(self, g: int) -> IntArray:
+        """First column (groups,) of each group in the panel of g; -1 where that does not reach."""
+        out = np.full(len(self.structure.dim), -1)
+        out[list(self.structure.after[g])] = self.structure.begin[g][:-1]
+        return out
+
     def add(self, groups: Sequence[int], S: FloatArray, s: FloatArray) -> None:
         """Add a dense system over groups in the order of elimination; of S the upper triangle counts."""
         begin = np.concatenate([[0], np.cumsum(self.structure.dim[list(groups)])])
@@ -121,6 +128,17 @@ class Panels:
                     here = (g == a) & (h == b)
                     np.add.at(self.panel[a], (row[here], place[int(b)] + column[here]), entry[here])
 
+    def add_right(self, g: IntArray, row: IntArray, entry: FloatArray) -> None:
+        """Add entries of s one by one: at `row` of group g."""
+        for a in np.unique(g):
+            np.add.at(self.panel[a][:, -1], row[g == a], entry[g == a])
+
+    def copy(self) -> "Panels":
+        """The same system in memory of its own."""
+        twin = copy(self)
+        twin.panel = [panel.copy() for panel in self.panel]
+        return twin
+
     def hold(self, held: dict[int, IntArray]) -> None:
         """Make some columns of groups independent of everything, of unit information."""
         for g, columns in held.items():
@@ -151,7 +169,8 @@ class Panels:
         rest = rows[:, n:]
         if rest.shape[1] == 1 or len(rows) == 0:
             return
-        update = -(rest.T @ rest)
+        update = rest.T @ rest
+        np.negative(update, out=update)
         begin, after = st.begin[g] - n, st.after[g]
         for i in range(1, len(after)):
             self.add_rows(i, after, begin, update, update[:, -1])
@@ -177,7 +196,8 @@ def _root_of_panel(panel: FloatArray, summed: FloatArray) -> FloatArray:
         upper = np.triu(upper)[:rank]
         rows[:, pivot] = upper * unit[pivot]
         right = panel[pivot[:rank], n:] * scale[pivot[:rank], None]
-        rows[:, n:] = blas.dtrsm(1.0, upper[:, :rank], right, trans_a=1)
+        # U'^-1 right, transposed: so that BLAS finds its own order of entries and nothing large is copied.
+        rows[:, n:] = blas.dtrsm(1.0, upper[:, :rank], right.T, side=1, overwrite_b=1).T
     return rows
 
 
@@ -188,6 +208,10 @@ class Root:
     structure: Pattern
     rows: tuple[FloatArray, ...]
     """For each group (rank, columns of its panel + 1): R, and e as the last column."""
+
+    def gain(self) -> float:
+        """By how much the step that solves the system lowers the cost, as far as it is linear: |e|^2 / 2."""
+        return 0.5 * sum(float(rows[:, -1] @ rows[:, -1]) for rows in self.rows)
 
     def covariance(self) -> "Covariance":
         """The blocks of the inverse of R'R where R is filled (Takahashi's recursion).

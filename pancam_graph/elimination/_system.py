@@ -1,7 +1,7 @@
 """All landmarks of a problem, cut into blocks, and what is left of them for the cameras' variables."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import TypeVar
@@ -17,6 +17,7 @@ from pancam_graph.landmarks import (
     CameraViews,
     Landmarks,
     Measurements,
+    over_landmarks,
     rays_of,
     refine,
     triangulate,
@@ -32,22 +33,40 @@ _PARTS = 8
 """A chunk has at most this share of all observations, so that two cores, or eight, have even work."""
 _ROOM = 6_000_000
 """Numbers in the dense systems of a wave of chunks: 48 MB."""
-_STRAY = 0.5 * 5.0**2
-"""A landmark with this cost per observation, as if all were 5 sigma off, is placed anew after a step."""
+_STRAY = 1.0
+"""A landmark with this cost per observation, twice what noise gives or more, is refined after a step."""
+_LOST = 0.5 * 5.0**2
+"""One with this cost even then, as if all were 5 sigma off, is placed anew."""
+_TOUCHED = 1e-2
+"""If the step changed its cost by more than this share."""
+_REFINED = 1e-2
+"""A stray is refined until that promises no more than this share of its cost."""
+_STRAY_GRAIN = 256
+"""Strays that one thread takes at once."""
 _SMALLEST_CHUNK = 4000
 """Observations of a chunk that is worth its overhead."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Block:
-    """Landmarks first seen from one stop, and the groups that these touch."""
+    """Landmarks first seen from one stop, and the groups that these touch.
+
+    Its columns are those that some segment touches, group by group. Each segment has an even number: the
+    kernel takes them in pairs, and one that fills up a pair belongs to nothing.
+    """
 
     groups: tuple[int, ...]
     """In the order of elimination."""
     begin: IntArray
     """(groups + 1,) first column of each in the block"""
     segment_column: IntArray
-    """(segments,) first column of each segment in the block; -1 where it is of another"""
+    """(segments,) first column of each segment in the block; negative where it is of another"""
+    row: IntArray
+    """(columns,) of each of the block's columns among those of its group; -1: of nothing"""
+    panel_column: tuple[IntArray, ...]
+    """For each of the groups, where in its panel each of the block's columns is; -1: of nothing"""
+    source: IntArray
+    """(columns,) of each among all columns; -1: of nothing"""
     n_units: int
 
 
@@ -60,9 +79,42 @@ class _Chunk:
     end: int
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Layout:
+    """Columns that segments touch, group by group, each segment's number filled up to an even one."""
+
+    group_width: IntArray
+    """(groups,) columns of each"""
+    segment_column: IntArray
+    """(segments,) first column of each in its group"""
+    row: tuple[IntArray, ...]
+    """For each group, where each of these columns is among all of the group's; -1: of nothing"""
+
+    @staticmethod
+    def of(linkage: Linkage) -> "_Layout":
+        """Segments that touch the same columns share them."""
+        of = linkage.segment_variable
+        group, start = linkage.group[of], linkage.variable_column[of] + linkage.segment_column
+        begin = linkage.group_column
+        _, one, which = np.unique(begin[group] + start, return_index=True, return_inverse=True)
+        width = linkage.segment_width[one]
+        even = width + width % 2
+        place = np.cumsum(even) - even
+        group_width = np.bincount(group[one], even, minlength=linkage.n_groups).astype(np.int64)
+        group_begin = np.concatenate([[0], np.cumsum(group_width)])
+        step = np.arange(int(width.sum())) - np.repeat(np.cumsum(width) - width, width)
+        row = np.full(int(group_begin[-1]), -1)
+        row[np.repeat(place, width) + step] = np.repeat(start[one], width) + step
+        return _Layout(
+            group_width=group_width,
+            segment_column=place[which] - group_begin[group],
+            row=tuple(row[a:b] for a, b in pairwise(group_begin)),
+        )
+
+
 _Wave = list[_Chunk]
 _Systems = list[tuple[FloatArray, FloatArray]]
-"""(S, s) of each chunk of a wave, over the columns of its block."""
+"""(S, s) of each chunk of a wave, over the columns of its block; S in tiles, see kernel.gather."""
 
 
 class LandmarkSystem:
@@ -94,15 +146,18 @@ class LandmarkSystem:
         self.origin_m = landmarks.origin_m[self.landmark_row]
         self.structure = pattern(linkage.group_dim, [*reach.values(), *cliques])
         self._panels = Panels(self.structure)
+        self._layout = _Layout.of(linkage)
         edges = np.flatnonzero(np.diff(first[self.landmark_row], prepend=-1, append=-1))
         self._arrange(measurements, first, reach, edges)
         self.reduced = kernel.Reduced(
             factor=np.empty((n, 6)),
             gamma=np.empty((n, 3)),
-            arms=np.empty(3 * len(self.sights.column)),
+            arms=np.empty(6 * len(self.sights.pair)),
             cost=np.zeros(n),
             undetermined=np.zeros(n, dtype=bool),
         )
+        self.regained = 0.0
+        """By how much placing strays anew lowered the cost where the last step led."""
         self._memory = np.empty(0)
         self._moved, self._moved_cost = np.empty_like(self.vector), np.zeros(n)
 
@@ -112,9 +167,10 @@ class LandmarkSystem:
         """Fill `sights`, `blocks` and `chunks`."""
         link = self.linkage
         n_obs, n = len(m.image), len(self.landmark_row)
-        segments = np.diff(link.segment_begin)
-        widths = np.add.reduceat(np.append(link.segment_width, 0), link.segment_begin[:-1]) * (segments > 0)
-        unit = link.image_unit[m.image]
+        n_segments = int(np.diff(link.segment_begin)[link.image_unit][m.image].sum())
+        n_pairs = (link.segment_width + 1) // 2
+        per_unit = np.diff(np.concatenate([[0], np.cumsum(n_pairs)])[link.segment_begin])
+        most_pairs = int(per_unit[link.image_unit][m.image].sum())
         sights = kernel.Sights(
             image=np.empty(n_obs, dtype=np.int64),
             uv_px=np.empty((0, 2)),
@@ -123,10 +179,10 @@ class LandmarkSystem:
             occurrence_unit=np.empty(n_obs, dtype=np.int64),
             occurrence_row=np.empty(n_obs, dtype=np.int64),
             place_begin=np.empty(n_obs + 1, dtype=np.int64),
-            place=np.empty(int(segments[unit].sum()), dtype=np.int64),
+            place=np.empty(n_segments, dtype=np.int64),
             landmark_begin=np.empty(n + 1, dtype=np.int64),
-            column_begin=np.empty(n + 1, dtype=np.int64),
-            column=np.empty(int(widths[unit].sum()), dtype=np.int64),
+            pair_begin=np.empty(n + 1, dtype=np.int64),
+            pair=np.empty(most_pairs, dtype=np.int64),
         )
         begin = m.begin
         rows, cursor = np.empty(n_obs, dtype=np.int64), np.zeros(4, dtype=np.int64)
@@ -135,26 +191,22 @@ class LandmarkSystem:
         self.chunks: list[_Chunk] = []
         for a, b in pairwise(edges.tolist()):
             groups = tuple(self._panels.sorted(reach[int(first[self.landmark_row[a]])]))
-            ends = np.concatenate([[0], np.cumsum(link.group_dim[list(groups)])])
-            group_column = np.full(link.n_groups, -1)
-            group_column[list(groups)] = ends[:-1]
-            of = link.segment_variable
-            column = group_column[link.group[of]] + link.variable_column[of] + link.segment_column
+            block = self._block(groups)
             n_units = kernel.arrange(
                 self.landmark_row[a:b],
                 begin,
                 m.image,
                 link.image_unit,
                 link.segment_begin,
-                link.segment_width,
-                column,
-                int(ends[-1]),
+                n_pairs,
+                block.segment_column >> 1,
+                len(block.row) // 2,
                 a,
                 rows,
                 sights,
                 cursor,
             )
-            self.blocks.append(_Block(groups=groups, begin=ends, segment_column=column, n_units=n_units))
+            self.blocks.append(replace(block, n_units=n_units))
             counts = np.cumsum(begin[self.landmark_row[a:b] + 1] - begin[self.landmark_row[a:b]])
             n_parts = -(-int(counts[-1]) // most)
             cuts = [a, *(a + 1 + np.searchsorted(counts, counts[-1] * np.arange(1, n_parts) / n_parts)), b]
@@ -163,19 +215,42 @@ class LandmarkSystem:
                 for p, q in pairwise(cuts)
                 if q > p
             ]
-        occurrences, places, columns = (int(c) for c in cursor[1:])
+        occurrences, places, pairs = (int(c) for c in cursor[1:])
         sights.occurrence_begin[occurrences] = n_obs
         sights.place_begin[occurrences] = places
-        sights.landmark_begin[n], sights.column_begin[n] = occurrences, columns
+        sights.landmark_begin[n], sights.pair_begin[n] = occurrences, pairs
         self.sights = sights._replace(
-            uv_px=m.uv_px[rows],
-            whitening=m.whitening[rows],
+            uv_px=m.uv_px.take(rows, axis=0),  # several times as fast as an index
+            whitening=m.whitening.take(rows, axis=0),
             occurrence_begin=sights.occurrence_begin[: occurrences + 1].copy(),
             occurrence_unit=sights.occurrence_unit[:occurrences].copy(),
             occurrence_row=sights.occurrence_row[:occurrences].copy(),
             place_begin=sights.place_begin[: occurrences + 1].copy(),
             place=sights.place[:places].copy(),
-            column=sights.column[:columns].copy(),
+            pair=sights.pair[:pairs].copy(),
+        )
+
+    def _block(self, groups: tuple[int, ...]) -> _Block:
+        """The columns of a block that touches these groups."""
+        link, layout = self.linkage, self._layout
+        begin = np.concatenate([[0], np.cumsum(layout.group_width[list(groups)])]).astype(np.int64)
+        shift = np.full(link.n_groups, np.iinfo(np.int32).min)
+        shift[list(groups)] = begin[:-1]
+        row = np.concatenate([np.zeros(0, dtype=np.int64), *(layout.row[g] for g in groups)])
+        of = np.repeat(np.array(groups, dtype=np.int64), np.diff(begin))
+
+        def among(first: IntArray) -> IntArray:
+            """Columns of the block, given where (groups,) each group begins; -1 where a group is not."""
+            return np.where((row < 0) | (first[of] < 0), -1, first[of] + row)
+
+        return _Block(
+            groups=groups,
+            begin=begin,
+            segment_column=shift[link.group[link.segment_variable]] + layout.segment_column,
+            row=row,
+            panel_column=tuple(among(self._panels.first_columns(g)) for g in groups),
+            source=among(link.group_column),
+            n_units=0,
         )
 
     def bearings(self, posture: Posture) -> kernel.Bearings:
@@ -189,6 +264,7 @@ class LandmarkSystem:
             unit_t=np.ascontiguousarray(posture.unit_t),
             segment_begin=self.linkage.segment_begin,
             segment_width=self.linkage.segment_width,
+            plain=self.linkage.segment_plain,
             chain=np.ascontiguousarray(posture.chain),
         )
 
@@ -199,7 +275,6 @@ class LandmarkSystem:
         """
         bearings = self.bearings(posture)
         eliminate = kernel.eliminate_poses if bearings.chain.shape[1] == 6 else kernel.eliminate_calibrations
-        paired = not np.any(self.linkage.segment_width % 2) and not np.any(self.linkage.segment_column % 2)
         self._panels.clear()
         for wave in self._waves:
             systems = self._room(wave)
@@ -220,7 +295,6 @@ class LandmarkSystem:
                         chunk.end,
                         block.segment_column,
                         block.n_units,
-                        paired,
                         self.reduced,
                         S,
                         s,
@@ -232,7 +306,9 @@ class LandmarkSystem:
                     block = self.blocks[chunk.block]
                     for i, g in enumerate(block.groups):
                         if first <= g < last:
-                            self._panels.add_rows(i, block.groups, block.begin, S, s)
+                            rows = int(block.begin[i]), int(block.begin[i + 1])
+                            panel = self._panels.panel[g]
+                            kernel.gather(S, s, *rows, block.row, block.panel_column[i], panel)
 
             in_parallel(eliminated, len(wave), grain=1)
             in_parallel(summed, self.linkage.n_groups, grain=1 + self.linkage.n_groups // 8)
@@ -244,7 +320,7 @@ class LandmarkSystem:
         waves: list[list[_Chunk]] = [[]]
         room = 0
         for chunk in self.chunks:
-            need = int(self.blocks[chunk.block].begin[-1]) ** 2
+            need = len(self.blocks[chunk.block].row) ** 2
             if waves[-1] and room + need > _ROOM:
                 waves.append([])
                 room = 0
@@ -254,13 +330,13 @@ class LandmarkSystem:
 
     def _room(self, wave: list[_Chunk]) -> _Systems:
         """A dense system (S, s) for each chunk of a wave, in memory that is used again."""
-        dims = [int(self.blocks[chunk.block].begin[-1]) for chunk in wave]
+        dims = [len(self.blocks[chunk.block].row) for chunk in wave]
         need = sum(n * n + n for n in dims)
         if len(self._memory) < need:
             self._memory = np.empty(need)
         out, begin = [], 0
         for n in dims:
-            out.append((self._memory[begin : begin + n * n].reshape(n, n), self._memory[begin + n * n :][:n]))
+            out.append((self._memory[begin : begin + n * n], self._memory[begin + n * n :][:n]))
             begin += n * n + n
         return out
 
@@ -271,11 +347,7 @@ class LandmarkSystem:
         kernel.BEHIND_COST.
         """
         bearings = self.bearings(posture)
-        column = self.linkage.group_column
-        steps = [
-            np.concatenate([step[:0], *(step[column[g] : column[g + 1]] for g in b.groups)])
-            for b in self.blocks
-        ]
+        steps = [np.append(step, 0.0)[block.source] for block in self.blocks]
 
         def work(begin: int, end: int) -> None:
             for chunk in self.chunks[begin:end]:
@@ -299,35 +371,64 @@ class LandmarkSystem:
         return self._by_block(self._moved_cost)
 
     def _replace_strays(self, views: CameraViews, bearings: kernel.Bearings) -> None:
-        """Place anew what is behind a camera or was left far off; elsewhere the linear step is good.
+        """Place anew what a step leaves behind a camera or off; elsewhere the linear step is good.
 
-        First from where the step led; what is far off even then, from nothing but its rays.
+        First it is refined from where the step led; what is far off even then is found from its rays alone.
         """
-        counts = np.diff(self.sights.occurrence_begin[self.sights.landmark_begin])
-        strays = np.flatnonzero(self._moved_cost > _STRAY * counts)
+        counts, seen = np.diff(self._seen.begin), self._seen
+        before, after = self.reduced.cost, self._moved_cost
+        # What a step hardly touches is as well placed as it was: noise alone is no reason to look again.
+        strays = np.flatnonzero((after > _STRAY * counts) & (np.abs(after - before) > _TOUCHED * before))
+        self.regained = 0.0
         if len(strays) == 0:
             return
-        m, ones = self._measurements, np.ones(len(self.sights.image))
-        moved = Landmarks(vector=self._given(self._moved), origin_m=self._given(self.origin_m))
-        rows = self.landmark_row[strays]
-        refined = refine(moved, m, views, ones, self.loss, beyond_infinity=True, only=np.sort(rows))
-        self._take_if_better(strays, refined.vector[rows], bearings)
+        seen = seen._replace(to_pixel=bearings.to_pixel, centre_m=bearings.centre_m)
+        weight, loss, refined = np.ones(len(seen.image)), self.loss, self._moved.copy()
+        over_landmarks(
+            kernel.refine,
+            strays,
+            seen,
+            self.origin_m,
+            weight,
+            loss.kind,
+            loss.width,
+            True,
+            _REFINED,
+            refined,
+            grain=_STRAY_GRAIN,
+        )
+        self._take_if_better(strays, refined[strays], bearings)
 
-        strays = strays[self._moved_cost[strays] > _STRAY * counts[strays]]
+        strays = strays[self._moved_cost[strays] > _LOST * counts[strays]]
         if len(strays) == 0:
             return
-        lost = np.zeros(len(counts), dtype=bool)
+        m, lost = self._measurements, np.zeros(len(counts), dtype=bool)
         lost[self.landmark_row[strays]] = True
         part, rows = m.part(np.flatnonzero(lost[m.landmark])), np.cumsum(lost)[self.landmark_row[strays]] - 1
-        origin = moved.origin_m[lost]
-        placed = triangulate(*rays_of(part, views), part.landmark, ones[: len(part.image)]).about(origin)
-        placed = refine(placed, part, views, ones[: len(part.image)], self.loss, beyond_infinity=True)
+        weight = weight[: len(part.image)]
+        placed = triangulate(*rays_of(part, views), part.landmark, weight)
+        placed = placed.about(self._given(self.origin_m)[lost])
+        placed = refine(placed, part, views, weight, self.loss, beyond_infinity=True)
         self._take_if_better(strays, placed.vector[rows], bearings)
+
+    @cached_property
+    def _seen(self) -> kernel.Seen:
+        """Observations as loops over landmarks take them, in the order of elimination; no cameras yet."""
+        sights = self.sights
+        return kernel.Seen(
+            begin=sights.occurrence_begin[sights.landmark_begin],
+            image=sights.image,
+            uv_px=sights.uv_px,
+            whitening=sights.whitening,
+            to_pixel=np.zeros((0, 3, 3)),
+            centre_m=np.zeros((0, 3)),
+        )
 
     def _take_if_better(self, strays: IntArray, vector: FloatArray, bearings: kernel.Bearings) -> None:
         cost, loss = np.empty(len(strays)), self.loss
         kernel.costs(self.sights, bearings, strays, vector, self.origin_m, loss.kind, loss.width, cost)
         better = cost < self._moved_cost[strays]
+        self.regained += float(np.sum((self._moved_cost[strays] - cost)[better]))
         self._moved[strays[better]], self._moved_cost[strays[better]] = vector[better], cost[better]
 
     def _given(self, array: NDArray[_T]) -> NDArray[_T]:
@@ -344,6 +445,16 @@ class LandmarkSystem:
     def any_behind(self) -> bool:
         """Whether an observation's landmark was behind its camera where the last step led."""
         return bool(self._moved_cost.max() >= kernel.BEHIND_COST)
+
+    @property
+    def moved_cost(self) -> float:
+        """Cost of all where the last step led."""
+        return float(self._moved_cost.sum())
+
+    @property
+    def gain_alone(self) -> float:
+        """By how much landmarks would lower the cost if no camera moved, as linearised last."""
+        return 0.5 * float(np.sum(self.reduced.gamma**2))
 
     def block_costs(self) -> FloatArray:
         """Costs (blocks,) at the last linearisation."""
@@ -367,12 +478,13 @@ class LandmarkSystem:
         """
         out = np.empty((len(self.landmark_row), 3, 3))
         for chunk in self.chunks:
-            groups = self.blocks[chunk.block].groups
-            joint = (
-                np.block([[covariance.block(g, h) for h in groups] for g in groups])
-                if groups
-                else np.zeros((0, 0))
-            )
+            block = self.blocks[chunk.block]
+            joint = np.zeros((len(block.row), len(block.row)))
+            own = [np.flatnonzero(block.row[a:b] >= 0) for a, b in pairwise(block.begin)]
+            for g, a, rows in zip(block.groups, block.begin, own, strict=False):
+                for h, b, columns in zip(block.groups, block.begin, own, strict=False):
+                    wanted = np.ix_(block.row[a + rows], block.row[b + columns])
+                    joint[np.ix_(a + rows, b + columns)] = covariance.block(g, h)[wanted]
             kernel.spread(self.sights, self.reduced, self.vector, joint, chunk.begin, chunk.end, out)
         return self._given(out)
 

@@ -78,6 +78,7 @@ class HardTemplate(FactorTemplate):
             segment_variable=np.array(variable, dtype=np.int64),
             segment_column=np.array(column, dtype=np.int64),
             segment_width=np.array(width, dtype=np.int64),
+            segment_plain=np.array(width, dtype=np.int64) == 6,  # a mast's
         )
 
     def posture(self, values: gtsam.Values) -> Posture:

@@ -77,6 +77,7 @@ class SoftTemplate(FactorTemplate):
             segment_variable=np.array([row[self.camera_key(i)] for i in range(n)], dtype=np.int64),
             segment_column=np.zeros(n, dtype=np.int64),
             segment_width=np.full(n, 6),
+            segment_plain=np.ones(n, dtype=bool),
         )
 
     def posture(self, values: gtsam.Values) -> Posture:

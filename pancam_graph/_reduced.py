@@ -1,0 +1,78 @@
+"""A problem with its landmarks eliminated: the square root of the system in the cameras' variables."""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from scipy.sparse import coo_array, csc_array
+
+from pancam_graph._problem import Problem, system_of
+from pancam_graph.elimination import LandmarkSystem, Linkage, Panels, Root
+from pancam_graph.geometry import IntArray
+from pancam_graph.graph import FactorTemplate
+
+__all__ = ["ReducedSystem", "held_columns", "joint_root"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ReducedSystem:
+    """What is left of a problem at its values, linearised, priors and ties included."""
+
+    system: LandmarkSystem
+    """Linearised there."""
+    rows: IntArray
+    """Its landmarks among all."""
+    root: Root
+
+    @staticmethod
+    def of(problem: Problem, arranged: tuple[LandmarkSystem, IntArray] | None = None) -> "ReducedSystem":
+        """Linearise a problem; `arranged` is its landmark system and rows, where these are known.
+
+        Raises SolveError where no observation takes part.
+        """
+        system, rows = arranged or system_of(problem)
+        panels = system.linearise(problem.template.posture(problem.values))
+        root = joint_root(problem.template, problem.factors, problem.values, panels)
+        return ReducedSystem(system=system, rows=rows, root=root)
+
+
+def joint_root(
+    template: FactorTemplate, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, panels: Panels
+) -> Root:
+    """Square root of what is left of the landmarks, with priors and ties added. Destroys the panels."""
+    if template.linkage.key:
+        _add(panels, template.linkage, factors.linearize(values))
+    panels.hold(held_columns(template))
+    return panels.root()
+
+
+def held_columns(template: FactorTemplate) -> dict[int, IntArray]:
+    """By group, the columns that telemetry holds."""
+    link = template.linkage
+    out: dict[int, IntArray] = {}
+    for key, components in template.held_columns().items():
+        if len(components):
+            g = int(link.group[link.row[key]])
+            columns = link.columns_of(key).start + components
+            out[g] = np.concatenate([out.get(g, np.zeros(0, dtype=np.int64)), columns])
+    return out
+
+
+def _add(panels: Panels, linkage: Linkage, linear: gtsam.GaussianFactorGraph) -> None:
+    """Add priors and ties, as GTSAM linearises them."""
+    row, column, entry = linear.sparseJacobian_()
+    # GTSAM counts from 1, takes keys in ascending order, and appends the right-hand side as a last column.
+    keys = sorted(linkage.key)
+    dims = [int(linkage.dim[linkage.row[key]]) for key in keys]
+    shape = (int(row.max(initial=0)), sum(dims) + 1)
+    jacobian = csc_array((entry, (row.astype(int) - 1, column.astype(int) - 1)), shape=shape)
+    own = [linkage.columns_of(key) for key in keys]
+    group = np.repeat([int(linkage.group[linkage.row[key]]) for key in keys], dims)
+    within = np.concatenate([np.arange(s.start, s.stop) for s in own])
+    normal = coo_array(jacobian.T @ jacobian)
+    i, j = normal.coords
+    left = (i < shape[1] - 1) & (j < shape[1] - 1)
+    panels.add_entries(group[i[left]], within[i[left]], group[j[left]], within[j[left]], normal.data[left])
+    right = (i < shape[1] - 1) & (j == shape[1] - 1)
+    # GTSAM's right-hand side is minus the residual.
+    panels.add_right(group[i[right]], within[i[right]], -normal.data[right])
