@@ -13,6 +13,7 @@ from scipy.stats import chi2, norm
 from pancam_graph import kernel
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.landmarks import (
+    SETTLED,
     CameraViews,
     Landmarks,
     Measurements,
@@ -72,7 +73,18 @@ def screen(
     fresh = np.flatnonzero(np.minimum.reduceat(weight, starts) > 0)
     for sweep in range(_SWEEPS):
         over_landmarks(kernel.triangulate, fresh, begin, centre, direction, weight, vector, origin)
-        over_landmarks(kernel.refine, which, seen, origin, weight, SQUARED.kind, SQUARED.width, False, vector)
+        over_landmarks(
+            kernel.refine,
+            which,
+            seen,
+            origin,
+            weight,
+            SQUARED.kind,
+            SQUARED.width,
+            False,
+            SETTLED,
+            vector,
+        )
         over_landmarks(kernel.evaluate, which, seen, vector, origin, residual, b, in_front)
         over_landmarks(kernel.free_derivatives, which, begin, vector, b)
         over_landmarks(kernel.cofactors, which, begin, b, weight, cofactor)

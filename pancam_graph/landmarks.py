@@ -20,10 +20,11 @@ from pancam_graph.threads import in_parallel
 
 _GRAIN = 1024
 _RAY_GRAIN = 16384
-_SETTLED = 1e-9
+SETTLED = 1e-9
 """A landmark is refined until that promises no more than this share of its cost."""
 
 __all__ = [
+    "SETTLED",
     "CameraViews",
     "Landmarks",
     "Measurements",
@@ -235,7 +236,7 @@ def refine(
     own, vector = as_floats(weight, (len(measurements.image),)), start.copy()
     which = np.arange(len(vector)) if only is None else only
     over_landmarks(
-        kernel.refine, which, seen, origin, own, loss.kind, loss.width, beyond_infinity, _SETTLED, vector
+        kernel.refine, which, seen, origin, own, loss.kind, loss.width, beyond_infinity, SETTLED, vector
     )
     return replace(landmarks, vector=vector)
 
