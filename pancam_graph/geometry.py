@@ -21,6 +21,8 @@ __all__ = [
     "FloatArray",
     "IntArray",
     "compose",
+    "corrected_poses",
+    "correction_twists",
     "d_pan_tilt_rotation",
     "pan_tilt_from_rotation",
     "pan_tilt_rotation",
@@ -31,7 +33,10 @@ __all__ = [
     "ry",
     "rz",
     "skew",
+    "so3_exp",
+    "so3_right_jacobian",
     "so3_right_jacobian_inverse",
+    "twists_in_parent",
     "wrap_angle",
     "wxyz_from_rotation",
 ]
@@ -88,6 +93,58 @@ def so3_right_jacobian_inverse(w: FloatArray) -> FloatArray:
         theta = np.sqrt(theta2)
         c = 1 / theta2 - (1 + np.cos(theta)) / (2 * theta * np.sin(theta))
     return np.asarray(np.eye(3) + 0.5 * k + c * k @ k)
+
+
+def so3_exp(w: FloatArray) -> FloatArray:
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), by Rodrigues' formula; of 0, exactly I."""
+    k = skew(w)
+    theta = np.linalg.norm(w, axis=-1)[..., None, None]
+    half = np.sinc(theta / (2 * np.pi))
+    return np.asarray(np.eye(3) + np.sinc(theta / np.pi) * k + 0.5 * half * half * (k @ k))
+
+
+def so3_right_jacobian(w: FloatArray) -> FloatArray:
+    """Right Jacobians of SO(3) at rotation vectors, (..., 3) to (..., 3, 3).
+
+    `Exp(w + d) = Exp(w) Exp(Jr(w) d)` to first order. Source: Chirikjian, Stochastic Models, Information
+    Theory, and Lie Groups 2, section 10.8.6.
+    """
+    k = skew(w)
+    theta2 = np.sum(w * w, axis=-1)[..., None, None]
+    theta = np.sqrt(theta2)
+    half = np.sinc(theta / (2 * np.pi))
+    small = theta2 < 1e-4  # where the difference from the sine would lose its digits
+    safe = np.where(small, 1.0, theta)
+    c = np.where(small, 1 / 6 - theta2 / 120 + theta2**2 / 5040, (safe - np.sin(safe)) / safe**3)
+    return np.asarray(np.eye(3) - 0.5 * half * half * k + c * (k @ k))
+
+
+def corrected_poses(
+    a_R_b: FloatArray, a_t_b: FloatArray, correction: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Poses (..., 3, 3), (..., 3) turned and shifted in their own frames by corrections (..., 6).
+
+    A correction is a rotation vector w, radians, and a shift s, metres: `a_T_b * (Exp(w), s)`. Rotation and
+    shift are independent of each other, unlike in the exponential of Pose3: s is how far the origin of b
+    moves, however b turns. A correction of 0 changes no bit.
+    """
+    turn, shift = so3_exp(correction[..., :3]), correction[..., 3:]
+    return compose(a_R_b, a_t_b, turn, shift)
+
+
+def correction_twists(correction: FloatArray) -> FloatArray:
+    """Body-frame twists (..., 6, 6), rotation first, of a corrected pose by its correction (..., 6)."""
+    w = correction[..., :3]
+    out = np.zeros((*correction.shape, 6))
+    out[..., :3, :3] = so3_right_jacobian(w)
+    out[..., 3:, 3:] = np.swapaxes(so3_exp(w), -1, -2)
+    return out
+
+
+def twists_in_parent(a_R_b: FloatArray, a_t_b: FloatArray, twists: FloatArray) -> FloatArray:
+    """Twists (..., 6, m) of a that move b as its own `twists` do; poses of b (..., 3, 3), (..., 3)."""
+    turn = a_R_b @ twists[..., :3, :]
+    return np.concatenate([turn, a_R_b @ twists[..., 3:, :] + skew(a_t_b) @ turn], axis=-2)
 
 
 def wrap_angle(angle_rad: ArrayLike) -> FloatArray:

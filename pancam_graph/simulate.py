@@ -43,7 +43,10 @@ class SimulationOptions:
     ridge_m: float = 1500.0
     """Mean distance from the drive to the ridge that surrounds it."""
     sweep_rad: float = 2 * np.pi
-    """Range of pan that a panorama covers, centred on straight ahead."""
+    """Range of pan that a panorama covers, centred on straight ahead.
+
+    A rig that does not turn (a Ladybug) takes one frame per stop, whatever sweep_rad, pans and tilts_rad say.
+    """
     pans: int | None = None
     """Frames per row of a panorama. None: as many as make the widest eye's neighbours overlap by 28 %."""
     tilts_rad: tuple[float, ...] | None = None
@@ -266,7 +269,9 @@ def _fields_rad(camera: Camera) -> tuple[float, float]:
 
 
 def _panorama(rig: Rig, options: SimulationOptions) -> FloatArray:
-    """Pan and tilt (frames, 2) of one stop, row by row."""
+    """Pan and tilt (frames, 2) of one stop, row by row; of a rig that does not turn, one frame at 0."""
+    if not rig.turns:
+        return np.zeros((1, 2))
     across, down = (max(fields) for fields in zip(*(_fields_rad(e.camera) for e in rig.eyes), strict=True))
     pans = options.pans or int(np.ceil(options.sweep_rad / ((1 - _OVERLAP) * across) - 1e-9))
     tilts = options.tilts_rad or (-_HORIZON * down, -(_HORIZON + 1 - _OVERLAP) * down)
@@ -390,13 +395,19 @@ def _telemetry(
     sigmas = np.repeat([options.sigma_stop_rad, options.sigma_stop_m], 3)
     errors = sigmas * rng.standard_normal((len(world_T_mast), 6))
     errors[0] = 0.0
-    pointing = options.pointing_scale * np.array([rig.pointing_sigma.pan_rad, rig.pointing_sigma.tilt_rad])
+    pointing = _pointing_sigma_rad(rig, options)
     return TelemetryStart(
         world_T_mast=tuple(
             pose * gtsam.Pose3.Expmap(error) for pose, error in zip(world_T_mast, errors, strict=True)
         ),
         pan_tilt_rad=pan_tilt_rad + pointing * rng.standard_normal(pan_tilt_rad.shape),
     )
+
+
+def _pointing_sigma_rad(rig: Rig, options: SimulationOptions) -> FloatArray:
+    """Standard deviation of pan and tilt telemetry (2,); 0 where the rig does not turn."""
+    sigma = np.array([rig.pointing_sigma.pan_rad, rig.pointing_sigma.tilt_rad])
+    return options.pointing_scale * rig.turns * sigma
 
 
 def _traverse(
@@ -417,14 +428,15 @@ def _traverse(
         for i, pose in enumerate(world_T_mast)
     )
     per_stop = len(pan_tilt_rad) // len(stops)
+    sigma_pan, sigma_tilt = _pointing_sigma_rad(rig, options).tolist()
     frames = tuple(
         Frame(
             id=f"frame{i:05d}",
             stop=stops[i // per_stop].id,
             pan_rad=float(pan),
             tilt_rad=float(tilt),
-            sigma_pan_rad=options.pointing_scale * rig.pointing_sigma.pan_rad,
-            sigma_tilt_rad=options.pointing_scale * rig.pointing_sigma.tilt_rad,
+            sigma_pan_rad=sigma_pan,
+            sigma_tilt_rad=sigma_tilt,
         )
         for i, (pan, tilt) in enumerate(pan_tilt_rad)
     )

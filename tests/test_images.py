@@ -396,7 +396,7 @@ def test_image_of_another_size_is_refused(tmp_path: Path) -> None:
     truth, _ = make_traverse(tmp_path, eyes=("left",))
     cv2.imwrite(str(tmp_path / "s0-f1-left.png"), np.zeros((200, 240), np.uint8))
     with pytest.raises(
-        ImageError, match=r"s0-f1-left\.png: expected 240 x 240 .* camera left; found 240 x 200"
+        ImageError, match=r"s0-f1-left\.png: expected 240 x 240 .* camera left of .*, found 240 x 200"
     ):
         find_observations(truth, QUICK)
 

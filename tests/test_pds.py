@@ -587,6 +587,10 @@ def changed(pattern: str, by: str) -> Callable[[str], str]:
         ),
         (changed(r"MODEL_COMPONENT_3 = \(.*?\)", "MODEL_COMPONENT_3 = (0, 0, 0)"), "focal length"),
         (
+            changed(r"MODEL_COMPONENT_1 = \(.*?\)", "MODEL_COMPONENT_1 = (0, 1e9, 0)"),
+            "camera centre: expected a point within 100 m of the rover, found",
+        ),
+        (
             changed("= ROVER_NAV_FRAME", "= LOCAL_LEVEL_FRAME"),
             "expected ROVER_FRAME or ROVER_NAV_FRAME or SITE_FRAME",
         ),

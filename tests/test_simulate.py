@@ -24,6 +24,17 @@ from pancam_graph.traverse import Observations
 
 SMALL = SimulationOptions(stops=2, pans=3, sweep_rad=1.5)
 
+PANORAMAS = (
+    "mer-pancam",
+    "mer-navcam",
+    "msl-navcam",
+    "mars2020-navcam",
+    "mars2020-mastcam-z-34mm",
+    "exomars-pancam",
+    "stereo-pan-tilt",
+)
+"""Templates whose eyes are wide enough, and equal but for the HRC, for full panoramas that hang together."""
+
 
 @lru_cache
 def default_of(template: str) -> Simulation:
@@ -96,7 +107,7 @@ def test_truth_reproduces_the_pixels_when_there_is_no_noise(rig: Rig) -> None:
     np.testing.assert_array_equal(simulation.traverse.pan_tilt_rad, simulation.truth.pan_tilt_rad)
 
 
-@pytest.mark.parametrize("template", TEMPLATES)
+@pytest.mark.parametrize("template", PANORAMAS)
 def test_every_image_sees_enough_and_every_track_is_seen_enough(template: str) -> None:
     simulation = default_of(template)
     traverse, observations = simulation.traverse, observed(simulation)
@@ -112,7 +123,7 @@ def test_every_image_sees_enough_and_every_track_is_seen_enough(template: str) -
         assert eye.camera.contains(simulation.truth.uv_px[traverse.image_eye[observations.image] == i]).all()
 
 
-@pytest.mark.parametrize("template", TEMPLATES)
+@pytest.mark.parametrize("template", PANORAMAS)
 def test_each_stop_hangs_together_by_shared_tracks(template: str) -> None:
     traverse, observations = default_of(template).traverse, observed(default_of(template))
     sees = coo_array(
@@ -134,7 +145,7 @@ def test_each_stop_hangs_together_by_shared_tracks(template: str) -> None:
         assert (shared[np.ix_(wide, others)] > 0).sum() > 10
 
 
-@pytest.mark.parametrize("template", TEMPLATES)
+@pytest.mark.parametrize("template", PANORAMAS)
 def test_points_lie_on_ground_rocks_and_horizon_from_near_to_far(template: str) -> None:
     truth = default_of(template).truth
     xy, height = truth.landmarks_m[:, :2], truth.landmarks_m[:, 2]

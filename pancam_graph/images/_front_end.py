@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pancam_graph.errors import ImageError, InputError
+from pancam_graph.errors import InputError
 from pancam_graph.geometry import BoolArray
 from pancam_graph.images._features import Features, find_features
 from pancam_graph.images._match import Matches
@@ -18,7 +18,7 @@ from pancam_graph.images._overlap import overlap_cells, overlapping_pairs
 from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._refine import refine_tracks
 from pancam_graph.images._tracks import Links, join_tracks
-from pancam_graph.io.image_files import GreyImage, read_image
+from pancam_graph.io.image_files import GreyImage, read_eye_image
 from pancam_graph.traverse import Observations, Traverse
 
 __all__ = ["find_observations"]
@@ -120,14 +120,7 @@ def _read_images(traverse: Traverse) -> list[GreyImage | None]:
         if entry.file is None:
             found.append(None)
             continue
-        camera = traverse.rig.eyes[eye].camera
-        image = read_image(folder / entry.file)
-        if image.shape != (camera.height_px, camera.width_px):
-            raise ImageError(
-                f"{folder / entry.file}: expected {camera.width_px} x {camera.height_px} pixels, the size of "
-                f"camera {entry.camera}; found {image.shape[1]} x {image.shape[0]}"
-            )
-        found.append(image)
+        found.append(read_eye_image(folder / entry.file, traverse.rig, int(eye)))
     return found
 
 

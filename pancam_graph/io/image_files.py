@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from pancam_graph.errors import ImageError, InputError
 from pancam_graph.io.pds_label import ImageLayout, read_label
+from pancam_graph.rigs import Rig
 
-__all__ = ["GreyImage", "read_image"]
+__all__ = ["GreyImage", "read_eye_image", "read_image"]
 
 GreyImage = NDArray[np.uint8] | NDArray[np.uint16]
 
@@ -33,6 +34,22 @@ def read_image(path: Path) -> GreyImage:
     if path.suffix.lower() == ".img":
         return _read_pds(path)
     return _read_with_opencv(path)
+
+
+def read_eye_image(path: Path, rig: Rig, eye: int) -> GreyImage:
+    """Read an image that an eye of a rig took; see `read_image`.
+
+    Raises ImageError as `read_image` does, and for an image of another size than the eye's camera: a rig
+    (most often a template) for another product, subframe or zoom.
+    """
+    image = read_image(path)
+    name, camera, (height_px, width_px) = rig.eyes[eye].name, rig.eyes[eye].camera, image.shape
+    if (width_px, height_px) != (camera.width_px, camera.height_px):
+        raise ImageError(
+            f"{path}: expected {camera.width_px} x {camera.height_px} pixels as of camera {name} "
+            f"of the rig {rig.name}, found {width_px} x {height_px}"
+        )
+    return image
 
 
 def _read_pds(path: Path) -> GreyImage:

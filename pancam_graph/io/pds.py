@@ -19,17 +19,16 @@ the first one, as ours do.
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import gtsam
 import numpy as np
 
-from pancam_graph.cameras import CAHV, CAHVOR, CAHVORE
 from pancam_graph.errors import InputError
-from pancam_graph.geometry import FloatArray, IntArray, pose_arrays, wrap_angle
-from pancam_graph.io._mast_fit import LabelCameras, MastFit, fit_angles, fit_mast, label_misfit
+from pancam_graph.geometry import FloatArray, IntArray, wrap_angle
 from pancam_graph.io._pds_image import PMA_GROUPS, LabelledImage, read_labelled_image
-from pancam_graph.rigs import MER_MAST, Eye, MastKinematics, Rig
+from pancam_graph.rigs import MER_MAST, MastKinematics, ReferenceSigma, RigFit, RigFitOptions, fit_rig
 from pancam_graph.traverse import Frame, Image, Stop, Traverse
 
 __all__ = ["LOCALISATION_SIGMA", "SAME_POINTING_RAD", "LocalisationSigma", "read_pds"]
@@ -41,6 +40,16 @@ SAME_POINTING_RAD = 1e-4
 
 _LABEL_TOLERANCE = 1e-4
 """Metres and radians to which the rig must reproduce each label's camera."""
+_FARTHEST_CAMERA_M = 100.0
+_AS_DESIGNED = RigFitOptions(
+    reference_sigma=ReferenceSigma(mast_rad=0.0, mast_m=0.0, axis_rad=0.0, axis_m=0.0)
+)
+_AS_LABELLED = RigFitOptions(
+    angles="free",
+    angle_sigma_rad=5e-3,
+    reference_sigma=ReferenceSigma(mast_rad=5e-3, mast_m=5e-3, axis_rad=5e-3, axis_m=5e-3),
+)
+"""A flight unit's axes may differ from the design, and its angles from the measured ones, by so much."""
 _SAME_FOCAL = 2e-4
 _SAME_PRINCIPAL_POINT_PX = 1.0
 _SAME_POSE = 1e-3
@@ -84,10 +93,10 @@ def read_pds(folder: Path | str) -> Traverse:
     eye_of, eye_names = _sort_eyes(images)
     stop_ids, stops = _sort_stops(images, kinematics, warnings)
     frame_of, frames_first = _sort_frames(images, eye_of)
-    fit, eyes = _fit_rig(images, kinematics, frame_of, eye_of, eye_names, len(frames_first), warnings)
+    fit = _fit_rig(images, kinematics, frame_of, eye_of, eye_names, frames_first, warnings)
     # The chain's own mast frame replaces the design's where the axes were fitted.
     stops = tuple(
-        replace(s, world_T_mast=images[i].world_T_rover * fit.rover_T_mast)
+        replace(s, world_T_mast=images[i].world_T_rover * fit.world_T_mast)
         for s, i in zip(stops, stop_ids.values(), strict=True)
     )
     sigma = kinematics.pointing_sigma
@@ -96,18 +105,16 @@ def read_pds(folder: Path | str) -> Traverse:
         Frame(
             id=name,
             stop=_stop_id(images[i].stop),
-            pan_rad=float(wrap_angle(fit.pan_tilt_rad[row, 0])),
-            tilt_rad=float(fit.pan_tilt_rad[row, 1]),
+            pan_rad=float(wrap_angle(fit.pan_tilt_rad[i, 0])),
+            tilt_rad=float(fit.pan_tilt_rad[i, 1]),
             sigma_pan_rad=sigma.pan_rad,
             sigma_tilt_rad=sigma.tilt_rad,
         )
-        for row, (name, i) in enumerate(zip(frame_ids, frames_first, strict=True))
+        for name, i in zip(frame_ids, frames_first, strict=True)
     )
     order = sorted(range(len(frames)), key=lambda r: (images[frames_first[r]].stop, r))
-    rig = Rig(
-        name=f"{kinematics.name}-pds",
-        pan_T_tilt=fit.pan_T_tilt,
-        eyes=eyes,
+    rig = replace(
+        fit.rig(f"{kinematics.name}-pds"),
         pointing_sigma=sigma,
         mast_height_m=kinematics.mast_height_m,
         source=f"PDS labels of {folder.resolve().name}; {kinematics.source}",
@@ -266,49 +273,47 @@ def _fit_rig(
     frame_of: IntArray,
     eye_of: IntArray,
     eye_names: Sequence[str],
-    n_frames: int,
+    frames_first: Sequence[int],
     warnings: list[str],
-) -> tuple[MastFit, tuple[Eye, ...]]:
-    """The chain that reproduces the labels' cameras, and its eyes."""
-    rotation, centre = pose_arrays([image.model.split()[1] for image in images])
-    labels = LabelCameras(rotation=rotation, centre_m=centre, frame=frame_of, eye=eye_of)
-    measured = np.zeros((n_frames, 2))
-    for frame, image in reversed(list(zip(frame_of, images, strict=True))):
-        measured[frame] = image.pan_tilt_rad
+) -> RigFit:
+    """The chain that reproduces the labels' cameras: the design's, or one fitted to them."""
+    for image in images:
+        if np.linalg.norm(image.model.C) > _FARTHEST_CAMERA_M:
+            raise InputError(
+                f"{image.label.label_file}: camera centre: expected a point within "
+                f"{_FARTHEST_CAMERA_M:g} m of the rover, found {image.model.C.tolist()}"
+            )
+    measured = np.array([images[i].pan_tilt_rad for i in frames_first])
     rover_T_mast, pan_T_tilt = mast.chain()
-    fit = MastFit(
-        rover_T_mast=rover_T_mast,
+    fit_of = partial(
+        fit_rig,
+        [image.model for image in images],
+        measured[frame_of],
+        eyes=[eye_names[eye] for eye in eye_of],
+        pointings=frame_of.tolist(),
+        world_T_mast=rover_T_mast,
         pan_T_tilt=pan_T_tilt,
-        mount_R=np.broadcast_to(np.eye(3), (len(eye_names), 3, 3)),
-        mount_t=np.zeros((len(eye_names), 3)),
-        pan_tilt_rad=measured,
     )
-    fit, eyes = _mount_eyes(fit, images, labels, eye_names)
-    if _worst(label_misfit(fit, labels)).max() > _LABEL_TOLERANCE:
-        fit, eyes = _mount_eyes(fit_mast(fit, labels), images, labels, eye_names)
-        # Averaging the mounts' vectors moves them within the labels' digits; the angles follow.
-        fit = fit_angles(fit, labels)
-        change = wrap_angle(fit.pan_tilt_rad - measured)
+    fit = fit_of(options=_AS_DESIGNED)
+    if max(fit.worst_m, fit.worst_rad) > _LABEL_TOLERANCE:
+        fit = fit_of(options=_AS_LABELLED)
+        change = wrap_angle(fit.pan_tilt_rad[frames_first] - measured)
         _log.info(
             "mast axes and angles fitted to the labels' cameras; angles moved by up to %.2f mrad",
             1e3 * np.abs(change).max(),
         )
         _warn_of_angles(change, mast, images, frame_of, warnings)
-    misfit = _worst(label_misfit(fit, labels))
-    bad = misfit.max(axis=1) > _LABEL_TOLERANCE
+    metres, radians = np.linalg.norm(fit.residual_m, axis=1), np.linalg.norm(fit.residual_rad, axis=1)
+    misfit = np.maximum(metres, radians)
+    bad = misfit > _LABEL_TOLERANCE
     if bad.any():
-        worst = int(misfit.max(axis=1).argmax())
+        worst = int(misfit.argmax())
         warnings.append(
             f"the mast model misses the label's camera in {int(bad.sum())} of {len(images)} images by more "
-            f"than 0.1 mm or 0.1 mrad; worst {misfit[worst, 1] * 1e3:.2f} mm and "
-            f"{misfit[worst, 0] * 1e3:.2f} mrad in {images[worst].label.file.name}"
+            f"than 0.1 mm or 0.1 mrad; worst {metres[worst] * 1e3:.2f} mm and "
+            f"{radians[worst] * 1e3:.2f} mrad in {images[worst].label.file.name}"
         )
-    return fit, eyes
-
-
-def _worst(misfit: FloatArray) -> FloatArray:
-    """(n, 2): angle in radians and distance in metres."""
-    return np.column_stack([np.linalg.norm(misfit[:, :3], axis=1), np.linalg.norm(misfit[:, 3:], axis=1)])
+    return fit
 
 
 def _warn_of_angles(
@@ -331,40 +336,3 @@ def _warn_of_angles(
             f"angles by more than 3 sigma, at most {alone[worst].max() * 1e3:.1f} mrad in {name}; the "
             "camera's pointing is used"
         )
-
-
-def _mount_eyes(
-    fit: MastFit, images: Sequence[LabelledImage], labels: LabelCameras, eye_names: Sequence[str]
-) -> tuple[MastFit, tuple[Eye, ...]]:
-    """Eyes whose vectors are the mean of their images' in the head frame, and the chain with them."""
-    unmounted = replace(
-        fit,
-        mount_R=np.broadcast_to(np.eye(3), fit.mount_R.shape),
-        mount_t=np.zeros_like(fit.mount_t),
-    )
-    heads_R, heads_t = unmounted.rover_T_camera(labels.frame, labels.eye)
-    eyes: list[Eye] = []
-    for row, name in enumerate(eye_names):
-        models = [
-            image.model.transformed(gtsam.Pose3(gtsam.Rot3(head_R), head_t).inverse())
-            for image, head_R, head_t, eye in zip(images, heads_R, heads_t, labels.eye, strict=True)
-            if eye == row
-        ]
-        eyes.append(Eye.from_head_model(name, _mean_model(models)))
-    mount_R, mount_t = pose_arrays([eye.head_T_camera for eye in eyes])
-    return replace(fit, mount_R=mount_R, mount_t=mount_t), tuple(eyes)
-
-
-def _mean_model(models: Sequence[CAHV]) -> CAHV:
-    """Mean of models of one kind, vector by vector; labels of one camera differ in their last digits."""
-
-    def mean(name: str) -> FloatArray:
-        return np.asarray(np.mean([getattr(model, name) for model in models], axis=0))
-
-    first = models[0]
-    out: CAHV = replace(first, C=mean("C"), A=mean("A"), H=mean("H"), V=mean("V"))
-    if isinstance(out, CAHVOR):
-        out = replace(out, O=mean("O"), R=mean("R"))
-    if isinstance(out, CAHVORE):
-        out = replace(out, E=mean("E"), linearity=float(mean("linearity")))
-    return out

@@ -19,7 +19,7 @@ from pancam_graph.io._schema import (
     TraverseFile,
     rig_entry,
 )
-from pancam_graph.io.image_files import read_image
+from pancam_graph.io.image_files import read_eye_image
 from pancam_graph.io.observations import observations_npz, read_observations
 from pancam_graph.traverse import Frame, Image, Stop, Traverse
 
@@ -168,17 +168,11 @@ def _inside(folder: Path, name: str, entry: str) -> Path:
 
 
 def _require_image(file: Path, traverse: Traverse, row: int) -> None:
-    entry = f"images[{row}] ({traverse.images[row].id})"
     try:
-        height, width = read_image(file).shape
+        read_eye_image(file, traverse.rig, int(traverse.image_eye[row]))
     except ImageError as error:
+        entry = f"images[{row}] ({traverse.images[row].id})"
         raise ImageError(f"{traverse.folder}/{_TRAVERSE_JSON}: {entry}: {error}") from error
-    eye = traverse.rig.eyes[traverse.image_eye[row]]
-    if (width, height) != (eye.camera.width_px, eye.camera.height_px):
-        raise ImageError(
-            f"{file}: {entry}: expected {eye.camera.width_px} x {eye.camera.height_px} pixels as of camera "
-            f"{eye.name}, found {width} x {height}"
-        )
 
 
 def _copies(traverse: Traverse, folder: Path) -> list[tuple[Path, Path]]:

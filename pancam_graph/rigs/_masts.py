@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from pancam_graph.geometry import Z_DOWN_R_Z_UP, FloatArray
+from pancam_graph.geometry import Z_DOWN_R_Z_UP, FloatArray, ry, rz
 from pancam_graph.rigs._rig import PointingSigma
 
 __all__ = ["MARS2020_MAST", "MER_MAST", "MSL_MAST", "MastKinematics"]
@@ -77,6 +77,22 @@ class MastKinematics:
         rover_R_tilt = np.column_stack([tilt_x, y, np.cross(tilt_x, y)])
         rover_T_mast = gtsam.Pose3(gtsam.Rot3(rover_R_mast), origin)
         return rover_T_mast, rover_T_mast.inverse() * gtsam.Pose3(gtsam.Rot3(rover_R_tilt), tilt_origin)
+
+    def rover_T_head(self, azimuth_rad: float, elevation_rad: float) -> gtsam.Pose3:
+        """The head at readings of the joints, z up."""
+        rover_T_mast, pan_T_tilt = self.chain()
+        pan, tilt = self.pan_tilt_rad(azimuth_rad, elevation_rad)
+        pan_turn, tilt_turn = (gtsam.Pose3(gtsam.Rot3(turn), np.zeros(3)) for turn in (rz(pan), ry(-tilt)))
+        return rover_T_mast * pan_turn * pan_T_tilt * tilt_turn
+
+    def head_T_document(self) -> gtsam.Pose3:
+        """The head frame of the mast's documents (RSM_HEAD, RSM_EL) in ours.
+
+        It has the same origin, but is z down and parallel to the rover at home, where ours follows the
+        elevation axis.
+        """
+        at_home = self.rover_T_head(self.home_azimuth_rad, self.home_elevation_rad).rotation().matrix()
+        return gtsam.Pose3(gtsam.Rot3(at_home.T @ Z_DOWN_R_Z_UP), np.zeros(3))
 
 
 def _unit(v: FloatArray) -> FloatArray:

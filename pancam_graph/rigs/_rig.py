@@ -68,6 +68,9 @@ class Rig:
     """Telemetry's accuracy, used where a traverse does not say; default: MER, 0.077 degrees."""
     mast_height_m: float = 1.5
     """Height of the mast frame above the ground, for simulations and drawings only."""
+    turns: bool = True
+    """Whether the head turns. False for a rigid ring of cameras, whose pan and tilt are 0 and held; for
+    simulations only: a traverse says so by the sigmas of its frames."""
     source: str = ""
     """Where the numbers come from."""
 

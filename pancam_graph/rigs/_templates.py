@@ -1,8 +1,10 @@
-"""Rigs that ship with the package, every number with its source.
+"""Rigs that ship with the package by name, and those of MER and ExoMars, every number with its source.
 
 Where sources disagree the docstring says so. Offsets of rover documents are z-down; they are turned
 to our z-up head frame here.
 """
+
+from collections.abc import Callable
 
 import gtsam
 import numpy as np
@@ -10,7 +12,11 @@ import numpy as np
 from pancam_graph.cameras import Pinhole
 from pancam_graph.errors import InputError
 from pancam_graph.geometry import HEAD_R_FORWARD_CAMERA, FloatArray, rz
+from pancam_graph.rigs._mars2020 import MASTCAM_Z_TEMPLATES, mars2020_navcam
+from pancam_graph.rigs._msl import msl_mastcam, msl_navcam
 from pancam_graph.rigs._rig import Eye, PointingSigma, Rig
+from pancam_graph.rigs._rings import ladybug3, ladybug5
+from pancam_graph.rigs._stereo import stereo_pan_tilt
 
 __all__ = ["TEMPLATES", "exomars_pancam", "mer_navcam", "mer_pancam", "rig_template"]
 
@@ -97,7 +103,18 @@ def exomars_pancam() -> Rig:
     )
 
 
-TEMPLATES = {"mer-pancam": mer_pancam, "mer-navcam": mer_navcam, "exomars-pancam": exomars_pancam}
+TEMPLATES: dict[str, Callable[[], Rig]] = {
+    "mer-pancam": mer_pancam,
+    "mer-navcam": mer_navcam,
+    "msl-navcam": msl_navcam,
+    "msl-mastcam": msl_mastcam,
+    "mars2020-navcam": mars2020_navcam,
+    **MASTCAM_Z_TEMPLATES,
+    "exomars-pancam": exomars_pancam,
+    "ladybug3": ladybug3,
+    "ladybug5": ladybug5,
+    "stereo-pan-tilt": stereo_pan_tilt,
+}
 """The templates by the name that `traverse.json` uses."""
 
 
