@@ -10,7 +10,7 @@ from pancam_graph._covariance import Uncertainty, uncertainty
 from pancam_graph._diagnose import connection_warnings, listed
 from pancam_graph._eliminated import EliminatedSolver
 from pancam_graph._explicit import ExplicitSolver
-from pancam_graph._optimise import Iteration, Outcome, StopRule
+from pancam_graph._optimise import Iteration, Outcome
 from pancam_graph._problem import Problem, Solver, reach_m
 from pancam_graph._rejection import screen
 from pancam_graph.cameras import carry_to_pinhole
@@ -22,6 +22,7 @@ from pancam_graph.landmarks import Landmarks, Measurements, rays_of, refine, res
 from pancam_graph.losses import loss_of
 from pancam_graph.options import SolveOptions
 from pancam_graph.solution import Solution, State
+from pancam_graph.stopping import StopRule
 from pancam_graph.traverse import Observations, Traverse
 
 __all__ = ["Adjustment"]
@@ -217,19 +218,13 @@ class Adjustment:
 
     def _final_rounds(self) -> Outcome:
         """Least squares over what was kept, until neither noise scale nor carried pixels move any more."""
-        options = self.options
-        rule = StopRule(
-            max_iterations=options.max_iterations,
-            relative_decrease=options.relative_decrease,
-            absolute_cost=1e-16 * len(self.problem.measurements.row),
-        )
-        rescale = options.rescale_noise
+        rescale = self.options.rescale_noise
         if rescale is None:
             rescale = self.observations.origin == "images"
         costs: list[float] = []
         for _ in range(_FINAL_ROUNDS):
             before = self.problem.accepted
-            self.problem, outcome = self.solver.adjust(self.problem, rule)
+            self.problem, outcome = self.solver.adjust(self.problem, self.options)
             self._note_behind(before & ~self.problem.accepted)
             costs += outcome.costs[1:] if costs else outcome.costs
             moved = self._recarry()
@@ -238,7 +233,7 @@ class Adjustment:
                 self.sigma_px *= factor
                 self.problem = replace(self.problem, measurements=self.problem.measurements.scaled(factor))
                 moved |= abs(factor - 1) > 1e-3
-            if not moved:
+            if not (moved and outcome.converged):
                 break
         return replace(outcome, costs=tuple(costs))
 

@@ -5,13 +5,14 @@ from dataclasses import replace
 
 import gtsam
 
-from pancam_graph._optimise import InOrder, Iteration, Outcome, StopRule, optimise
+from pancam_graph._optimise import InOrder, Iteration, Outcome, optimise
 from pancam_graph._problem import Problem, Solver, system_of
 from pancam_graph.elimination import LandmarkSystem
 from pancam_graph.factors import LandmarkBlocks
 from pancam_graph.geometry import IntArray
 from pancam_graph.graph import HardTemplate, SoftTemplate, read_variable
 from pancam_graph.losses import SQUARED, Loss
+from pancam_graph.stopping import StopRule
 
 __all__ = ["EliminatedSolver"]
 
@@ -73,6 +74,8 @@ class EliminatedSolver(Solver):
             problem.values,
             rule,
             InOrder(blocks.ordering()),
+            n_observations=int(problem.kept.sum()),
+            held=template.held_columns(),
             stage=stage,
             on_iteration=self.on_iteration,
         )
