@@ -58,7 +58,7 @@ class Adjustment:
         self.observations: Observations = traverse.observations
         self.start = start or start_from_telemetry(traverse)
         self.warnings = [*traverse.warnings, *self.start.warnings]
-        self.sigma_px = self.observations.sigma_px.copy()
+        self.noise = self.observations.noise
         self.reason = np.full(len(self.observations), "", dtype=object)
         solvers: dict[str, type[Solver]] = {"eliminated": EliminatedSolver, "explicit": ExplicitSolver}
         self.solver = solvers[options.landmarks](on_iteration)
@@ -116,7 +116,7 @@ class Adjustment:
             image=obs.image[rows],
             landmark=landmark.astype(np.int64),
             uv_px=uv[rows],
-            whitening=turn[rows] / obs.sigma_px[rows, None, None],
+            whitening=self.noise.select(rows).whiten(turn[rows]),
         )
 
     def _carry(self, range_m: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
@@ -150,10 +150,10 @@ class Adjustment:
         distance = np.linalg.norm(first.points_m()[m.landmark] - views.world_t_camera[m.image], axis=1)
         focal = views.calibration[m.image, 0, 0]
         telemetry_px = focal * np.sqrt(frame**2 + stop_rad**2 + (stop_m / distance.clip(1.0)) ** 2)
-        sigma = self.observations.sigma_px[m.row]
+        noise = self.noise.select(m.row)
         screening = screen(
             p.landmarks,
-            m.scaled(np.hypot(sigma, telemetry_px) / sigma),
+            replace(m, whitening=noise.widened(telemetry_px).whiten(noise.to_pixels(m.whitening))),
             views,
             p.accepted,
             cutoff_sigma=self.options.outlier_sigma,
@@ -230,7 +230,7 @@ class Adjustment:
             moved = self._recarry()
             if rescale:
                 factor = self._noise_factor()
-                self.sigma_px *= factor
+                self.noise = self.noise.scaled(factor)
                 self.problem = replace(self.problem, measurements=self.problem.measurements.scaled(factor))
                 moved |= abs(factor - 1) > 1e-3
             if not (moved and outcome.converged):
@@ -256,7 +256,7 @@ class Adjustment:
         if shift.max(initial=0.0) < _CARRIED_PX:
             return False
         keep = valid[m.row, None]
-        whitening = turn[m.row] / self.sigma_px[m.row, None, None]
+        whitening = self.noise.select(m.row).whiten(turn[m.row])
         carried = replace(
             m,
             uv_px=np.where(keep, uv[m.row], m.uv_px),
@@ -266,7 +266,7 @@ class Adjustment:
         return True
 
     def _noise_factor(self) -> float:
-        """By how much the residuals' spread exceeds the sigmas: the square root of the variance factor."""
+        """By how much residuals exceed the noise assumed: the square root of the variance factor."""
         p = self.problem
         rows = p.kept
         residual, _ = p.residuals()
@@ -309,7 +309,8 @@ class Adjustment:
             reason=tuple(self.reason.tolist()),
             residual_initial_px=self._raw_residuals(first, present),
             residual_final_px=self._raw_residuals(p, present),
-            sigma_px=self.sigma_px,
+            sigma_px=self.noise.sigma_px,
+            covariance_px2=self.noise.covariance_px2,
             stop_covariance=found.stop_covariance,
             angle_sigma_rad=found.angle_sigma_rad,
             landmark_covariance_m2=found.landmark_covariance_m2,
@@ -350,7 +351,7 @@ class Adjustment:
         whitened, in_front = problem.residuals()
         out = np.full((len(self.observations), 2), np.nan)
         known = present[m.landmark] & in_front
-        out[m.row[known]] = whitened[known] * self.sigma_px[m.row[known], None]
+        out[m.row[known]] = self.noise.select(m.row[known]).to_pixels(whitened[known])
         return out
 
     def _late_warnings(self, used: BoolArray) -> list[str]:

@@ -166,9 +166,10 @@ def test_no_observation_twice_is_bad_input(run: Run, tmp_path: Path) -> None:
 
 
 def test_simulate_then_optimize(run: Run, tmp_path: Path) -> None:
-    options = ("--stops", "1", "--pans", "2", "--sweep-deg", "45", "--seed", "3")
+    options = ("--stops", "1", "--pans", "2", "--sweep-deg", "45", "--seed", "3", "--noise-stretch", "4")
     assert run("simulate_traverse.py", "made", *options).returncode == 0
     assert run("optimize_traverse.py", "made", "--out", "out", "--no-report").returncode == 0
+    assert (tmp_path / "out" / "residuals.csv").read_text().splitlines()[0].endswith("cov_vv_px2")
     again = run("simulate_traverse.py", "made", *options)
     assert again.returncode == 2
     assert "made" in again.stderr
