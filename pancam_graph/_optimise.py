@@ -68,7 +68,7 @@ def optimise(
         costs = [optimizer.error()]
 
         def vanished() -> str | None:
-            if costs[-1] <= no_cost:
+            if rule.residual_sigmas and costs[-1] <= no_cost:
                 return f"residuals below {rule.residual_sigmas:g} sigma"
             if rule.max_gradient and _gradient(graph, optimizer.values(), held) <= rule.max_gradient:
                 return f"gradient below {rule.max_gradient:g}"
@@ -86,7 +86,7 @@ def optimise(
                 on_iteration(Iteration(stage=stage, number=number, cost=costs[-1]))
             if optimizer.lambda_() >= parameters.getlambdaUpperBound():
                 reason = "no step lowers the cost"
-            elif before is not None and _relative_step(before, optimizer.values()) <= rule.relative_step:
+            elif costs[-1] < costs[-2] and _is_short(before, optimizer.values(), rule.relative_step):
                 reason = f"relative step below {rule.relative_step:g}"
             elif rule.relative_decrease and _still_to_gain(costs) <= rule.relative_decrease * costs[-1]:
                 reason = f"relative decrease below {rule.relative_decrease:g}"
@@ -116,8 +116,10 @@ def _gradient(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, held: Map
     return largest
 
 
-def _relative_step(before: gtsam.Values, after: gtsam.Values) -> float:
-    """Length of the step between values over that of the parameters before it; see StopRule."""
+def _is_short(before: gtsam.Values | None, after: gtsam.Values, share: float) -> bool:
+    """Whether a step is no longer than a share of the parameters before it, if given; see StopRule."""
+    if before is None:
+        return False
     length2 = 0.0
     for key in before.keys():  # noqa: SIM118  gtsam.Values is not a dictionary
         is_landmark = chr(gtsam.symbolChr(key)) == "L"
@@ -125,8 +127,7 @@ def _relative_step(before: gtsam.Values, after: gtsam.Values) -> float:
         if isinstance(value, gtsam.Pose3):
             value = [*gtsam.Rot3.Logmap(value.rotation()), *value.translation()]
         length2 += float(np.sum(np.square(value)))
-    step = before.localCoordinates(after).norm()
-    return float(step / max(np.sqrt(length2), 1e-300))
+    return bool(before.localCoordinates(after).norm() <= share * np.sqrt(length2))
 
 
 def _still_to_gain(costs: list[float]) -> float:
