@@ -23,6 +23,7 @@ from pancam_graph.simulate import simulate as simulate
 from pancam_graph.solution import Solution as Solution
 from pancam_graph.solve import SolveOptions as SolveOptions
 from pancam_graph.solve import solve as solve
+from pancam_graph.stopping import StopRule as StopRule
 from pancam_graph.traverse import Frame as Frame
 from pancam_graph.traverse import Image as Image
 from pancam_graph.traverse import Observations as Observations

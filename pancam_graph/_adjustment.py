@@ -10,7 +10,7 @@ from pancam_graph._covariance import Uncertainty, uncertainty
 from pancam_graph._diagnose import connection_warnings, listed
 from pancam_graph._eliminated import EliminatedSolver
 from pancam_graph._explicit import ExplicitSolver
-from pancam_graph._optimise import Iteration, Outcome, StopRule
+from pancam_graph._optimise import Iteration, Outcome
 from pancam_graph._problem import Problem, Solver, reach_m
 from pancam_graph._reduced import ReducedSystem
 from pancam_graph._rejection import screen
@@ -23,6 +23,7 @@ from pancam_graph.landmarks import Landmarks, Measurements, rays_of, refine, res
 from pancam_graph.losses import loss_of
 from pancam_graph.options import SolveOptions
 from pancam_graph.solution import Solution, State
+from pancam_graph.stopping import StopRule
 from pancam_graph.traverse import Observations, Traverse
 
 __all__ = ["Adjustment"]
@@ -58,7 +59,7 @@ class Adjustment:
         self.observations: Observations = traverse.observations
         self.start = start or start_from_telemetry(traverse)
         self.warnings = [*traverse.warnings, *self.start.warnings]
-        self.sigma_px = self.observations.sigma_px.copy()
+        self.noise = self.observations.noise
         self.reason = np.full(len(self.observations), "", dtype=object)
         solvers: dict[str, type[Solver]] = {"eliminated": EliminatedSolver, "explicit": ExplicitSolver}
         self.solver = solvers[options.landmarks](on_iteration)
@@ -116,7 +117,7 @@ class Adjustment:
             image=obs.image[rows],
             landmark=landmark.astype(np.int64),
             uv_px=uv[rows],
-            whitening=turn[rows] / obs.sigma_px[rows, None, None],
+            whitening=self.noise.select(rows).whiten(turn[rows]),
         )
 
     def _carry(self, range_m: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
@@ -150,10 +151,10 @@ class Adjustment:
         distance = np.linalg.norm(first.points_m()[m.landmark] - views.world_t_camera[m.image], axis=1)
         focal = views.calibration[m.image, 0, 0]
         telemetry_px = focal * np.sqrt(frame**2 + stop_rad**2 + (stop_m / distance.clip(1.0)) ** 2)
-        sigma = self.observations.sigma_px[m.row]
+        noise = self.noise.select(m.row)
         screening = screen(
             p.landmarks,
-            m.scaled(np.hypot(sigma, telemetry_px) / sigma),
+            replace(m, whitening=noise.widened(telemetry_px).whiten(noise.to_pixels(m.whitening))),
             views,
             p.accepted,
             cutoff_sigma=self.options.outlier_sigma,
@@ -218,28 +219,22 @@ class Adjustment:
 
     def _final_rounds(self) -> Outcome:
         """Least squares over what was kept, until neither noise scale nor carried pixels move any more."""
-        options = self.options
-        rule = StopRule(
-            max_iterations=options.max_iterations,
-            relative_decrease=options.relative_decrease,
-            absolute_cost=1e-16 * len(self.problem.measurements.row),
-        )
-        rescale = options.rescale_noise
+        rescale = self.options.rescale_noise
         if rescale is None:
             rescale = self.observations.origin == "images"
         costs: list[float] = []
         for _ in range(_FINAL_ROUNDS):
             before = self.problem.accepted
-            self.problem, outcome = self.solver.adjust(self.problem, rule)
+            self.problem, outcome = self.solver.adjust(self.problem, self.options)
             self._note_behind(before & ~self.problem.accepted)
             costs += outcome.costs[1:] if costs else outcome.costs
             moved = self._recarry()
             if rescale:
                 factor = self._noise_factor()
-                self.sigma_px *= factor
+                self.noise = self.noise.scaled(factor)
                 self.problem = replace(self.problem, measurements=self.problem.measurements.scaled(factor))
                 moved |= abs(factor - 1) > 1e-3
-            if not moved:
+            if not (moved and outcome.converged):
                 break
         return replace(outcome, costs=tuple(costs))
 
@@ -262,7 +257,7 @@ class Adjustment:
         if shift.max(initial=0.0) < _CARRIED_PX:
             return False
         keep = valid[m.row, None]
-        whitening = turn[m.row] / self.sigma_px[m.row, None, None]
+        whitening = self.noise.select(m.row).whiten(turn[m.row])
         carried = replace(
             m,
             uv_px=np.where(keep, uv[m.row], m.uv_px),
@@ -272,7 +267,7 @@ class Adjustment:
         return True
 
     def _noise_factor(self) -> float:
-        """By how much the residuals' spread exceeds the sigmas: the square root of the variance factor."""
+        """By how much residuals exceed the noise assumed: the square root of the variance factor."""
         p = self.problem
         rows = p.kept
         residual, _ = p.residuals()
@@ -315,7 +310,8 @@ class Adjustment:
             reason=tuple(self.reason.tolist()),
             residual_initial_px=self._raw_residuals(first, present),
             residual_final_px=self._raw_residuals(p, present),
-            sigma_px=self.sigma_px,
+            sigma_px=self.noise.sigma_px,
+            covariance_px2=self.noise.covariance_px2,
             stop_covariance=found.stop_covariance,
             angle_sigma_rad=found.angle_sigma_rad,
             landmark_covariance_m2=found.landmark_covariance_m2,
@@ -361,7 +357,7 @@ class Adjustment:
         whitened, in_front = problem.residuals()
         out = np.full((len(self.observations), 2), np.nan)
         known = present[m.landmark] & in_front
-        out[m.row[known]] = whitened[known] * self.sigma_px[m.row[known], None]
+        out[m.row[known]] = self.noise.select(m.row[known]).to_pixels(whitened[known])
         return out
 
     def _late_warnings(self, used: BoolArray) -> list[str]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import gtsam
 
-from pancam_graph._optimise import InOrder, Iteration, Outcome, StopRule, optimise
+from pancam_graph._optimise import InOrder, Iteration, Outcome, optimise
 from pancam_graph._problem import Problem, Solver, system_of
 from pancam_graph._reduced import ReducedSystem, joint_root
 from pancam_graph.elimination import LandmarkSystem, Root
@@ -13,6 +13,7 @@ from pancam_graph.factors import LandmarkBlocks
 from pancam_graph.geometry import IntArray
 from pancam_graph.graph import HardTemplate, SoftTemplate, read_variable
 from pancam_graph.losses import SQUARED, Loss
+from pancam_graph.stopping import StopRule
 
 __all__ = ["EliminatedSolver"]
 
@@ -88,6 +89,8 @@ class EliminatedSolver(Solver):
             problem.values,
             rule,
             InOrder(blocks.ordering()),
+            n_observations=int(problem.kept.sum()),
+            held=template.held_columns(),
             stage=stage,
             on_iteration=self.on_iteration,
             gain_ahead=gain_ahead,

@@ -6,13 +6,14 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from pancam_graph._optimise import Elimination, Iteration, Outcome, StopRule, optimise
+from pancam_graph._optimise import Elimination, Iteration, Outcome, optimise
 from pancam_graph._problem import Problem, Solver
 from pancam_graph.errors import SolveError
 from pancam_graph.geometry import BoolArray, FloatArray
 from pancam_graph.graph import ExplicitLandmarks, SoftTemplate
 from pancam_graph.landmarks import point_sigma_m, refine
 from pancam_graph.losses import SQUARED, Loss
+from pancam_graph.stopping import StopRule
 
 __all__ = ["ExplicitSolver"]
 
@@ -106,6 +107,8 @@ class ExplicitSolver(Solver):
             problem, outcome = self._adjust(problem, rule)
             gained = outcome.costs[0] - outcome.costs[-1]
             costs += outcome.costs[1:] if costs else outcome.costs
+            if not outcome.converged:
+                break
             if gained <= 1e-6 * costs[-1] or not _weak(problem).needs_prior.any():
                 break
         return problem, replace(outcome, costs=tuple(costs))
@@ -124,7 +127,15 @@ class ExplicitSolver(Solver):
         graph.push_back(explicit.proximal_factors(points, weak.prior_m, weak.needs_prior))
         values = explicit.with_landmarks(problem.values, points, present)
         elimination = Elimination(graph, values, by_qr=bool(weak.stretched.any()))
-        outcome = optimise(graph, values, rule, elimination, on_iteration=self.on_iteration)
+        outcome = optimise(
+            graph,
+            values,
+            rule,
+            elimination,
+            n_observations=int(problem.kept.sum()),
+            held=template.held_columns(),
+            on_iteration=self.on_iteration,
+        )
         found = np.where(present[:, None], explicit.points_m(outcome.values, present), points)
         return problem.at(template.only_cameras(outcome.values), problem.landmarks.moved_to(found)), outcome
 

@@ -1,14 +1,18 @@
 """GTSAM's Levenberg-Marquardt, iteration by iteration, with a reason for stopping."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
+import numpy as np
 
 from pancam_graph.errors import SolveError
+from pancam_graph.geometry import IntArray
+from pancam_graph.graph import read_variable
+from pancam_graph.stopping import StopRule
 
-__all__ = ["Elimination", "InOrder", "Iteration", "Outcome", "StopRule", "optimise"]
+__all__ = ["Elimination", "InOrder", "Iteration", "Outcome", "optimise"]
 
 _LOG = logging.getLogger(__name__)
 _INDETERMINATE = "ndeterminate"
@@ -25,17 +29,6 @@ class Iteration:
     """"screening" while outliers are sought, "approach" from afar, "solve" for the final least squares."""
     number: int
     cost: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class StopRule:
-    """When to stop (thesis 3.8)."""
-
-    max_iterations: int
-    relative_decrease: float
-    """The iterations end where those to come would lower the cost by less than this share of it."""
-    absolute_cost: float = 0.0
-    """A cost below this is as good as none."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,48 +48,106 @@ def optimise(
     rule: StopRule,
     elimination: "Elimination | InOrder",
     *,
+    n_observations: int,
+    held: Mapping[int, IntArray],
     stage: str = "solve",
     on_iteration: Callable[[Iteration], None] | None = None,
     gain_ahead: Callable[[gtsam.Values], float | None] | None = None,
 ) -> Outcome:
     """Minimise the graph's error from the given values.
 
-    `gain_ahead` may tell by how much the next step from some values would lower the cost; None: not known.
-    Without it, that is judged by the gains so far.
+    `held` are, by key, tangent components that the graph's factors hold. `gain_ahead` may tell by how much
+    the next step from some values would lower the cost; None: not known, and judged by the gains so far.
 
     Raises SolveError where the linear system cannot be factorised however much it is damped; an exception
     from inside a custom factor reaches the caller as it is.
     """
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setlambdaUpperBound(1e10)
+    # A step that raises the cost by less than this share ends GTSAM's search for one that lowers it.
+    parameters.setRelativeErrorTol(min(parameters.getRelativeErrorTol(), rule.relative_decrease))
     elimination.set_up(parameters)
+    no_cost = n_observations * rule.residual_sigmas**2 / 2
     try:
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
         costs = [optimizer.error()]
-        converged, reason = False, f"iteration limit of {rule.max_iterations}"
-        for number in range(1, rule.max_iterations + 1):
-            if costs[-1] <= rule.absolute_cost:
-                converged, reason = True, "residuals vanish"
-                break
+
+        def vanished() -> str | None:
+            if rule.residual_sigmas and costs[-1] <= no_cost:
+                return f"residuals below {rule.residual_sigmas:g} sigma"
+            if rule.max_gradient and _gradient(graph, optimizer.values(), held) <= rule.max_gradient:
+                return f"gradient below {rule.max_gradient:g}"
+            return None
+
+        reason = vanished()
+        while reason is None and len(costs) <= rule.max_iterations:
+            # A copy: what the optimiser shows is gone once it has moved on.
+            before = gtsam.Values(optimizer.values()) if rule.relative_step else None
             optimizer.iterate()
             costs.append(optimizer.error())
+            number = len(costs) - 1
             _LOG.debug("iteration %d: cost %.9g, lambda %.1e", number, costs[-1], optimizer.lambda_())
             if on_iteration is not None:
                 on_iteration(Iteration(stage=stage, number=number, cost=costs[-1]))
             if optimizer.lambda_() >= parameters.getlambdaUpperBound():
-                converged, reason = True, "no step lowers the cost"
-                break
-            least = rule.relative_decrease * costs[-1]
-            gain, shrinking = _still_to_gain(costs)
-            if gain_ahead is not None and gain > least and not (shrinking and gain > _FAR * least):
-                ahead = gain_ahead(optimizer.values())
-                gain = gain if ahead is None else ahead
-            if gain <= least:
-                converged, reason = True, f"relative decrease below {rule.relative_decrease:g}"
-                break
+                reason = "no step lowers the cost"
+            elif costs[-1] < costs[-2] and _is_short(before, optimizer.values(), rule.relative_step):
+                reason = f"relative step below {rule.relative_step:g}"
+            elif rule.relative_decrease and _is_settled(costs, rule.relative_decrease, gain_ahead, optimizer):
+                reason = f"relative decrease below {rule.relative_decrease:g}"
+            else:
+                reason = vanished()
     except RuntimeError as error:
         raise _explained(error) from error
-    return Outcome(values=optimizer.values(), converged=converged, reason=reason, costs=tuple(costs))
+    return Outcome(
+        values=optimizer.values(),
+        converged=reason is not None,
+        reason=reason or f"iteration limit of {rule.max_iterations}",
+        costs=tuple(costs),
+    )
+
+
+def _gradient(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, held: Mapping[int, IntArray]) -> float:
+    """Largest component of the gradient of the graph's error in the variables' tangents, but for held ones.
+
+    Landmark blocks linearise here as they would in the next step, and not again then: what this costs is
+    handing their rows over a second time.
+    """
+    gradient = graph.linearize(values).gradientAtZero()
+    largest = 0.0
+    for key in values.keys():  # noqa: SIM118  gtsam.Values is not a dictionary
+        free = np.delete(gradient.at(key), held.get(key, []))
+        largest = max(largest, float(np.abs(free).max(initial=0.0)))
+    return largest
+
+
+def _is_short(before: gtsam.Values | None, after: gtsam.Values, share: float) -> bool:
+    """Whether a step is no longer than a share of the parameters before it, if given; see StopRule."""
+    if before is None:
+        return False
+    length2 = 0.0
+    for key in before.keys():  # noqa: SIM118  gtsam.Values is not a dictionary
+        is_landmark = chr(gtsam.symbolChr(key)) == "L"
+        value = before.atPoint3(key) if is_landmark else read_variable(before, key)
+        if isinstance(value, gtsam.Pose3):
+            value = [*gtsam.Rot3.Logmap(value.rotation()), *value.translation()]
+        length2 += float(np.sum(np.square(value)))
+    return bool(before.localCoordinates(after).norm() <= share * np.sqrt(length2))
+
+
+def _is_settled(
+    costs: list[float],
+    share: float,
+    gain_ahead: Callable[[gtsam.Values], float | None] | None,
+    optimizer: gtsam.NonlinearOptimizer,
+) -> bool:
+    """Whether the iterations to come would lower the cost by no more than a share of it."""
+    least = share * costs[-1]
+    gain, shrinking = _still_to_gain(costs)
+    if gain_ahead is not None and gain > least and not (shrinking and gain > _FAR * least):
+        ahead = gain_ahead(optimizer.values())
+        gain = gain if ahead is None else ahead
+    return gain <= least
 
 
 def _still_to_gain(costs: list[float]) -> tuple[float, bool]:

@@ -8,13 +8,14 @@ from functools import cached_property
 import gtsam
 import numpy as np
 
-from pancam_graph._optimise import Iteration, Outcome, StopRule
+from pancam_graph._optimise import Iteration, Outcome
 from pancam_graph.elimination import LandmarkSystem
 from pancam_graph.errors import SolveError
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.graph import FactorTemplate
 from pancam_graph.landmarks import CameraViews, Landmarks, Measurements, refine, residuals
 from pancam_graph.losses import SQUARED, Loss
+from pancam_graph.stopping import StopRule
 
 __all__ = ["Problem", "Solver", "reach_m", "system_of"]
 

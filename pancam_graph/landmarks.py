@@ -69,7 +69,7 @@ class Measurements:
     uv_px: FloatArray
     """(n, 2) pixels of the pinhole of the same camera"""
     whitening: FloatArray
-    """(n, 2, 2) takes a residual of the pinhole to raw pixels divided by sigma"""
+    """(n, 2, 2) takes a residual of the pinhole to raw pixels, and these to unit covariance"""
 
     @property
     def n_landmarks(self) -> int:

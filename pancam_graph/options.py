@@ -6,13 +6,18 @@ from typing import Literal
 from pancam_graph.errors import InputError
 from pancam_graph.graph import DEFAULT_FLEX, Flex, Model, Tie
 from pancam_graph.losses import LossName, loss_of
+from pancam_graph.stopping import StopRule
 
 __all__ = ["SolveOptions"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class SolveOptions:
-    """How to solve."""
+class SolveOptions(StopRule):
+    """How to solve, and when the final least squares ends (see StopRule).
+
+    Where noise is rescaled or pixels are carried anew, a few such least squares follow each other, each with
+    the whole number of iterations.
+    """
 
     model: Model = "mast"
     landmarks: Literal["eliminated", "explicit"] = "eliminated"
@@ -33,13 +38,10 @@ class SolveOptions:
     the observations itself and their sigmas are guesses."""
     landmark_covariances: bool = False
     """Whether the solution gets the covariance of each terrain point."""
-    max_iterations: int = 100
-    """Of the final least squares; reaching it means not converged."""
-    relative_decrease: float = 1e-7
-    """The final least squares ends where further iterations would lower the cost by a smaller share."""
 
     def __post_init__(self) -> None:
         """Check the choices."""
+        super().__post_init__()
         loss_of(self.loss)
         for name, value, choices in (
             ("model", self.model, tuple(DEFAULT_FLEX)),
@@ -54,8 +56,6 @@ class SolveOptions:
             )
         if self.flex is not None and self.firm_tie == "hard":
             raise InputError("flex: expected none with a hard tie, which has no sigma")
-        if self.max_iterations < 1:
-            raise InputError(f"max_iterations: expected 1 or more, found {self.max_iterations}")
         if not self.outlier_sigma > 0:
             raise InputError(f"outlier_sigma: expected a number above 0, found {self.outlier_sigma}")
 

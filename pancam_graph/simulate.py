@@ -4,7 +4,7 @@ Points are found as a camera finds them: along random lines of sight of every im
 the ground. Then every image near enough is asked whether it sees them, by its own camera model.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import gtsam
@@ -67,6 +67,10 @@ class SimulationOptions:
     """Tracks with fewer observations are dropped."""
     noise_px: float = 0.3
     """Standard deviation of each coordinate of an observation; with 0, they are said to have 0.3."""
+    noise_stretch: float = 1.0
+    """How many times longer than wide an observation's error ellipse is; its direction is drawn at random.
+
+    Above 1 observations get covariances. Their mean variance is that of `noise_px`."""
     outliers: float = 0.0
     """Share of observations that are a random pixel of their image instead."""
     pointing_scale: float = 1.0
@@ -106,6 +110,7 @@ class SimulationOptions:
             "sigma_stop_rad",
         ):
             self._require(name, 0 <= getattr(self, name) < np.inf, "a number of 0 or above")
+        self._require("noise_stretch", 1 <= self.noise_stretch <= 1e4, "a number from 1 to 10000")
         self._require("slope_rad", 0 <= self.slope_rad <= 0.3, "a number from 0 to 0.3")
         self._require("rocks", 0 <= self.rocks <= 1, "a share from 0 to 1")
         self._require("ridge_m", 100 <= self.ridge_m <= 1e5, "a distance from 100 m to 100 km")
@@ -171,8 +176,10 @@ def simulate(rig: Rig, options: SimulationOptions | None = None, *, seed: int = 
     options = options if options is not None else SimulationOptions()
     if seed < 0:
         raise InputError(f"simulation: seed: expected 0 or more, found {seed}")
-    streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(7)]
-    rng_terrain, rng_drive, rng_sight, rng_detection, rng_noise, rng_outlier, rng_telemetry = streams
+    streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(8)]
+    rng_terrain, rng_drive, rng_sight, rng_detection, rng_noise, rng_outlier, rng_telemetry, rng_ellipse = (
+        streams
+    )
 
     terrain, world_T_mast = _drive(rig, options, rng_terrain, rng_drive)
     angles = _panorama(rig, options)
@@ -203,13 +210,18 @@ def simulate(rig: Rig, options: SimulationOptions | None = None, *, seed: int = 
     size = np.array([[e.camera.width_px, e.camera.height_px] for e in rig.eyes])[image_eye[image]]
     outlier = rng_outlier.random(len(uv)) < options.outliers
     anywhere = rng_outlier.random(uv.shape) * size - 0.5
-    noisy = uv + options.noise_px * rng_noise.standard_normal(uv.shape)
     observations = Observations(
         image=image,
         track=track,
-        uv_px=np.where(outlier[:, None], anywhere, noisy),
+        uv_px=uv,
         sigma_px=np.full(len(uv), options.noise_px or _NOMINAL_SIGMA_PX),
     )
+    if options.noise_stretch > 1:
+        observations = observations.with_covariance(_ellipses(options, observations.sigma_px, rng_ellipse))
+    noisy = uv
+    if options.noise_px > 0:
+        noisy = uv + observations.noise.to_pixels(rng_noise.standard_normal(uv.shape))
+    observations = replace(observations, uv_px=np.where(outlier[:, None], anywhere, noisy))
 
     start = _telemetry(rig, options, world_T_mast, pan_tilt, rng_telemetry)
     truth = Truth(
@@ -223,6 +235,17 @@ def simulate(rig: Rig, options: SimulationOptions | None = None, *, seed: int = 
     centre = truth if options.prior == "truth" else start
     traverse = _traverse(rig, options, centre.world_T_mast, centre.pan_tilt_rad, observations, seed)
     return Simulation(traverse=traverse, truth=truth, telemetry_start=start)
+
+
+def _ellipses(options: SimulationOptions, sigma_px: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Covariances (n, 2, 2) of one shape and mean variance, each turned at random."""
+    long = options.noise_stretch**2
+    variances = 2 * np.array([long, 1.0]) / (long + 1.0)
+    angle = np.pi * rng.random(len(sigma_px))
+    cos, sin = np.cos(angle), np.sin(angle)
+    turn = np.stack([np.stack([cos, -sin], axis=1), np.stack([sin, cos], axis=1)], axis=1)
+    covariance = np.einsum("n,nij,j,nkj->nik", sigma_px**2, turn, variances, turn)
+    return np.asarray((covariance + covariance.transpose(0, 2, 1)) / 2)
 
 
 def _drive(

@@ -82,13 +82,15 @@ class Solution:
     residual_final_px: FloatArray
     """(observations, 2) the same at the end; for outliers too, where their landmark exists."""
     sigma_px: FloatArray
-    """(observations,) standard deviation each was weighted with in the end."""
+    """(observations,) standard deviation each was weighted with in the end (or of its covariance)."""
     stop_covariance: FloatArray
     """(stops, 6, 6) rotation first, body frame, landmarks marginalised; formal. 0 for a held stop.
 
     NaN, as the angles' sigmas, where the solution leaves a direction free; a warning says so."""
     angle_sigma_rad: FloatArray
     """(frames, 2) formal standard deviation of pan and tilt, landmarks marginalised."""
+    covariance_px2: FloatArray | None = None
+    """(observations, 2, 2) covariance each was weighted with in the end, where the input has covariances."""
     landmark_covariance_m2: FloatArray | None = None
     """(landmarks, 3, 3) of `final.landmarks_m`, all else marginalised; formal; where it was asked for."""
     warnings: tuple[str, ...] = ()

@@ -12,12 +12,21 @@ from typing import Literal
 
 import gtsam
 import numpy as np
+from numpy.typing import ArrayLike
 
+from pancam_graph._noise import PixelNoise, mean_sigma_px
 from pancam_graph.errors import InputError
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray, compose, pose_arrays
 from pancam_graph.rigs import Rig
 
 __all__ = ["Frame", "Image", "Observations", "Stop", "Traverse"]
+
+_ASYMMETRY = 1e-9
+"""Largest difference of a covariance's two mixed entries, as a share of its larger variance."""
+_FLATTEST = 1e-12
+"""Least determinant of a covariance whose larger variance is 1: less is singular but for rounding."""
+_AGREE = 0.01
+"""Largest share by which a sigma may differ from what goes with its covariance."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,22 +83,35 @@ class Observations:
     uv_px: FloatArray
     """(n, 2) pixel, centre of the top-left one at (0, 0)."""
     sigma_px: FloatArray
-    """(n,) standard deviation of each coordinate."""
+    """(n,) standard deviation of each coordinate; with covariances, the root of their mean variance."""
+    covariance_px2: FloatArray | None = None
+    """(n, 2, 2) covariance of (u, v) of each, symmetric and positive definite; None: sigma_px^2 I."""
     origin: Literal["given", "images"] = "given"
-    """"images" where this package measured them: then their sigma is a guess that the solve rescales."""
+    """"images" where this package measured them: then their noise is a guess that the solve rescales."""
 
     def __len__(self) -> int:
         """Number of observations."""
         return len(self.image)
 
+    @property
+    def noise(self) -> PixelNoise:
+        """By what the observations are weighted."""
+        return PixelNoise(sigma_px=self.sigma_px, covariance_px2=self.covariance_px2)
+
+    def with_covariance(self, covariance_px2: FloatArray) -> "Observations":
+        """The same observations with a covariance (n, 2, 2) each, and the sigmas that go with them."""
+        return replace(self, covariance_px2=covariance_px2, sigma_px=mean_sigma_px(covariance_px2))
+
     def select(self, rows: BoolArray | IntArray) -> "Observations":
         """The observations of some rows, by mask or index."""
+        noise = self.noise.select(rows)
         return replace(
             self,
             image=self.image[rows],
             track=self.track[rows],
             uv_px=self.uv_px[rows],
-            sigma_px=self.sigma_px[rows],
+            sigma_px=noise.sigma_px,
+            covariance_px2=noise.covariance_px2,
         )
 
 
@@ -222,36 +244,56 @@ def _require_observations(obs: Observations, n_images: int) -> None:
         ("track", obs.track, (n,)),
         ("uv_px", obs.uv_px, (n, 2)),
         ("sigma_px", obs.sigma_px, (n,)),
+        ("covariance_px2", obs.covariance_px2, (n, 2, 2)),
     ):
-        if column.shape != shape:
+        if column is not None and column.shape != shape:
             raise InputError(f"observations: {name}: expected shape {shape}, found {column.shape}")
     if n == 0:
         raise InputError("observations: expected at least one, found none")
-    checks = (
-        (
-            "image",
-            f"a row of images, 0 to {n_images - 1}",
-            (obs.image < 0) | (obs.image >= n_images),
-            obs.image,
-        ),
-        ("track", "a number of 0 or above", obs.track < 0, obs.track),
-        ("uv_px", "finite pixels", ~np.isfinite(obs.uv_px).all(axis=1), obs.uv_px),
-        (
-            "sigma_px",
-            "a finite number above 0",
-            ~(np.isfinite(obs.sigma_px) & (obs.sigma_px > 0)),
-            obs.sigma_px,
-        ),
+    _require_rows(
+        "image",
+        f"a row of images, 0 to {n_images - 1}",
+        (obs.image < 0) | (obs.image >= n_images),
+        obs.image,
     )
-    for name, expected, bad, column in checks:
-        if bad.any():
-            row = int(np.flatnonzero(bad)[0])
-            raise InputError(
-                f"observations: {name}, row {row}: expected {expected}, found {column[row].tolist()}"
-            )
+    _require_rows("track", "a number of 0 or above", obs.track < 0, obs.track)
+    _require_rows("uv_px", "finite pixels", ~np.isfinite(obs.uv_px).all(axis=1), obs.uv_px)
+    sigma_px, covariance_px2 = obs.sigma_px, obs.covariance_px2
+    # Covariances first: where they stand alone in a file, the sigmas were made of them.
+    if covariance_px2 is not None:
+        _require_covariances(covariance_px2)
+    wrong = ~(np.isfinite(sigma_px) & (sigma_px > 0))
+    _require_rows("sigma_px", "a finite number above 0", wrong, sigma_px)
+    if covariance_px2 is not None:
+        mean = mean_sigma_px(covariance_px2)
+        other = np.abs(sigma_px - mean) > _AGREE * mean
+        right = (
+            f"{mean[np.argmax(other)]:.6g}, the root of the mean variance in covariance_px2, or no sigma_px"
+        )
+        _require_rows("sigma_px", right, other, sigma_px)
     pairs = np.unique(np.column_stack([obs.image, obs.track]), axis=0, return_counts=True)
     if (pairs[1] > 1).any():
         image, track = pairs[0][pairs[1] > 1][0]
         raise InputError(
             f"observations: expected an image to see a track once, found image {image}, track {track} twice"
         )
+
+
+def _require_rows(name: str, expected: str, wrong: ArrayLike, column: FloatArray | IntArray) -> None:
+    """Raise InputError naming the first row that is wrong."""
+    if np.any(wrong):
+        row = int(np.argmax(wrong))
+        found = column[row].tolist()
+        raise InputError(f"observations: {name}, row {row}: expected {expected}, found {found}")
+
+
+def _require_covariances(covariance_px2: FloatArray) -> None:
+    name, c = "covariance_px2", covariance_px2
+    _require_rows(name, "finite numbers", ~np.isfinite(c).all(axis=(1, 2)), c)
+    _require_rows(name, "variances above 0", ~((c[:, 0, 0] > 0) & (c[:, 1, 1] > 0)), c)
+    with np.errstate(over="ignore"):  # what overflows is refused
+        scaled = c / np.maximum(c[:, 0, 0], c[:, 1, 1])[:, None, None]
+        skewed = ~(np.abs(scaled[:, 0, 1] - scaled[:, 1, 0]) <= _ASYMMETRY)
+        determinant = scaled[:, 0, 0] * scaled[:, 1, 1] - scaled[:, 1, 0] ** 2
+    _require_rows(name, "a symmetric matrix", skewed, c)
+    _require_rows(name, "a positive definite matrix", ~(determinant > _FLATTEST), c)

@@ -15,6 +15,7 @@ from pancam_graph.io import check_out
 from pancam_graph.kernel import must_compile
 from pancam_graph.program import Parser, Progress, print_summary, run, show_log
 from pancam_graph.solve import COMPILING
+from pancam_graph.stopping import criteria
 
 
 def main() -> int:
@@ -41,9 +42,19 @@ def main() -> int:
         default="huber",
         help="robust loss while outliers are sought (default huber); none: keep every observation",
     )
+    parser.add_argument(
+        "--stop",
+        action="append",
+        default=[],
+        metavar="NAME=NUMBER",
+        help="when the final iterations end; may be given for each of max_iterations (default 100), "
+        "relative_decrease (of the cost, 1e-7), relative_step, max_gradient, residual_sigmas; 0: not used",
+    )
     parser.add_argument("--no-report", action="store_true", help="do not write report.html")
     arguments = parser.parse_args()
     show_log(verbose=arguments.verbose)
+    choices = {name: getattr(arguments, name) for name in ("model", "landmarks", "loss")}
+    options = SolveOptions(**choices, **criteria(arguments.stop))
     progress = Progress()
 
     begin = time.perf_counter()
@@ -55,7 +66,6 @@ def main() -> int:
         read_s = time.perf_counter() - begin
         if must_compile():
             progress.say(COMPILING)
-        options = SolveOptions(model=arguments.model, landmarks=arguments.landmarks, loss=arguments.loss)
         solution = solve(traverse, options, on_iteration=progress.iteration).with_seconds(read=read_s)
         progress.say("writing the results")
         solution = solution.save(arguments.out, report=not arguments.no_report)

@@ -36,6 +36,7 @@ def main() -> int:
     add("--tilts-deg", dest="tilts_rad", type=_degrees, nargs="+", help="of each row, up positive (two rows)")
     add("--points-per-image", type=int, default=d.points_per_image, help="density (%(default)s)")
     add("--noise-px", type=float, default=d.noise_px, help="sigma per coordinate (%(default)s)")
+    add("--noise-stretch", type=float, default=1.0, help="length over width of error ellipses (1: round)")
     add("--outliers", type=float, default=d.outliers, help="share of random pixels (%(default)s)")
     add("--pointing-scale", type=float, default=1.0, help="errors of pan and tilt, times the rig's (1)")
     add("--sigma-stop-m", type=float, default=d.sigma_stop_m, help="odometry's, per axis (%(default)s)")

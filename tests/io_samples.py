@@ -83,6 +83,13 @@ def traverse(poses: tuple[gtsam.Pose3, ...] = (gtsam.Pose3(), MOUNT), folder: Pa
     )
 
 
+def covariances(n: int) -> FloatArray:
+    """Covariances (n, 2, 2) that are all different, correlated, and exactly symmetric."""
+    root = np.random.default_rng(1).normal(0, 0.3, (n, 2, 2))
+    covariance = root @ root.transpose(0, 2, 1) + 0.01 * np.eye(2)
+    return np.asarray((covariance + covariance.transpose(0, 2, 1)) / 2)
+
+
 def solution(**changes: Any) -> Solution:
     """A made-up solution: track 2 has no landmark, image 0 has no used observation, one is an outlier."""
     given = traverse()

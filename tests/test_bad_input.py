@@ -232,6 +232,18 @@ def spring() -> None:
 Arrays = dict[str, Any]
 N = 60
 
+
+def covariance(
+    arrays: Arrays, change: Callable[[Any], Any] = lambda c: c, at: list[list[float]] | None = None
+) -> None:
+    """Put covariances in place of sigmas; changed, or with another at row 5."""
+    good = np.tile([[0.1, 0.05], [0.05, 0.7 / 3]], (N, 1, 1))
+    if at is not None:
+        good[5] = at
+    del arrays["sigma_px"]
+    arrays["covariance_px2"] = change(good)
+
+
 COLUMNS: dict[str, tuple[Callable[[Arrays], object], str, str]] = {
     # name: change, column and row as the sentence names them, what it says was found
     "missing": (lambda a: a.pop("sigma_px"), "sigma_px", "image, track, uv_px"),
@@ -264,6 +276,66 @@ COLUMNS: dict[str, tuple[Callable[[Arrays], object], str, str]] = {
     "sigma 0": (put("sigma_px", 5, to=0), "sigma_px, row 5", "found 0.0"),
     "sigma NaN": (put("sigma_px", 5, to=np.nan), "sigma_px, row 5", "found nan"),
     "a track twice in an image": (put("track", 1, to=0), "see a track once", "twice"),
+    "covariance short": (
+        lambda a: covariance(a, lambda c: c[1:]),
+        "columns: expected one length",
+        "covariance_px2 (59, 2, 2)",
+    ),
+    "covariance of triples": (
+        lambda a: covariance(a, lambda c: np.ones((N, 3))),
+        "covariance_px2: expected shape (60, 2, 2)",
+        "(60, 3)",
+    ),
+    "covariance single": (
+        lambda a: covariance(a, lambda c: np.array(0.1)),
+        "covariance_px2: expected a column",
+        "a single value",
+    ),
+    "covariance texts": (
+        lambda a: covariance(a, lambda c: c.astype(str)),
+        "covariance_px2: expected numbers",
+        "<U",
+    ),
+    "covariance NaN": (
+        lambda a: covariance(a, at=[[0.1, np.nan], [np.nan, 0.1]]),
+        "covariance_px2, row 5: expected finite",
+        "[[0.1, nan], [nan, 0.1]]",
+    ),
+    "covariance skewed": (
+        lambda a: covariance(a, at=[[0.1, 0.02], [0.01, 0.1]]),
+        "covariance_px2, row 5: expected a symmetric",
+        "[[0.1, 0.02], [0.01, 0.1]]",
+    ),
+    "covariance indefinite": (
+        lambda a: covariance(a, at=[[0.1, 0.2], [0.2, 0.1]]),
+        "covariance_px2, row 5: expected a positive definite",
+        "[[0.1, 0.2], [0.2, 0.1]]",
+    ),
+    "covariance singular": (
+        lambda a: covariance(a, at=[[0.4, 0.2], [0.2, 0.1]]),
+        "covariance_px2, row 5: expected a positive definite",
+        "[[0.4, 0.2], [0.2, 0.1]]",
+    ),
+    "covariance immense": (
+        lambda a: covariance(a, at=[[1e-300, 1e300], [1e300, 1e308]]),
+        "covariance_px2, row 5: expected a positive definite",
+        "[[1e-300, 1e+300], [1e+300, 1e+308]]",
+    ),
+    "variance 0": (
+        lambda a: covariance(a, at=[[0.1, 0.0], [0.0, 0.0]]),
+        "covariance_px2, row 5: expected variances above 0",
+        "[[0.1, 0.0], [0.0, 0.0]]",
+    ),
+    "variance below 0": (
+        lambda a: covariance(a, at=[[-0.1, 0.0], [0.0, -0.1]]),
+        "covariance_px2, row 5: expected variances above 0",
+        "[[-0.1, 0.0], [0.0, -0.1]]",
+    ),
+    "sigma against covariance": (
+        lambda a: covariance(a) or a.update(sigma_px=np.full(N, 0.3)),
+        "sigma_px, row 0: expected 0.408248, the root of the mean variance in covariance_px2",
+        "found 0.3",
+    ),
     "none": (lambda a: a.update({k: v[:0] for k, v in a.items()}), "at least one", "none"),
 }
 
@@ -312,6 +384,10 @@ def test_npz_with_damaged_members(folder: Path) -> None:
 
 CSV = "image,track,u_px,v_px,sigma_px\n0,0,1,2,0.5\n1,0,3,4,0.5\n"
 
+COVARIANCES = (
+    "image,track,u_px,v_px,cov_uu_px2,cov_uv_px2,cov_vv_px2\n0,0,1,2,0.1,0,0.1\n1,0,3,4,0.1,0.01,0.2\n"
+)
+
 TABLES: dict[str, tuple[bytes, str, str]] = {
     "empty": (b"", "line 1", "an empty line"),
     "header only": (CSV.splitlines()[0].encode(), "at least one", "none"),
@@ -327,6 +403,33 @@ TABLES: dict[str, tuple[bytes, str, str]] = {
     "track endless": (CSV.replace("1,0", f"1,{2**63}").encode(), "track, row 1 (line 3)", str(2**63)),
     "cell missing": (CSV.replace("3,4,0.5", "3,4").encode(), "row 1 (line 3): expected 5 cells", "found 4"),
     "NaN": (CSV.replace("3,4", "nan,4").encode(), "uv_px, row 1", "[nan, 4.0]"),
+    "covariance column missing": (
+        CSV.replace("sigma_px", "cov_uv_px2").encode(),
+        "cov_uu_px2: expected one such column",
+        "none of this",
+    ),
+    "covariance column twice": (
+        COVARIANCES.replace("cov_uv", "cov_uu").encode(),
+        "cov_uu_px2: expected one such column",
+        "2 times",
+    ),
+    "covariance text": (
+        COVARIANCES.replace("0.01,0.2\n", "none,0.2\n").encode(),
+        "cov_uv_px2, row 1 (line 3): expected a number",
+        '"none"',
+    ),
+    "covariance indefinite": (
+        COVARIANCES.replace("0.01,0.2\n", "0.3,0.2\n").encode(),
+        "covariance_px2, row 1: expected a positive definite",
+        "[[0.1, 0.3], [0.3, 0.2]]",
+    ),
+    "sigma against covariance": (
+        "".join(
+            f"{a},{b}\n" for a, b in zip(COVARIANCES.split(), ("sigma_px", "0.3", "0.5"), strict=True)
+        ).encode(),
+        "sigma_px, row 0: expected 0.316228",
+        "found 0.3",
+    ),
     "image beyond": (CSV.replace("1,0", "99,0").encode(), "image, row 1", "found 99"),
     "open quote": (CSV.replace("3,4", '"3,4').encode(), "line ", "an error"),
     "not UTF-8": (b"\xff\xfe" + CSV.encode("utf-16-le"), "CSV in UTF-8", "other bytes"),

@@ -142,6 +142,12 @@ def uneven_noise(traverse: Traverse) -> Traverse:
     return traverse.with_observations(replace(traverse.observations, sigma_px=sigma_px))
 
 
+def ellipses(traverse: Traverse) -> Traverse:
+    assert traverse.observations is not None
+    covariance_px2 = np.tile(np.diag([0.1, 0.2]), (len(traverse.observations), 1, 1))
+    return traverse.with_observations(traverse.observations.with_covariance(covariance_px2))
+
+
 def uneven_pointing(traverse: Traverse) -> Traverse:
     first, *others = traverse.frames
     return replace(traverse, frames=(replace(first, sigma_pan_rad=0.1), *others))
@@ -155,6 +161,7 @@ def uneven_pointing(traverse: Traverse) -> Traverse:
         (larger_eye, "two equal cameras"),
         (free_first_stop, "held"),
         (uneven_noise, "sigma_px: the peer expects one number"),
+        (ellipses, "covariance_px2: the peer expects none"),
         (uneven_pointing, "sigmas of pan and tilt: the peer expects one number"),
         (lambda t: replace(t, observations=None), "observations"),
     ],

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pancam_graph import Image, Traverse
+from pancam_graph import Image, Observations, Traverse
 from pancam_graph.cameras import CAHV, Camera
 from pancam_graph.errors import InputError
 from pancam_graph.io import read_input, read_traverse, write_traverse
@@ -53,7 +53,7 @@ def assert_same(found: Traverse, expected: Traverse) -> None:
         assert found.observations is None
         return
     assert found.observations is not None
-    for name in ("image", "track", "uv_px", "sigma_px"):
+    for name in ("image", "track", "uv_px", "sigma_px", "covariance_px2"):
         np.testing.assert_array_equal(getattr(found.observations, name), getattr(expected.observations, name))
 
 
@@ -151,6 +151,52 @@ def test_csv_observations(tmp_path: Path) -> None:
         for row in range(len(obs)):
             u, v = obs.uv_px[row].tolist()
             writer.writerow([obs.track[row], obs.image[row], "a, b", repr(v), repr(u), obs.sigma_px[row]])
+    assert_same(read_traverse(tmp_path), expected)
+
+
+def with_covariances() -> tuple[Traverse, Observations]:
+    sample = io_samples.traverse()
+    assert sample.observations is not None
+    observations = sample.observations.with_covariance(io_samples.covariances(len(sample.observations)))
+    return sample.with_observations(observations), observations
+
+
+def test_covariances_return(tmp_path: Path) -> None:
+    expected, obs = with_covariances()
+    write_traverse(expected, tmp_path)
+    assert_same(read_traverse(tmp_path), expected)
+    np.savez(  # without sigma_px, which follows from them
+        tmp_path / "observations.npz",
+        image=obs.image,
+        track=obs.track,
+        uv_px=obs.uv_px,
+        covariance_px2=obs.covariance_px2,
+    )
+    assert_same(read_traverse(tmp_path), expected)
+
+
+@pytest.mark.parametrize("with_sigma", [False, True])
+def test_csv_covariances(tmp_path: Path, with_sigma: bool) -> None:
+    expected, obs = with_covariances()
+    write_traverse(expected, tmp_path)
+    path = tmp_path / "traverse.json"
+    path.write_text(path.read_text().replace("observations.npz", "observations.csv"))
+    assert obs.covariance_px2 is not None
+    names = ["cov_vv_px2", "image", "track", "u_px", "v_px", "cov_uu_px2", "cov_uv_px2"]
+    columns = [
+        obs.covariance_px2[:, 1, 1],
+        obs.image,
+        obs.track,
+        *obs.uv_px.T,
+        *obs.covariance_px2[:, 0].T,
+    ]
+    if with_sigma:
+        names.append("sigma_px")
+        columns.append(obs.sigma_px)
+    with (tmp_path / "observations.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(names)
+        writer.writerows(zip(*(map(repr, c.tolist()) for c in columns), strict=True))
     assert_same(read_traverse(tmp_path), expected)
 
 

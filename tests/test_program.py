@@ -132,6 +132,27 @@ def test_wrong_option_is_one_line(run: Run, traverse_folder: Path) -> None:
     assert "'ring'" in done.stderr
 
 
+def test_stopping_is_set_and_said(run: Run, traverse_folder: Path, tmp_path: Path) -> None:
+    short = ("--loss", "none", "--no-report", "--stop", "max_iterations=1", "--stop", "relative_decrease=0")
+    assert run("optimize_traverse.py", "traverse", "--out", "out", *short).returncode == 1
+    solution = read_solution_json(tmp_path / "out" / "solution.json")
+    assert (solution.converged, solution.stop_reason) == (False, "iteration limit of 1")
+    other = ("--no-report", "--stop", "relative_decrease=0", "--stop", "max_gradient=0.5")
+    assert run("optimize_traverse.py", "traverse", "--out", "out", *other).returncode == 0
+    assert read_solution_json(tmp_path / "out" / "solution.json").stop_reason == "gradient below 0.5"
+
+
+@pytest.mark.parametrize(
+    ("text", "word"), [("steps=3", "'steps=3'"), ("max_gradient=few", "'few'"), ("relative_step=-1", "-1.0")]
+)
+def test_wrong_stopping_is_one_sentence_before_anything_is_read(run: Run, text: str, word: str) -> None:
+    done = run("optimize_traverse.py", "nowhere", "--out", "out", "--stop", text)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    for part in ("expected", "found", word):
+        assert part in done.stderr
+
+
 def test_no_observation_twice_is_bad_input(run: Run, tmp_path: Path) -> None:
     simulation = simulate(mer_navcam(), SMALL, seed=0)
     t = simulation.traverse
@@ -145,9 +166,10 @@ def test_no_observation_twice_is_bad_input(run: Run, tmp_path: Path) -> None:
 
 
 def test_simulate_then_optimize(run: Run, tmp_path: Path) -> None:
-    options = ("--stops", "1", "--pans", "2", "--sweep-deg", "45", "--seed", "3")
+    options = ("--stops", "1", "--pans", "2", "--sweep-deg", "45", "--seed", "3", "--noise-stretch", "4")
     assert run("simulate_traverse.py", "made", *options).returncode == 0
     assert run("optimize_traverse.py", "made", "--out", "out", "--no-report").returncode == 0
+    assert (tmp_path / "out" / "residuals.csv").read_text().splitlines()[0].endswith("cov_vv_px2")
     again = run("simulate_traverse.py", "made", *options)
     assert again.returncode == 2
     assert "made" in again.stderr

@@ -160,6 +160,7 @@ class LandmarkSystem:
         """By how much placing strays anew lowered the cost where the last step led."""
         self._memory = np.empty(0)
         self._moved, self._moved_cost = np.empty_like(self.vector), np.zeros(n)
+        self._has_moved = False
 
     def _arrange(
         self, m: Measurements, first: IntArray, reach: dict[int, tuple[int, ...]], edges: IntArray
@@ -367,6 +368,7 @@ class LandmarkSystem:
                 )
 
         in_parallel(work, len(self.chunks), grain=1)
+        self._has_moved = True
         self._replace_strays(posture.views, bearings)
         return self._by_block(self._moved_cost)
 
@@ -443,8 +445,9 @@ class LandmarkSystem:
 
     @property
     def any_behind(self) -> bool:
-        """Whether an observation's landmark was behind its camera where the last step led."""
-        return bool(self._moved_cost.max() >= kernel.BEHIND_COST)
+        """Whether a landmark was behind a camera of its own where the last step led, or at its first."""
+        cost = self._moved_cost if self._has_moved else self.reduced.cost
+        return bool(cost.max() >= kernel.BEHIND_COST)
 
     @property
     def moved_cost(self) -> float:

@@ -49,7 +49,8 @@ class ExplicitLandmarks:
                     noise = loss.noise_model(gtsam.noiseModel.Isotropic.Sigma(2, 1 / w[0, 0]))
                     isotropic[w[0, 0]] = noise
             else:
-                noise = loss.noise_model(gtsam.noiseModel.Gaussian.SqrtInformation(w))
+                # Not "smart": GTSAM takes a matrix with nothing above its diagonal for a diagonal one.
+                noise = loss.noise_model(gtsam.noiseModel.Gaussian.SqrtInformation(w, False))
             image = int(m.image[i])
             graph.push_back(
                 gtsam.GenericProjectionFactorCal3_S2(

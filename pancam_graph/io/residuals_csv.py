@@ -9,7 +9,7 @@ import numpy as np
 from pancam_graph.geometry import FloatArray
 from pancam_graph.solution import Solution
 
-__all__ = ["COLUMNS", "residuals_csv"]
+__all__ = ["COLUMNS", "COVARIANCE_COLUMNS", "residuals_csv"]
 
 COLUMNS = (
     "image",
@@ -28,11 +28,16 @@ COLUMNS = (
 `reason` says why an observation was not used."""
 
 
+COVARIANCE_COLUMNS = ("cov_uu_px2", "cov_uv_px2", "cov_vv_px2")
+"""Last, and only where the observations have covariances: those that each was weighted with in the end."""
+
+
 def residuals_csv(solution: Solution) -> bytes:
     """The residuals of a solution as a CSV file with `COLUMNS`, in the order of the observations."""
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
+    covariance = solution.covariance_px2
+    writer.writerow(COLUMNS if covariance is None else COLUMNS + COVARIANCE_COLUMNS)
     observations = solution.traverse.observations
     if observations is not None:
         ids = [i.id for i in solution.traverse.images]
@@ -46,6 +51,8 @@ def residuals_csv(solution: Solution) -> bytes:
             solution.used.astype(int).tolist(),
             solution.reason,
         ]
+        if covariance is not None:
+            columns += [_cells(covariance[:, i, j]) for i, j in ((0, 0), (0, 1), (1, 1))]
         writer.writerows(zip(*columns, strict=True))
     return text.getvalue().encode()
 

@@ -33,6 +33,8 @@ def write_peer(traverse: Traverse, start_m: FloatArray, path: Path) -> None:
         raise InputError(
             f"stops: {traverse.stops[0].id}: expected to be held (sigmas of 0), found {stops[0]}"
         )
+    if observations.covariance_px2 is not None:
+        raise InputError("observations: covariance_px2: the peer expects none, only sigma_px; found some")
     sigma_px = _one("observations: sigma_px", observations.sigma_px)
     sigma_angle_rad = _one("frames: sigmas of pan and tilt", np.array(angles))
     sigma_rotation_rad, sigma_translation_m = (
