@@ -217,19 +217,13 @@ class Adjustment:
 
     def _final_rounds(self) -> Outcome:
         """Least squares over what was kept, until neither noise scale nor carried pixels move any more."""
-        options = self.options
-        rule = StopRule(
-            max_iterations=options.max_iterations,
-            relative_decrease=options.relative_decrease,
-            absolute_cost=1e-16 * len(self.problem.measurements.row),
-        )
-        rescale = options.rescale_noise
+        rescale = self.options.rescale_noise
         if rescale is None:
             rescale = self.observations.origin == "images"
         costs: list[float] = []
         for _ in range(_FINAL_ROUNDS):
             before = self.problem.accepted
-            self.problem, outcome = self.solver.adjust(self.problem, rule)
+            self.problem, outcome = self.solver.adjust(self.problem, self._rule)
             self._note_behind(before & ~self.problem.accepted)
             costs += outcome.costs[1:] if costs else outcome.costs
             moved = self._recarry()
@@ -241,6 +235,21 @@ class Adjustment:
             if not moved:
                 break
         return replace(outcome, costs=tuple(costs))
+
+    @property
+    def _rule(self) -> StopRule:
+        """When the final least squares ends."""
+        return StopRule(
+            max_iterations=self.options.max_iterations,
+            relative_decrease=self.options.relative_decrease,
+            absolute_cost=1e-16 * len(self.problem.measurements.row),
+        )
+
+    def with_only(self, landmarks: BoolArray) -> tuple[Problem, Outcome]:
+        """Least squares over some landmarks (landmarks,) from where `solve` ended, which stays as it is."""
+        p = self.problem
+        part = replace(p, accepted=p.accepted & landmarks[p.measurements.landmark])
+        return self.solver.adjust(part, self._rule)
 
     def _note_behind(self, behind: BoolArray) -> None:
         self.reason[self.problem.measurements.row[behind]] = "behind"
@@ -323,11 +332,7 @@ class Adjustment:
 
     def _uncertainty(self) -> Uncertainty:
         """Covariances; NaN and a warning where a direction is free. Warns of landmarks without a place."""
-        t, wanted = self.traverse, self.options.landmark_covariances
-        problem = self.problem
-        if self.options.firm_tie == "hard" and isinstance(problem.template, SoftTemplate):
-            # The inverse of a system with a tie of 1e-8 would have lost half its digits.
-            problem = problem.on(HardTemplate(t))
+        t, wanted, problem = self.traverse, self.options.landmark_covariances, self.regular
         try:
             found = uncertainty(problem, self.final, *self.solver.system(problem), landmarks=wanted)
         except SolveError as error:
@@ -348,6 +353,15 @@ class Adjustment:
                 "they tell where cameras point, and a weak prior holds the point"
             )
         return found
+
+    @property
+    def regular(self) -> Problem:
+        """The problem as covariances are taken from it."""
+        problem = self.problem
+        if self.options.firm_tie == "hard" and isinstance(problem.template, SoftTemplate):
+            # The inverse of a system with a tie of 1e-8 would have lost half its digits.
+            return problem.on(HardTemplate(self.traverse))
+        return problem
 
     def _raw_residuals(self, problem: Problem, present: BoolArray) -> FloatArray:
         """Projected minus measured (observations, 2) in raw pixels; NaN where there is no landmark."""

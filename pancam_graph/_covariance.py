@@ -7,13 +7,13 @@ import numpy as np
 from scipy.sparse import coo_array, csc_array
 
 from pancam_graph._problem import Problem
-from pancam_graph.elimination import FreeDirectionError, LandmarkSystem, Linkage, Panels
+from pancam_graph.elimination import Covariance, FreeDirectionError, LandmarkSystem, Linkage, Panels
 from pancam_graph.errors import SolveError
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.graph import FactorTemplate
 from pancam_graph.solution import State
 
-__all__ = ["Uncertainty", "uncertainty"]
+__all__ = ["Uncertainty", "covariance_of", "uncertainty"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -38,16 +38,7 @@ def uncertainty(
     `rows` are the system's landmarks among all. Raises SolveError where a direction is held by nothing.
     """
     template, m = problem.template, problem.measurements
-    panels = system.linearise(template.posture(problem.values))
-    if template.linkage.key:
-        _add(panels, template.linkage, problem.factors.linearize(problem.values))
-    held = _columns(template.linkage, template.held_columns())
-    panels.hold(held)
-    try:
-        covariance = panels.root().covariance()
-    except FreeDirectionError as error:
-        raise SolveError(f"nothing holds {_name(template, error)}") from error
-    covariance.release(held)
+    covariance = covariance_of(problem, system)
     undetermined = np.zeros(m.n_landmarks, dtype=bool)
     undetermined[rows] = system.undetermined
     spread = None
@@ -60,6 +51,25 @@ def uncertainty(
         landmark_covariance_m2=spread,
         undetermined=undetermined,
     )
+
+
+def covariance_of(problem: Problem, system: LandmarkSystem) -> Covariance:
+    """Covariance of the variables at the problem's values; 0 where held.
+
+    Raises SolveError where a direction is held by nothing.
+    """
+    template = problem.template
+    panels = system.linearise(template.posture(problem.values))
+    if template.linkage.key:
+        _add(panels, template.linkage, problem.factors.linearize(problem.values))
+    held = _columns(template.linkage, template.held_columns())
+    panels.hold(held)
+    try:
+        covariance = panels.root().covariance()
+    except FreeDirectionError as error:
+        raise SolveError(f"nothing holds {_name(template, error)}") from error
+    covariance.release(held)
+    return covariance
 
 
 def _add(panels: Panels, linkage: Linkage, linear: gtsam.GaussianFactorGraph) -> None:

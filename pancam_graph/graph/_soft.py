@@ -9,7 +9,7 @@ from functools import cached_property
 import gtsam
 import numpy as np
 
-from pancam_graph.elimination import Covariance, Linkage, Posture
+from pancam_graph.elimination import Linkage, Posture
 from pancam_graph.factors import CircleOffset, Fixed, Key, Slot, circle_factor, mast_factor
 from pancam_graph.geometry import FloatArray, IntArray, pan_tilt_from_rotation, pose_arrays, wrap_angle
 from pancam_graph.graph._options import Flex, Model
@@ -231,37 +231,31 @@ class SoftTemplate(FactorTemplate):
                 held[slot.key] = np.flatnonzero(np.array([frame.sigma_pan_rad, frame.sigma_tilt_rad]) == 0)
         return held
 
-    def angle_sigma_rad(self, covariance: Covariance, state: State) -> FloatArray:
-        """Standard deviation of pan and tilt (frames, 2): of the variables, or of what camera poses say.
+    def angle_rows(self, frame: int, state: State) -> tuple[IntArray, FloatArray]:
+        """How a frame's pan and tilt move: they are variables, or what camera poses say.
 
-        As in `state`: where the model is not `mast`, it is that of the mean over a frame's eyes.
+        As in `state`: where the model is not `mast`, it is the mean over a frame's eyes.
         """
         t, link = self.traverse, self.linkage
-        sigma = np.zeros((len(t.frames), 2))
-        for frame in range(len(t.frames)):
-            stop = int(t.frame_stop[frame])
-            if self.model == "mast":
-                if isinstance(slot := self.pan_tilt(frame), Key):
-                    rows = link.columns_of(slot.key)
-                    sigma[frame] = np.sqrt(np.diag(covariance.block(stop, stop)[rows, rows]))
-                continue
-            images = np.flatnonzero(t.image_frame == frame)
-            if len(images) == 0:
-                continue
-            mast_R = state.world_T_mast[stop].rotation().matrix()
-            pan, tilt = state.pan_tilt_rad[frame]
-            # A small turn w of the head, in the mast frame, moves pan by d_pan w and tilt by d_tilt w.
-            d_pan = np.array([-np.cos(pan) * np.tan(tilt), -np.sin(pan) * np.tan(tilt), 1.0])
-            d_tilt = np.array([np.sin(pan), -np.cos(pan), 0.0])
-            d_angles = np.vstack([d_pan, d_tilt])
-            jacobian = np.zeros((2, int(link.group_dim[stop])))
-            for i in images:
-                turn = link.columns_of(self.camera_key(int(i))).start + np.arange(3)
-                jacobian[:, turn] = d_angles @ mast_R.T @ state.world_R_camera[i] / len(images)
-            if isinstance(slot := self.mast(stop), Key):
-                jacobian[:, link.columns_of(slot.key).start + np.arange(3)] = -d_angles
-            sigma[frame] = np.sqrt(np.diag(jacobian @ covariance.block(stop, stop) @ jacobian.T))
-        return sigma
+        stop = int(t.frame_stop[frame])
+        if self.model == "mast":
+            if not isinstance(slot := self.pan_tilt(frame), Key):
+                return np.zeros(0, dtype=np.int64), np.zeros((2, 0))
+            own = link.columns_of(slot.key)
+            return np.arange(own.start, own.stop), np.eye(2)
+        mast_R = state.world_T_mast[stop].rotation().matrix()
+        pan, tilt = state.pan_tilt_rad[frame]
+        # A small turn w of the head, in the mast frame, moves pan by d_pan w and tilt by d_tilt w.
+        d_pan = np.array([-np.cos(pan) * np.tan(tilt), -np.sin(pan) * np.tan(tilt), 1.0])
+        d_tilt = np.array([np.sin(pan), -np.cos(pan), 0.0])
+        d_angles = np.vstack([d_pan, d_tilt])
+        images = np.flatnonzero(t.image_frame == frame)
+        turns = [(self.camera_key(int(i)), mast_R.T @ state.world_R_camera[i] / len(images)) for i in images]
+        if turns and isinstance(slot := self.mast(stop), Key):
+            turns.append((slot.key, -np.eye(3)))
+        columns = [link.columns_of(key).start + np.arange(3) for key, _ in turns]
+        rows = [d_angles @ turn for _, turn in turns]
+        return np.concatenate([np.zeros(0, dtype=np.int64), *columns]), np.hstack([np.zeros((2, 0)), *rows])
 
     def image_pointing_offset(
         self, masts: tuple[gtsam.Pose3, ...], pan_tilt_rad: FloatArray, world_R_camera: FloatArray
