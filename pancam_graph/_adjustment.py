@@ -28,6 +28,7 @@ __all__ = ["Adjustment"]
 
 _LOG = logging.getLogger(__name__)
 
+_SOLVERS: dict[str, type[Solver]] = {"eliminated": EliminatedSolver, "explicit": ExplicitSolver}
 _SCREENING_ROUNDS = 12
 _ABOUT = 0.002
 """The first pass of screening ends when no more than this share of the observations changes."""
@@ -59,8 +60,7 @@ class Adjustment:
         self.warnings = [*traverse.warnings, *self.start.warnings]
         self.sigma_px = self.observations.sigma_px.copy()
         self.reason = np.full(len(self.observations), "", dtype=object)
-        solvers: dict[str, type[Solver]] = {"eliminated": EliminatedSolver, "explicit": ExplicitSolver}
-        self.solver = solvers[options.landmarks](on_iteration)
+        self.solver = _SOLVERS[options.landmarks](on_iteration)
         self.problem = self.first = self._first_problem(_template(traverse, options)).placed()
 
     # --- preparation ---
@@ -246,10 +246,17 @@ class Adjustment:
         )
 
     def with_only(self, landmarks: BoolArray) -> tuple[Problem, Outcome]:
-        """Least squares over some landmarks (landmarks,) from where `solve` ended, which stays as it is."""
+        """Least squares over some landmarks (landmarks,) from where `solve` ended, which stays as it is.
+
+        From there, so that of several optima it is the one beside; anew from afar where that does not
+        converge, since steps with a firm tie are short.
+        """
         p = self.problem
         part = replace(p, accepted=p.accepted & landmarks[p.measurements.landmark])
-        return self.solver.adjust(part, self._rule)
+        found, outcome = self.solver.adjust(part, self._rule)
+        if outcome.converged:
+            return found, outcome
+        return _SOLVERS[self.options.landmarks](self.solver.on_iteration).adjust(part, self._rule)
 
     def _note_behind(self, behind: BoolArray) -> None:
         self.reason[self.problem.measurements.row[behind]] = "behind"

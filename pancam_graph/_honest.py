@@ -67,11 +67,12 @@ class Spread:
         images_part = np.minimum(geometric / count.clip(1), formal**2)
         variance = formal**2 + np.where(count > 0, images_part * (np.nan_to_num(mean_square) - 1), 0.0)
         times = np.count_nonzero(told, axis=0)
+        known = np.any(told & np.all(np.isfinite(step_variance), axis=1), axis=0)
         apart = np.where(told, np.nan_to_num(step[:, 1] - step[:, 0]) ** 2, 0.0).sum(axis=0)
         return Spread(
             difference=np.sqrt(apart / np.where(times > 0, times, np.nan)),
             ratio=np.sqrt(mean_square),
-            sigma=np.where(times > 0, np.sqrt(variance.clip(0.0)), np.nan),
+            sigma=np.where(known, np.sqrt(variance.clip(0.0)), np.nan),
         )
 
 

@@ -27,6 +27,8 @@ from pancam_graph.traverse import Traverse
 __all__ = ["CrossValidation", "HalfScore", "Sigmas", "Spread", "cross_validate"]
 
 _FEWEST_TRACKS = 4
+_RELATIVE_DECREASE = 1e-10
+"""Steps along what telemetry decides may be a thousandth of its sigma: iterations may not stop before."""
 _T = TypeVar("_T", bound=np.generic)
 _HalfName = Literal["first", "second", "upper", "lower"]
 _NAMES: dict[Splitting, tuple[_HalfName, _HalfName]] = {
@@ -138,7 +140,13 @@ class _Whole:
         self.traverse = solution.traverse.with_observations(kept)
         self.adjustment = Adjustment(
             self.traverse,
-            replace(options, loss="none", rescale_noise=False, landmark_covariances=False),
+            replace(
+                options,
+                loss="none",
+                rescale_noise=False,
+                landmark_covariances=False,
+                relative_decrease=min(options.relative_decrease, _RELATIVE_DECREASE),
+            ),
             Start(world_T_mast=final.world_T_mast, pan_tilt_rad=final.pan_tilt_rad),
             None,
         )
@@ -206,7 +214,7 @@ class _Verdict:
     """What a half says of the whole."""
 
     failure: str
-    """Why it says nothing; "" if it does."""
+    """What it does not say, and why; "" if it says all."""
     step: FloatArray
     """(quantities,) from the whole solution to the half's; NaN where the half loses what it is of"""
     sigma: FloatArray
@@ -223,6 +231,7 @@ class _Half:
     def __init__(self, whole: _Whole, name: _HalfName, landmarks: BoolArray) -> None:
         self.name, self.landmarks = name, landmarks
         self.problem: Problem | None = None
+        self.covariance: Covariance | None = None
         self.verdict = self._solve(whole)
 
     def _solve(self, whole: _Whole) -> _Verdict:
@@ -230,12 +239,16 @@ class _Half:
             return _nothing(whole, "no track is of it")
         try:
             problem, outcome = whole.adjustment.with_only(self.landmarks)
-            part = whole.part(self.landmarks)
-            self.covariance = covariance_of(part, system_of(part, cliques=whole.cliques)[0])
         except SolveError as error:
             return _nothing(whole, str(error))
         if not outcome.converged:
             return _nothing(whole, f"not converged ({outcome.reason})")
+        part, failure, sigma = whole.part(self.landmarks), "", np.full(whole.n_quantities, np.nan)
+        try:
+            self.covariance = covariance_of(part, system_of(part, cliques=whole.cliques)[0])
+            sigma = whole.sigmas(self.covariance)
+        except SolveError as error:
+            failure = f"has no formal sigmas: {error}"
         self.problem = problem
         self.frames, stops = whole.groups(problem)
         lost_frames, lost_stops = whole.frames.lost_in(self.frames), whole.stops.lost_in(stops)
@@ -246,18 +259,18 @@ class _Half:
         )
         step = whole.step(problem.template.state(problem.values, np.zeros((0, 3))))
         return _Verdict(
-            failure="",
+            failure=failure,
             step=np.where(lost, np.nan, step),
-            sigma=np.where(lost, np.nan, whole.sigmas(self.covariance)),
+            sigma=np.where(lost, np.nan, sigma),
             lost_frames=lost_frames,
             lost_stops=lost_stops,
         )
 
 
-def _nothing(whole: _Whole, failure: str) -> _Verdict:
+def _nothing(whole: _Whole, why: str) -> _Verdict:
     unknown = np.full(whole.n_quantities, np.nan)
     return _Verdict(
-        failure=failure,
+        failure=f"says nothing: {why}",
         step=unknown,
         sigma=unknown,
         lost_frames=np.zeros(len(whole.traverse.frames), dtype=bool),
@@ -314,12 +327,13 @@ def _score(whole: _Whole, splitting: Splitting, number: int, own: _Half, other: 
             system, _ = system_of(part, cliques=whole.cliques)
             panels = system.linearise(part.template.posture(part.values))
             redundancy = 2 * n - 3 * scored + int(system.undetermined.sum())
-            expected = (
-                redundancy - panels.trace_with(own.covariance),
-                redundancy + panels.trace_with(other.covariance),
+            follows, strays = (
+                np.nan if half.covariance is None else panels.trace_with(half.covariance)
+                for half in (own, other)
             )
+            expected = np.clip([redundancy - follows, redundancy + strays], 0.0, None)
             own_px, other_px = (rms_px(r[rows] * sigma[:, None]) for r in (by_own, by_other))
-            own_expected, other_expected = np.sqrt(np.mean(sigma**2) * np.clip(expected, 0.0, None) / n)
+            own_expected, other_expected = np.sqrt(np.mean(sigma**2) * expected / n)
             px = [own_px, float(own_expected), other_px, float(other_expected)]
     return HalfScore(
         splitting=splitting,
@@ -343,7 +357,7 @@ def _warnings(traverse: Traverse, verdicts: _Verdicts) -> list[str]:
             for name, half in zip(_NAMES[splitting], pair, strict=True):
                 if half.failure:
                     which = f"{name} random half {number}" if splitting == "random" else f"{name} half"
-                    warnings.append(f"{which}: says nothing: {half.failure}")
+                    warnings.append(f"{which} {half.failure}")
         halves = [half for pair in pairs for half in pair]
         which = "a random half" if splitting == "random" else "the upper or the lower half"
         for what, ids, lost in (

@@ -11,7 +11,7 @@ import numpy as np
 
 from pancam_graph.elimination import Linkage, Posture
 from pancam_graph.factors import CircleOffset, Fixed, Key, Slot, circle_factor, mast_factor
-from pancam_graph.geometry import FloatArray, IntArray, pan_tilt_from_rotation, pose_arrays, wrap_angle
+from pancam_graph.geometry import FloatArray, IntArray, pan_tilt_from_rotation, pose_arrays, rz, wrap_angle
 from pancam_graph.graph._options import Flex, Model
 from pancam_graph.graph._template import Factors, FactorTemplate, diagonal_noise, read_variable
 from pancam_graph.landmarks import CameraViews
@@ -238,24 +238,37 @@ class SoftTemplate(FactorTemplate):
         """
         t, link = self.traverse, self.linkage
         stop = int(t.frame_stop[frame])
-        if self.model == "mast":
-            if not isinstance(slot := self.pan_tilt(frame), Key):
-                return np.zeros(0, dtype=np.int64), np.zeros((2, 0))
-            own = link.columns_of(slot.key)
-            return np.arange(own.start, own.stop), np.eye(2)
+        columns, rows = [np.zeros(0, dtype=np.int64)], [np.zeros((2, 0))]
+
+        def add(key: int, jacobian: FloatArray) -> None:
+            columns.append(link.columns_of(key).start + np.arange(jacobian.shape[1]))
+            rows.append(jacobian)
+
+        images = np.flatnonzero((t.image_frame == frame) & (self.model != "mast"))
+        if isinstance(slot := self.pan_tilt(frame), Key):
+            nominal = self._d_nominal(state.pan_tilt_rad[frame]) if len(images) else np.zeros((2, 2))
+            add(slot.key, np.eye(2) - nominal)
         mast_R = state.world_T_mast[stop].rotation().matrix()
-        pan, tilt = state.pan_tilt_rad[frame]
-        # A small turn w of the head, in the mast frame, moves pan by d_pan w and tilt by d_tilt w.
-        d_pan = np.array([-np.cos(pan) * np.tan(tilt), -np.sin(pan) * np.tan(tilt), 1.0])
-        d_tilt = np.array([np.sin(pan), -np.cos(pan), 0.0])
-        d_angles = np.vstack([d_pan, d_tilt])
-        images = np.flatnonzero(t.image_frame == frame)
-        turns = [(self.camera_key(int(i)), mast_R.T @ state.world_R_camera[i] / len(images)) for i in images]
-        if turns and isinstance(slot := self.mast(stop), Key):
-            turns.append((slot.key, -np.eye(3)))
-        columns = [link.columns_of(key).start + np.arange(3) for key, _ in turns]
-        rows = [d_angles @ turn for _, turn in turns]
-        return np.concatenate([np.zeros(0, dtype=np.int64), *columns]), np.hstack([np.zeros((2, 0)), *rows])
+        by_mast = np.zeros((2, 3))
+        for i in images:
+            camera_R = mast_R.T @ state.world_R_camera[i]
+            head_R = camera_R @ t.rig.eyes[int(t.image_eye[i])].head_T_camera.rotation().matrix().T
+            d_angles = _d_pan_tilt(head_R) / len(images)
+            add(self.camera_key(int(i)), d_angles @ camera_R)
+            by_mast -= d_angles
+        if len(images) and isinstance(slot := self.mast(stop), Key):
+            add(slot.key, by_mast)
+        return np.concatenate(columns), np.hstack(rows)
+
+    def _d_nominal(self, pan_tilt_rad: FloatArray) -> FloatArray:
+        """How `image_pointing_offset`'s nominal pan and tilt move with the angles (2, 2).
+
+        The identity, unless the tilt axis stands askew.
+        """
+        pan, tilt = pan_tilt_rad[:1], pan_tilt_rad[1:]
+        tilt_axis = rz(float(pan[0])) @ self.traverse.rig.pan_T_tilt.rotation().matrix()[:, 1]
+        turns = np.column_stack([[0.0, 0.0, 1.0], -tilt_axis])
+        return np.asarray(_d_pan_tilt(self.traverse.rig.mast_T_head(pan, tilt)[0][0]) @ turns)
 
     def image_pointing_offset(
         self, masts: tuple[gtsam.Pose3, ...], pan_tilt_rad: FloatArray, world_R_camera: FloatArray
@@ -273,6 +286,14 @@ class SoftTemplate(FactorTemplate):
         found, nominal = pan_tilt_from_rotation(head_R), pan_tilt_from_rotation(before)
         offset = np.column_stack([found[0] - nominal[0], found[1] - nominal[1]])
         return wrap_angle(offset)
+
+
+def _d_pan_tilt(mast_R_head: FloatArray) -> FloatArray:
+    """How pan and tilt of the head's x axis move with a small turn of the head in the mast frame, (2, 3)."""
+    pan, tilt = pan_tilt_from_rotation(mast_R_head)
+    return np.array(
+        [[-np.cos(pan) * np.tan(tilt), -np.sin(pan) * np.tan(tilt), 1.0], [np.sin(pan), -np.cos(pan), 0.0]]
+    )
 
 
 def _mean_by_frame(traverse: Traverse, per_image: FloatArray) -> FloatArray:
