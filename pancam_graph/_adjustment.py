@@ -249,7 +249,7 @@ class Adjustment:
         """Least squares over some landmarks (landmarks,) from where `solve` ended, which stays as it is.
 
         From there, so that of several optima it is the one beside; anew from afar where that does not
-        converge, since steps with a firm tie are short.
+        converge, since steps with a firm tie are short. Pixels of moving pupils stay carried as they are.
         """
         p = self.problem
         part = replace(p, accepted=p.accepted & landmarks[p.measurements.landmark])
