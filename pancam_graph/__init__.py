@@ -11,6 +11,8 @@ Read a traverse, find observations in its images where it has none, solve, save:
 
 import logging
 
+from pancam_graph.cross_validation import CrossValidation as CrossValidation
+from pancam_graph.cross_validation import cross_validate as cross_validate
 from pancam_graph.errors import PancamGraphError as PancamGraphError
 from pancam_graph.images import find_observations as find_observations
 from pancam_graph.io import read_input as read_input

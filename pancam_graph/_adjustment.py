@@ -30,6 +30,7 @@ __all__ = ["Adjustment"]
 
 _LOG = logging.getLogger(__name__)
 
+_SOLVERS: dict[str, type[Solver]] = {"eliminated": EliminatedSolver, "explicit": ExplicitSolver}
 _SCREENING_ROUNDS = 12
 _ABOUT = 0.002
 """The first pass of screening ends when no more than this share of the observations changes."""
@@ -61,8 +62,7 @@ class Adjustment:
         self.warnings = [*traverse.warnings, *self.start.warnings]
         self.noise = self.observations.noise
         self.reason = np.full(len(self.observations), "", dtype=object)
-        solvers: dict[str, type[Solver]] = {"eliminated": EliminatedSolver, "explicit": ExplicitSolver}
-        self.solver = solvers[options.landmarks](on_iteration)
+        self.solver = _SOLVERS[options.landmarks](on_iteration)
         self.problem = self.first = self._first_problem(_template(traverse, options)).placed()
 
     # --- preparation ---
@@ -238,6 +238,19 @@ class Adjustment:
                 break
         return replace(outcome, costs=tuple(costs))
 
+    def with_only(self, landmarks: BoolArray) -> tuple[Problem, Outcome]:
+        """Least squares over some landmarks (landmarks,) from where `solve` ended, which stays as it is.
+
+        From there, so that of several optima it is the one beside; anew from afar where that does not
+        converge, since steps with a firm tie are short. Pixels of moving pupils stay carried as they are.
+        """
+        p = self.problem
+        part = replace(p, accepted=p.accepted & landmarks[p.measurements.landmark])
+        found, outcome = self.solver.adjust(part, self.options)
+        if outcome.converged:
+            return found, outcome
+        return _SOLVERS[self.options.landmarks](self.solver.on_iteration).adjust(part, self.options)
+
     def _note_behind(self, behind: BoolArray) -> None:
         self.reason[self.problem.measurements.row[behind]] = "behind"
 
@@ -320,11 +333,7 @@ class Adjustment:
 
     def _uncertainty(self) -> Uncertainty:
         """Covariances; NaN and a warning where a direction is free. Warns of landmarks without a place."""
-        t, wanted = self.traverse, self.options.landmark_covariances
-        problem = self.problem
-        if self.options.firm_tie == "hard" and isinstance(problem.template, SoftTemplate):
-            # The inverse of a system with a tie of 1e-8 would have lost half its digits.
-            problem = problem.on(HardTemplate(t))
+        t, wanted, problem = self.traverse, self.options.landmark_covariances, self.regular
         try:
             found = uncertainty(problem, self.final, self._reduced(problem), landmarks=wanted)
         except SolveError as error:
@@ -345,6 +354,15 @@ class Adjustment:
                 "they tell where cameras point, and a weak prior holds the point"
             )
         return found
+
+    @property
+    def regular(self) -> Problem:
+        """The problem as covariances are taken from it."""
+        problem = self.problem
+        if self.options.firm_tie == "hard" and isinstance(problem.template, SoftTemplate):
+            # The inverse of a system with a tie of 1e-8 would have lost half its digits.
+            return problem.on(HardTemplate(self.traverse))
+        return problem
 
     def _reduced(self, problem: Problem) -> ReducedSystem:
         """The problem with landmarks eliminated; that of the last fit where this was one of it."""

@@ -7,13 +7,13 @@ import numpy as np
 
 from pancam_graph._problem import Problem
 from pancam_graph._reduced import ReducedSystem, held_columns
-from pancam_graph.elimination import FreeDirectionError
+from pancam_graph.elimination import Covariance, FreeDirectionError
 from pancam_graph.errors import SolveError
 from pancam_graph.geometry import BoolArray, FloatArray
 from pancam_graph.graph import FactorTemplate
 from pancam_graph.solution import State
 
-__all__ = ["Uncertainty", "uncertainty"]
+__all__ = ["Uncertainty", "covariance_of", "uncertainty"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -36,11 +36,7 @@ def uncertainty(problem: Problem, state: State, reduced: ReducedSystem, *, landm
     Raises SolveError where a direction is held by nothing.
     """
     template, m, system, rows = problem.template, problem.measurements, reduced.system, reduced.rows
-    try:
-        covariance = reduced.root.covariance()
-    except FreeDirectionError as error:
-        raise SolveError(f"nothing holds {_name(template, error)}") from error
-    covariance.release(held_columns(template))
+    covariance = covariance_of(template, reduced)
     undetermined = np.zeros(m.n_landmarks, dtype=bool)
     undetermined[rows] = system.undetermined
     spread = None
@@ -53,6 +49,19 @@ def uncertainty(problem: Problem, state: State, reduced: ReducedSystem, *, landm
         landmark_covariance_m2=spread,
         undetermined=undetermined,
     )
+
+
+def covariance_of(template: FactorTemplate, reduced: ReducedSystem) -> Covariance:
+    """Covariance of a template's variables where the system was linearised; 0 where held.
+
+    Raises SolveError where a direction is held by nothing.
+    """
+    try:
+        covariance = reduced.root.covariance()
+    except FreeDirectionError as error:
+        raise SolveError(f"nothing holds {_name(template, error)}") from error
+    covariance.release(held_columns(template))
+    return covariance
 
 
 def _name(template: FactorTemplate, free: FreeDirectionError) -> str:

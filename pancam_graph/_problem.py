@@ -1,7 +1,7 @@
 """What a solver of either kind is given and returns."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -127,10 +127,13 @@ class Solver(ABC):
         """The problem at the least-squares optimum near by."""
 
 
-def system_of(problem: Problem, loss: Loss = SQUARED) -> tuple[LandmarkSystem, IntArray]:
+def system_of(
+    problem: Problem, loss: Loss = SQUARED, cliques: Iterable[Iterable[int]] = ()
+) -> tuple[LandmarkSystem, IntArray]:
     """The landmark system of what takes part, and its rows among the landmarks.
 
-    Raises SolveError where nothing is left.
+    `cliques` are more groups of variables between which its square root is to have room. Raises SolveError
+    where nothing is left.
     """
     m = problem.measurements
     take = problem.kept
@@ -141,4 +144,5 @@ def system_of(problem: Problem, loss: Loss = SQUARED) -> tuple[LandmarkSystem, I
         m = m.part(np.flatnonzero(take))
     landmarks = Landmarks(vector=problem.landmarks.vector[rows], origin_m=problem.landmarks.origin_m[rows])
     template = problem.template
-    return LandmarkSystem(template.linkage, m, landmarks, loss, cliques=template.cliques), rows
+    cliques = [*template.cliques, *cliques]
+    return LandmarkSystem(template.linkage, m, landmarks, loss, cliques=cliques), rows

@@ -7,10 +7,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import NoReturn
 
+import numpy as np
 from rich.console import Console
 from rich.logging import RichHandler
 from rich.table import Table
 
+from pancam_graph._honest import CrossValidation
 from pancam_graph._optimise import Iteration
 from pancam_graph.errors import PancamGraphError
 from pancam_graph.solution import Solution
@@ -74,8 +76,8 @@ class Progress:
         if self._status is not None:
             self._status.update(text)
 
-    def images(self, what: str, done: int, total: int) -> None:
-        """Progress of the image front end."""
+    def counted(self, what: str, done: int, total: int) -> None:
+        """Progress of what is done one by one."""
         self.say(f"{what} {done} of {total}")
 
     def iteration(self, iteration: Iteration) -> None:
@@ -92,6 +94,8 @@ def print_summary(solution: Solution, where: str) -> None:
             f"{'converged' if solution.converged else 'NOT converged'}: RMS {solution.rms_initial_px:.3f} -> "
             f"{solution.rms_final_px:.3f} px over {used} of {total} observations; {where}\n"
         )
+        if solution.cross_validation is not None:
+            sys.stdout.write(f"{_of_cross_validation(solution.cross_validation)}\n")
         return
     table = Table(title=solution.traverse.name or None, title_justify="left")
     for column in ("", "before", "after"):
@@ -104,6 +108,24 @@ def print_summary(solution: Solution, where: str) -> None:
     console.print(table)
     state = "converged" if solution.converged else "[bold red]not converged[/]"
     console.print(f"{state}: {solution.stop_reason}; {solution.seconds.solve:.1f} s")
-    for warning in solution.warnings:
+    warnings = solution.warnings
+    if solution.cross_validation is not None:
+        console.print(_of_cross_validation(solution.cross_validation), highlight=False)
+        warnings = (*warnings, *solution.cross_validation.warnings)
+    for warning in warnings:
         console.print(f"[yellow]warning[/] {warning}", highlight=False)
     console.print(f"results in [bold]{where}[/]", highlight=False)
+
+
+def _of_cross_validation(found: CrossValidation) -> str:
+    """One line: by how much honest sigmas exceed formal ones, and how halves fit each other."""
+    relative = len(found.pairs) > 0
+    ratio = found.relative_pointing.ratio if relative else found.pointing.ratio
+    known = ratio[~np.isnan(ratio)]
+    what = "relative pointing" if relative else "pointing"
+    times = f"{np.median(known):.1f} times the formal ones (median)" if len(known) else "unknown"
+    scored, expected = found.score_px("upper_lower")
+    return (
+        f"cross-validation: honest sigmas of {what} {times}; image halves under each other's cameras "
+        f"{scored:.3f} px, by noise {expected:.3f}; {len(found.scores)} half solves, {found.seconds:.1f} s"
+    )

@@ -6,6 +6,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
+from pancam_graph._honest import CrossValidation
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.traverse import Traverse
 
@@ -93,6 +94,8 @@ class Solution:
     """(observations, 2, 2) covariance each was weighted with in the end, where the input has covariances."""
     landmark_covariance_m2: FloatArray | None = None
     """(landmarks, 3, 3) of `final.landmarks_m`, all else marginalised; formal; where it was asked for."""
+    cross_validation: CrossValidation | None = None
+    """What solutions from halves of the tracks say of the sigmas; where it was asked for."""
     warnings: tuple[str, ...] = ()
     seconds: Seconds = field(default_factory=Seconds)
 
@@ -114,6 +117,10 @@ class Solution:
     def with_seconds(self, **seconds: float) -> "Solution":
         """The same solution with some wall-clock times filled in."""
         return replace(self, seconds=replace(self.seconds, **seconds))
+
+    def with_cross_validation(self, found: CrossValidation) -> "Solution":
+        """The same solution with a cross-validation of it."""
+        return replace(self, cross_validation=found)
 
     def save(self, out: Path | str, *, report: bool = True) -> "Solution":
         """Write solution.json, points.ply, residuals.csv and report.html into the folder `out`.

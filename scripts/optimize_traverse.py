@@ -10,7 +10,7 @@ Exit status: 0 solved, 1 not converged (results are written), 2 bad input (nothi
 import time
 from pathlib import Path
 
-from pancam_graph import SolveOptions, find_observations, read_input, solve
+from pancam_graph import SolveOptions, cross_validate, find_observations, read_input, solve
 from pancam_graph.io import check_out
 from pancam_graph.kernel import must_compile
 from pancam_graph.program import Parser, Progress, print_summary, run, show_log
@@ -50,6 +50,11 @@ def main() -> int:
         help="when the final iterations end; may be given for each of max_iterations (default 100), "
         "relative_decrease (of the cost, 1e-7), relative_step, max_gradient, residual_sigmas; 0: not used",
     )
+    parser.add_argument(
+        "--cross-validate",
+        action="store_true",
+        help="solve halves of the terrain points too, and show honest sigmas beside the formal ones",
+    )
     parser.add_argument("--no-report", action="store_true", help="do not write report.html")
     arguments = parser.parse_args()
     show_log(verbose=arguments.verbose)
@@ -62,11 +67,14 @@ def main() -> int:
         check_out(arguments.out)
         traverse = read_input(arguments.traverse)
         if traverse.observations is None:
-            traverse = find_observations(traverse, progress=progress.images)
+            traverse = find_observations(traverse, progress=progress.counted)
         read_s = time.perf_counter() - begin
         if must_compile():
             progress.say(COMPILING)
         solution = solve(traverse, options, on_iteration=progress.iteration).with_seconds(read=read_s)
+        if arguments.cross_validate:
+            found = cross_validate(traverse, options, solution=solution, progress=progress.counted)
+            solution = solution.with_cross_validation(found)
         progress.say("writing the results")
         solution = solution.save(arguments.out, report=not arguments.no_report)
     print_summary(solution, str(arguments.out))

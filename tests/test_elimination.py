@@ -178,6 +178,14 @@ def test_covariance_blocks_are_those_of_the_inverse(name: str, scaled: bool) -> 
         assert found == pytest.approx(expected, abs=1e-10)
 
 
+@pytest.mark.parametrize("name", GRAPHS)
+def test_trace_with_a_covariance_of_another_system(name: str) -> None:
+    system, other = Random(name), Random(name, seed=1)
+    covariance = other.panels.root().covariance()
+    expected = np.trace(system.S @ np.linalg.inv(other.S))
+    assert system.panels.trace_with(covariance) == pytest.approx(expected, rel=1e-10)
+
+
 def test_no_covariance_of_what_no_clique_joins() -> None:
     with pytest.raises(KeyError):
         Random("apart").panels.root().covariance().block(0, 3)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -72,6 +73,34 @@ def test_models_and_no_report(run: Run, traverse_folder: Path, tmp_path: Path, m
     assert done.returncode == 0, done.stderr
     assert not (tmp_path / "out" / "report.html").exists()
     assert read_solution_json(tmp_path / "out" / "solution.json").model == model
+
+
+def test_cross_validation_is_written_and_said(run: Run, traverse_folder: Path, tmp_path: Path) -> None:
+    done = run("optimize_traverse.py", "traverse", "--out", "out", "--cross-validate")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    first, second = done.stdout.splitlines()
+    assert first.startswith("converged")
+    assert re.fullmatch(
+        r"cross-validation: honest sigmas of relative pointing [\d.]+ times the formal ones \(median\); "
+        r"image halves under each other's cameras [\d.]+ px, by noise [\d.]+; 10 half solves, [\d.]+ s",
+        second,
+    )
+    entry = read_solution_json(tmp_path / "out" / "solution.json").cross_validation
+    assert entry is not None
+    assert len(entry.scores) == 10
+    assert "<h2>Cross-validation</h2>" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_too_few_tracks_to_cross_validate_are_bad_input(run: Run, tmp_path: Path) -> None:
+    t = simulate(mer_navcam(), SMALL, seed=0).traverse
+    assert t.observations is not None
+    few = np.isin(t.observations.track, np.unique(t.observations.track)[:3])
+    write_traverse(t.with_observations(t.observations.select(few)), tmp_path / "traverse")
+    done = run("optimize_traverse.py", "traverse", "--out", "out", "--cross-validate", "--loss", "none")
+    assert done.returncode == 2
+    assert done.stderr == "cross-validation: expected 4 used tracks or more to halve, found 3\n"
+    assert not (tmp_path / "out").exists()
 
 
 BAD: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {

@@ -225,3 +225,53 @@ def test_sigmas_are_handed_to_their_own_frames_and_stops(name: str) -> None:
             first = link.columns_of(HardTemplate.angles_key(i)).start + 2 * place
             assert angles[f] == pytest.approx(np.sqrt(100.0 * (i + 1) + first + np.arange(2)))
             place += 1
+
+
+@pytest.mark.parametrize("kind", ["hard", "mast", "circle", "free"])
+@pytest.mark.parametrize("name", TRAVERSES)
+def test_angles_move_with_their_variables_as_their_rows_say(name: str, kind: str) -> None:
+    t = TRAVERSES[name]()
+    template, state = templates(t)[kind], state_of(t)
+    link, values, h = template.linkage, template.values(state), 1e-6
+
+    def angles(key: int, component: int, step: float) -> FloatArray:
+        moved = gtsam.VectorValues()
+        for k, dim in zip(link.key, link.dim, strict=True):
+            moved.insert(k, step * np.eye(int(dim))[component] if k == key else np.zeros(int(dim)))
+        return template.state(values.retract(moved), np.zeros((0, 3))).pan_tilt_rad
+
+    for frame, stop in enumerate(t.frame_stop.tolist()):
+        columns, rows = template.angle_rows(frame, state)
+        found = np.zeros((2, int(link.group_dim[stop]) if stop < link.n_groups else 0))
+        found[:, columns] = rows
+        for key, group, dim in zip(link.key, link.group, link.dim, strict=True):
+            if group != stop:
+                continue
+            begin = link.columns_of(key).start
+            for c in range(int(dim)):
+                derivative = (angles(key, c, h)[frame] - angles(key, c, -h)[frame]) / (2 * h)
+                assert found[:, begin + c] == pytest.approx(derivative, abs=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["hard", "mast", "circle", "free"])
+def test_sigma_of_a_difference_is_that_of_draws(kind: str) -> None:
+    t = TRAVERSES["all free"]()
+    template, state = templates(t)[kind], state_of(t)
+    link, rng = template.linkage, np.random.default_rng(0)
+    roots = [rng.normal(size=(int(d), int(d))) for d in link.group_dim]
+
+    class Drawn(Covariance):
+        def block(self, g: int, h: int) -> FloatArray:
+            assert g == h
+            return np.asarray(roots[g] @ roots[g].T)
+
+    pairs = np.array([np.flatnonzero(t.frame_stop == s) for s in range(len(t.stops))])
+    covariance = Drawn({})
+    relative = template.relative_angle_sigma_rad(covariance, state, pairs)
+    single = template.angle_sigma_rad(covariance, state)
+    for (i, j), stop, sigma in zip(pairs.tolist(), range(len(t.stops)), relative, strict=True):
+        draws = roots[stop] @ rng.normal(size=(len(roots[stop]), 20000))
+        (columns_i, rows_i), (columns_j, rows_j) = (template.angle_rows(f, state) for f in (i, j))
+        angles = rows_i @ draws[columns_i], rows_j @ draws[columns_j]
+        assert sigma == pytest.approx((angles[1] - angles[0]).std(axis=1), rel=0.02)
+        assert single[[i, j]] == pytest.approx(np.std(angles, axis=2), rel=0.02)

@@ -148,6 +148,18 @@ class Panels:
                     panel[:, place[g] + columns] = 0.0
             self.panel[g][columns, columns] = 1.0
 
+    def trace_with(self, covariance: "Covariance") -> float:
+        """Trace of S times a covariance that has its blocks."""
+        total = 0.0
+        for g, panel in enumerate(self.panel):
+            n, begin = int(self.structure.dim[g]), self.structure.begin[g]
+            own = np.triu(panel[:, :n])
+            total += 2 * float(np.sum(np.triu(own, 1) * covariance.block(g, g)))
+            total += float(np.diag(own) @ np.diag(covariance.block(g, g)))
+            for h, first, last in zip(self.structure.after[g][1:], begin[1:-1], begin[2:], strict=True):
+                total += 2 * float(np.sum(panel[:, first:last] * covariance.block(g, h)))
+        return total
+
     def root(self) -> "Root":
         """Square root R'R = S with R'e = s, rows by group; destroys the panels.
 

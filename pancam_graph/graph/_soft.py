@@ -9,9 +9,9 @@ from functools import cached_property
 import gtsam
 import numpy as np
 
-from pancam_graph.elimination import Covariance, Linkage, Posture
+from pancam_graph.elimination import Linkage, Posture
 from pancam_graph.factors import CircleOffset, Fixed, Key, Slot, circle_factor, mast_factor
-from pancam_graph.geometry import FloatArray, IntArray, pan_tilt_from_rotation, pose_arrays, wrap_angle
+from pancam_graph.geometry import FloatArray, IntArray, pan_tilt_from_rotation, pose_arrays, rz, wrap_angle
 from pancam_graph.graph._options import Flex, Model
 from pancam_graph.graph._template import Factors, FactorTemplate, diagonal_noise, read_variable
 from pancam_graph.landmarks import CameraViews
@@ -232,37 +232,44 @@ class SoftTemplate(FactorTemplate):
                 held[slot.key] = np.flatnonzero(np.array([frame.sigma_pan_rad, frame.sigma_tilt_rad]) == 0)
         return held
 
-    def angle_sigma_rad(self, covariance: Covariance, state: State) -> FloatArray:
-        """Standard deviation of pan and tilt (frames, 2): of the variables, or of what camera poses say.
+    def angle_rows(self, frame: int, state: State) -> tuple[IntArray, FloatArray]:
+        """How a frame's pan and tilt move: they are variables, or what camera poses say.
 
-        As in `state`: where the model is not `mast`, it is that of the mean over a frame's eyes.
+        As in `state`: where the model is not `mast`, it is the mean over a frame's eyes.
         """
         t, link = self.traverse, self.linkage
-        sigma = np.zeros((len(t.frames), 2))
-        for frame in range(len(t.frames)):
-            stop = int(t.frame_stop[frame])
-            if self.model == "mast":
-                if isinstance(slot := self.pan_tilt(frame), Key):
-                    rows = link.columns_of(slot.key)
-                    sigma[frame] = np.sqrt(np.diag(covariance.block(stop, stop)[rows, rows]))
-                continue
-            images = np.flatnonzero(t.image_frame == frame)
-            if len(images) == 0:
-                continue
-            mast_R = state.world_T_mast[stop].rotation().matrix()
-            pan, tilt = state.pan_tilt_rad[frame]
-            # A small turn w of the head, in the mast frame, moves pan by d_pan w and tilt by d_tilt w.
-            d_pan = np.array([-np.cos(pan) * np.tan(tilt), -np.sin(pan) * np.tan(tilt), 1.0])
-            d_tilt = np.array([np.sin(pan), -np.cos(pan), 0.0])
-            d_angles = np.vstack([d_pan, d_tilt])
-            jacobian = np.zeros((2, int(link.group_dim[stop])))
-            for i in images:
-                turn = link.columns_of(self.camera_key(int(i))).start + np.arange(3)
-                jacobian[:, turn] = d_angles @ mast_R.T @ state.world_R_camera[i] / len(images)
-            if isinstance(slot := self.mast(stop), Key):
-                jacobian[:, link.columns_of(slot.key).start + np.arange(3)] = -d_angles
-            sigma[frame] = np.sqrt(np.diag(jacobian @ covariance.block(stop, stop) @ jacobian.T))
-        return sigma
+        stop = int(t.frame_stop[frame])
+        columns, rows = [np.zeros(0, dtype=np.int64)], [np.zeros((2, 0))]
+
+        def add(key: int, jacobian: FloatArray) -> None:
+            columns.append(link.columns_of(key).start + np.arange(jacobian.shape[1]))
+            rows.append(jacobian)
+
+        images = np.flatnonzero((t.image_frame == frame) & (self.model != "mast"))
+        if isinstance(slot := self.pan_tilt(frame), Key):
+            nominal = self._d_nominal(state.pan_tilt_rad[frame]) if len(images) else np.zeros((2, 2))
+            add(slot.key, np.eye(2) - nominal)
+        mast_R = state.world_T_mast[stop].rotation().matrix()
+        by_mast = np.zeros((2, 3))
+        for i in images:
+            camera_R = mast_R.T @ state.world_R_camera[i]
+            head_R = camera_R @ t.rig.eyes[int(t.image_eye[i])].head_T_camera.rotation().matrix().T
+            d_angles = _d_pan_tilt(head_R) / len(images)
+            add(self.camera_key(int(i)), d_angles @ camera_R)
+            by_mast -= d_angles
+        if len(images) and isinstance(slot := self.mast(stop), Key):
+            add(slot.key, by_mast)
+        return np.concatenate(columns), np.hstack(rows)
+
+    def _d_nominal(self, pan_tilt_rad: FloatArray) -> FloatArray:
+        """How `image_pointing_offset`'s nominal pan and tilt move with the angles (2, 2).
+
+        The identity, unless the tilt axis stands askew.
+        """
+        pan, tilt = pan_tilt_rad[:1], pan_tilt_rad[1:]
+        tilt_axis = rz(float(pan[0])) @ self.traverse.rig.pan_T_tilt.rotation().matrix()[:, 1]
+        turns = np.column_stack([[0.0, 0.0, 1.0], -tilt_axis])
+        return np.asarray(_d_pan_tilt(self.traverse.rig.mast_T_head(pan, tilt)[0][0]) @ turns)
 
     def image_pointing_offset(
         self, masts: tuple[gtsam.Pose3, ...], pan_tilt_rad: FloatArray, world_R_camera: FloatArray
@@ -280,6 +287,14 @@ class SoftTemplate(FactorTemplate):
         found, nominal = pan_tilt_from_rotation(head_R), pan_tilt_from_rotation(before)
         offset = np.column_stack([found[0] - nominal[0], found[1] - nominal[1]])
         return wrap_angle(offset)
+
+
+def _d_pan_tilt(mast_R_head: FloatArray) -> FloatArray:
+    """How pan and tilt of the head's x axis move with a small turn of the head in the mast frame, (2, 3)."""
+    pan, tilt = pan_tilt_from_rotation(mast_R_head)
+    return np.array(
+        [[-np.cos(pan) * np.tan(tilt), -np.sin(pan) * np.tan(tilt), 1.0], [np.sin(pan), -np.cos(pan), 0.0]]
+    )
 
 
 def _mean_by_frame(traverse: Traverse, per_image: FloatArray) -> FloatArray:

@@ -1,6 +1,7 @@
 """A rig as a factor template: the recipe that turns stops, frames and images into variables and factors."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Any
 
 import gtsam
@@ -65,8 +66,27 @@ class FactorTemplate(ABC):
         """By key, tangent components that telemetry holds while others of the same variable are free."""
 
     @abstractmethod
+    def angle_rows(self, frame: int, state: State) -> tuple[IntArray, FloatArray]:
+        """How a frame's pan and tilt move with its stop's variables: columns (k,) of the group, rows (2, k).
+
+        No columns where nothing moves them.
+        """
+
     def angle_sigma_rad(self, covariance: Covariance, state: State) -> FloatArray:
         """Standard deviation of pan and tilt (frames, 2); 0 where held."""
+        rows = [self.angle_rows(frame, state) for frame in range(len(self.traverse.frames))]
+        return _sigmas(covariance, self.traverse.frame_stop, rows)
+
+    def relative_angle_sigma_rad(self, covariance: Covariance, state: State, pairs: IntArray) -> FloatArray:
+        """Standard deviation (pairs, 2) of the difference in pan and tilt of pairs of frames of one stop.
+
+        `pairs` (pairs, 2) are rows of frames.
+        """
+        rows = []
+        for i, j in pairs:
+            (columns_i, rows_i), (columns_j, rows_j) = (self.angle_rows(int(f), state) for f in (i, j))
+            rows.append((np.concatenate([columns_i, columns_j]), np.hstack([-rows_i, rows_j])))
+        return _sigmas(covariance, self.traverse.frame_stop[pairs[:, 0]], rows)
 
     def mast(self, stop: int) -> Slot:
         """Slot of a stop's mast pose: fixed where both its sigmas are 0."""
@@ -106,6 +126,18 @@ class FactorTemplate(ABC):
         return CameraViews(
             world_R_camera=world_R_camera, world_t_camera=world_t_camera, calibration=self._calibration
         )
+
+
+def _sigmas(
+    covariance: Covariance, stop: IntArray, rows: Sequence[tuple[IntArray, FloatArray]]
+) -> FloatArray:
+    """Standard deviations (n, 2) of what rows (2, k) make of columns (k,) of the groups of stops (n,)."""
+    sigma = np.zeros((len(rows), 2))
+    for i, (columns, jacobian) in enumerate(rows):
+        if len(columns):
+            block = covariance.block(int(stop[i]), int(stop[i]))[np.ix_(columns, columns)]
+            sigma[i] = np.sqrt(np.einsum("ij,jk,ik->i", jacobian, block, jacobian).clip(0.0))
+    return sigma
 
 
 def _stop_sigmas(stop: Stop) -> FloatArray:

@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from pancam_graph.geometry import FloatArray, IntArray
+from pancam_graph.io._cross_validation import CrossValidationEntry
 from pancam_graph.io._json import read_json, validated
 from pancam_graph.io._schema import SOLUTION_FORMAT, VERSION, CameraEntry, Entry, PoseEntry, camera_entry
 from pancam_graph.solution import Solution
@@ -92,6 +93,8 @@ class SolutionFile(Entry):
     cameras: list[CameraEntry]
     """As the cameras of a rig in `traverse.json`."""
     warnings: list[str]
+    cross_validation: CrossValidationEntry | None = None
+    """Where it was asked for; else the key is missing."""
 
 
 def read_solution_json(path: Path | str) -> SolutionFile:
@@ -102,7 +105,8 @@ def read_solution_json(path: Path | str) -> SolutionFile:
 
 def solution_json(solution: Solution) -> bytes:
     """A solution as the content of `solution.json`; null in place of what is not finite."""
-    data = solution_file(solution).model_dump()
+    without = {"cross_validation"} if solution.cross_validation is None else None
+    data = solution_file(solution).model_dump(exclude=without)
     return f"{json.dumps(data, indent=1, allow_nan=False, ensure_ascii=False)}\n".encode()
 
 
@@ -127,7 +131,7 @@ def solution_file(solution: Solution) -> SolutionFile:
             traverse.frames, final.pan_tilt_rad, solution.angle_sigma_rad, strict=True
         )
     ]
-    seconds = solution.seconds
+    seconds, validation = solution.seconds, solution.cross_validation
     n_used = int(np.count_nonzero(solution.used))
     return SolutionFile(
         model=solution.model,
@@ -153,6 +157,7 @@ def solution_file(solution: Solution) -> SolutionFile:
         cameras=[camera_entry(e) for e in traverse.rig.eyes],
         # What the reader noticed comes first, once, whether or not the solver passed it on.
         warnings=list(dict.fromkeys([*traverse.warnings, *solution.warnings])),
+        cross_validation=None if validation is None else CrossValidationEntry.of(validation, traverse),
     )
 
 

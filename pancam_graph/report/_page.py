@@ -8,6 +8,7 @@ from html import escape
 
 from plotly.offline import get_plotlyjs
 
+from pancam_graph.report._cross_validation import cross_validation_section
 from pancam_graph.report._figures import make_corrections, make_histogram
 from pancam_graph.report._images import image_residuals, vector_panels
 from pancam_graph.report._look import AFTER, BEFORE, REJECTED, Figure, axis, layout
@@ -64,6 +65,7 @@ def make_page(solution: Solution) -> str:
         histogram=_section("Residuals before and after", histogram),
         vectors=_section("Residuals in single images", vectors, VECTOR_CONTROLS) if panels else NO_VECTORS,
         corrections=_section("Corrections of pan and tilt", corrections),
+        cross_validation=cross_validation_section(solution.cross_validation, solution.traverse),
         images=image_table(solution, table),
         stops=stop_table(solution),
         plotly=_packed_plotly(),

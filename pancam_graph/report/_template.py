@@ -42,6 +42,7 @@ script-src 'unsafe-inline' 'unsafe-eval'; img-src data: blob:; connect-src data:
 </div>
 {vectors}
 {corrections}
+{cross_validation}
 <section>
 <h2>Images</h2>
 {images}
@@ -58,7 +59,7 @@ about the mast's x (forward), y (left) and z (up) axes.</p>
 <ul>
 <li>Sigmas and ellipses are <em>formal</em>: they follow from the noise assumed for pixels, pointing and
 positions, with the terrain points free, and know nothing of errors in the camera calibration or of wrong
-matches. Real errors can be several times larger.</li>
+matches. Real errors can be several times larger; a cross-validation shows how much larger.</li>
 <li>“Before” is the state from which the adjustment started, with points triangulated there;
 “after” is its result, over the same observations.</li>
 <li>A residual is projected minus measured, in pixels of the raw image; u runs right, v down, and (0, 0) is
