@@ -28,7 +28,7 @@ from pancam_graph.traverse import Traverse
 __all__ = ["CrossValidation", "HalfScore", "Sigmas", "Spread", "cross_validate"]
 
 _FEWEST_TRACKS = 4
-_RELATIVE_DECREASE = 1e-10
+_RELATIVE_DECREASE = 1e-13
 """Steps along what telemetry decides may be a thousandth of its sigma: iterations may not stop before."""
 _T = TypeVar("_T", bound=np.generic)
 _HalfName = Literal["first", "second", "upper", "lower"]

@@ -184,7 +184,7 @@ def test_round_covariances_are_sigmas(loss: str) -> None:
     by_sigma = replace(observed(t), sigma_px=sigma)
     by_covariance = by_sigma.with_covariance(sigma[:, None, None] ** 2 * np.eye(2))
     a, b = (
-        solve(t.with_observations(obs), SolveOptions(loss=loss))  # type: ignore[arg-type]  # parametrised
+        solve(t.with_observations(obs), SolveOptions(loss=loss, relative_decrease=1e-12))  # type: ignore[arg-type]  # parametrised
         for obs in (by_sigma, by_covariance)
     )
     assert a.used.tolist() == b.used.tolist()
