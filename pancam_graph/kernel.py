@@ -472,7 +472,7 @@ def _eliminating(rows: int) -> Callable[..., None]:
                         continue
                     squared = r0 * r0 + r1 * r1
                     cost += loss_cost(kind, width, squared)
-                    root = np.sqrt(loss_weight(kind, width, squared))
+                    root = 1.0 if kind == NONE else np.sqrt(loss_weight(kind, width, squared))
                     r0, r1 = root * r0, root * r1
                     d00, d01, d02, d10, d11, d12 = by_ray(
                         to_pixel, image, u, v, root * per_depth, whitening, i

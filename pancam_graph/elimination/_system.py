@@ -39,10 +39,12 @@ _LOST = 0.5 * 5.0**2
 """One with this cost even then, as if all were 5 sigma off, is placed anew."""
 _TOUCHED = 1e-2
 """If the step changed its cost by more than this share."""
-_REFINED = 1e-2
+_REFINED = 0.1
 """A stray is refined until that promises no more than this share of its cost."""
 _STRAY_GRAIN = 256
 """Strays that one thread takes at once."""
+_SMALLEST_SUM = 200_000
+"""Entries of systems whose sum is worth waking another thread."""
 _SMALLEST_CHUNK = 4000
 """Observations of a chunk that is worth its overhead."""
 
@@ -312,7 +314,9 @@ class LandmarkSystem:
                             kernel.gather(S, s, *rows, block.row, block.panel_column[i], panel)
 
             in_parallel(eliminated, len(wave), grain=1)
-            in_parallel(summed, self.linkage.n_groups, grain=1 + self.linkage.n_groups // 8)
+            n_groups, n_entries = self.linkage.n_groups, sum(len(S) for S, _ in systems)
+            grain = n_groups if n_entries < _SMALLEST_SUM else 1 + n_groups // 8
+            in_parallel(summed, n_groups, grain=grain)
         return self._panels
 
     @cached_property
@@ -380,7 +384,8 @@ class LandmarkSystem:
         counts, seen = np.diff(self._seen.begin), self._seen
         before, after = self.reduced.cost, self._moved_cost
         # What a step hardly touches is as well placed as it was: noise alone is no reason to look again.
-        strays = np.flatnonzero((after > _STRAY * counts) & (np.abs(after - before) > _TOUCHED * before))
+        touched = np.abs(after - before) > _TOUCHED * before
+        strays = np.flatnonzero((after > _LOST * counts) | touched & (after > _STRAY * counts))
         self.regained = 0.0
         if len(strays) == 0:
             return
