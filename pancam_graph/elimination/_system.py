@@ -315,7 +315,7 @@ class LandmarkSystem:
 
             in_parallel(eliminated, len(wave), grain=1)
             n_groups, n_entries = self.linkage.n_groups, sum(len(S) for S, _ in systems)
-            grain = n_groups if n_entries < _SMALLEST_SUM else 1 + n_groups // 8
+            grain = max(n_groups, 1) if n_entries < _SMALLEST_SUM else 1 + n_groups // 8
             in_parallel(summed, n_groups, grain=grain)
         return self._panels
 
