@@ -8,7 +8,7 @@ rejected observations that fit again come back.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2, norm
+from scipy.special import chdtri, erfc
 
 from pancam_graph import kernel
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray
@@ -66,8 +66,8 @@ def screen(
     residual, b, cofactor = np.empty((n, 2)), np.empty((n, 2, 3)), np.empty((n, 2, 2))
     test, freedom, in_front = np.empty(n), np.empty(n, dtype=np.int64), np.empty(n, dtype=bool)
     lost, changed = np.empty(n_landmarks, dtype=bool), np.empty(n_landmarks, dtype=bool)
-    tail = 2 * norm.sf(cutoff_sigma)
-    limit = np.array([np.inf, chi2.isf(tail, 1), chi2.isf(tail, 2)])
+    tail = erfc(cutoff_sigma / np.sqrt(2.0))  # of a Gaussian beyond the cutoff, on either side
+    limit = np.array([np.inf, chdtri(1, tail), chdtri(2, tail)])
     scale = min_scale
     which = np.arange(n_landmarks)
     fresh = np.flatnonzero(np.minimum.reduceat(weight, starts) > 0)
@@ -128,6 +128,6 @@ def _revived(accepted: BoolArray, measurements: Measurements) -> BoolArray:
 
 def _robust_scale(test: FloatArray, dof: IntArray) -> float:
     """Noise scale from the median of the tests, each over the median that noise of scale 1 would give."""
-    expected = np.array([np.nan, chi2.median(1), chi2.median(2)])
+    expected = np.array([np.nan, chdtri(1, 0.5), chdtri(2, 0.5)])
     ratio = test[dof > 0] / expected[dof[dof > 0]]
     return float(np.sqrt(np.median(ratio))) if len(ratio) else 0.0
