@@ -4,8 +4,10 @@ One module a factor: `mast` (pan-tilt chain, 6 rows), `circle` (thesis eq. 4.8, 
 has itself (priors, projections) is taken from there.
 """
 
+from pancam_graph.factors._slots import Corrected as Corrected
 from pancam_graph.factors._slots import Fixed as Fixed
 from pancam_graph.factors._slots import Key as Key
+from pancam_graph.factors._slots import PoseSlot as PoseSlot
 from pancam_graph.factors._slots import Slot as Slot
 from pancam_graph.factors.circle import CircleOffset as CircleOffset
 from pancam_graph.factors.circle import circle_factor as circle_factor

@@ -9,7 +9,7 @@ camera as seen from where the chain puts it. Its sigma stands for the flex of th
 import gtsam
 import numpy as np
 
-from pancam_graph.factors._slots import Slot, custom_factor
+from pancam_graph.factors._slots import PoseSlot, Slot, custom_factor
 from pancam_graph.geometry import FloatArray, ry, rz, skew, so3_right_jacobian_inverse
 
 __all__ = ["mast_factor", "mast_residual"]
@@ -28,8 +28,8 @@ def _adjoint_of_inverse(rotation: FloatArray, translation: FloatArray) -> FloatA
 
 def mast_residual(
     world_T_camera: Pose, world_T_mast: Pose, pan_tilt_rad: FloatArray, head_T_camera: Pose, pan_T_tilt: Pose
-) -> tuple[FloatArray, tuple[FloatArray, FloatArray, FloatArray, FloatArray]]:
-    """Residual (6,) and its Jacobians by camera (6, 6), mast (6, 6), pan-tilt (6, 2), mount (6, 6).
+) -> tuple[FloatArray, tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]]:
+    """Residual (6,) and its Jacobians by camera, mast (6, 6 each), pan-tilt (6, 2), mount, tilt axis (6, 6).
 
     Poses are pairs of rotation and translation; Jacobians are by body-frame tangents, rotation first.
     Defined where camera and chain differ by less than half a turn.
@@ -62,7 +62,9 @@ def mast_residual(
     d_mast = d_chain @ _adjoint_of_inverse(*mast_to_camera)
     d_pan = d_chain @ _adjoint_of_inverse(*pan_to_camera)[:, 2]
     d_tilt = -d_chain @ _adjoint_of_inverse(mount_R, mount_t)[:, 1]
-    return np.concatenate([rotation, shift]), (d_camera, d_mast, np.column_stack([d_pan, d_tilt]), d_chain)
+    d_axis = d_chain @ _adjoint_of_inverse(*tilt_to_camera)
+    d_pan_tilt = np.column_stack([d_pan, d_tilt])
+    return np.concatenate([rotation, shift]), (d_camera, d_mast, d_pan_tilt, d_chain, d_axis)
 
 
 def mast_factor(
@@ -70,24 +72,24 @@ def mast_factor(
     world_T_camera: Slot,
     world_T_mast: Slot,
     pan_tilt_rad: Slot,
-    head_T_camera: Slot,
-    pan_T_tilt: gtsam.Pose3,
+    head_T_camera: PoseSlot,
+    pan_T_tilt: PoseSlot,
 ) -> gtsam.CustomFactor:
-    """The factor of `mast_residual`: slots of Pose3, Pose3, vector of 2, Pose3; noise of 6 rows."""
-    axis = pan_T_tilt.rotation().matrix(), pan_T_tilt.translation()
+    """The factor of `mast_residual`: slots of Pose3, Pose3, vector of 2, Pose3, Pose3; noise of 6 rows."""
 
     def residual(
-        camera: gtsam.Pose3, mast: gtsam.Pose3, pan_tilt: FloatArray, mount: gtsam.Pose3
+        camera: gtsam.Pose3, mast: gtsam.Pose3, pan_tilt: FloatArray, mount: gtsam.Pose3, axis: gtsam.Pose3
     ) -> tuple[FloatArray, tuple[FloatArray, ...]]:
-        camera_pose, mast_pose, mount_pose = (
-            (p.rotation().matrix(), p.translation()) for p in (camera, mast, mount)
+        camera_pose, mast_pose, mount_pose, axis_pose = (
+            (p.rotation().matrix(), p.translation()) for p in (camera, mast, mount, axis)
         )
-        return mast_residual(camera_pose, mast_pose, pan_tilt, mount_pose, axis)
+        return mast_residual(camera_pose, mast_pose, pan_tilt, mount_pose, axis_pose)
 
-    slots = [
+    slots = (
         (world_T_camera, gtsam.Values.atPose3),
         (world_T_mast, gtsam.Values.atPose3),
         (pan_tilt_rad, gtsam.Values.atVector),
         (head_T_camera, gtsam.Values.atPose3),
-    ]
+        (pan_T_tilt, gtsam.Values.atPose3),
+    )
     return custom_factor(noise, slots, residual)

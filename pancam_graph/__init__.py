@@ -20,6 +20,8 @@ from pancam_graph.io import read_pds as read_pds
 from pancam_graph.io import read_traverse as read_traverse
 from pancam_graph.io import write_traverse as write_traverse
 from pancam_graph.report import write_report as write_report
+from pancam_graph.sharing import Freedom as Freedom
+from pancam_graph.sharing import Sharing as Sharing
 from pancam_graph.simulate import SimulationOptions as SimulationOptions
 from pancam_graph.simulate import simulate as simulate
 from pancam_graph.solution import Solution as Solution

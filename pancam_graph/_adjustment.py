@@ -4,6 +4,7 @@ import logging
 from collections.abc import Callable
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 
 from pancam_graph._covariance import Uncertainty, uncertainty
@@ -17,11 +18,12 @@ from pancam_graph._rejection import screen
 from pancam_graph.cameras import carry_to_pinhole
 from pancam_graph.errors import InputError, SolveError
 from pancam_graph.geometry import BoolArray, FloatArray
-from pancam_graph.graph import RIGID, FactorTemplate, HardTemplate, SoftTemplate
+from pancam_graph.graph import RIGID, FactorTemplate, HardTemplate, RigVariables, SoftTemplate
 from pancam_graph.initialise import Start, start_from_telemetry
 from pancam_graph.landmarks import Landmarks, Measurements, rays_of, refine, residuals, triangulate
 from pancam_graph.losses import loss_of
 from pancam_graph.options import SolveOptions
+from pancam_graph.sharing import Sharing
 from pancam_graph.solution import Solution, State
 from pancam_graph.stopping import StopRule
 from pancam_graph.traverse import Observations, Traverse
@@ -39,7 +41,8 @@ _GROSS = 3.0
 _FINAL_ROUNDS = 6
 _TYPICAL_RANGE_M = 10.0
 _CARRIED_PX = 1e-6
-"""Pixels of CAHVORE cameras are carried anew until none moves by more."""
+"""Pixels of CAHVORE cameras, and of distorted ones with a free calibration, are carried anew until none moves
+by more."""
 
 
 class Adjustment:
@@ -63,7 +66,9 @@ class Adjustment:
         self.noise = self.observations.noise
         self.reason = np.full(len(self.observations), "", dtype=object)
         self.solver = _SOLVERS[options.landmarks](on_iteration)
-        self.problem = self.first = self._first_problem(_template(traverse, options)).placed()
+        self.sharing = (options.sharing or traverse.sharing or Sharing()).for_model(options.model)
+        template = _template(traverse, options, self.sharing)
+        self.problem = self.first = self._first_problem(template).placed()
 
     # --- preparation ---
 
@@ -77,7 +82,8 @@ class Adjustment:
             world_t_camera=centres,
             landmarks_m=np.zeros((0, 3)),
         )
-        measurements = self._measure()
+        values = template.values(state)
+        measurements = self._measure(template.rig_variables, values)
         n = measurements.n_landmarks
         return _triangulated(
             Problem(
@@ -85,15 +91,15 @@ class Adjustment:
                 factors=template.factors(),
                 measurements=measurements,
                 accepted=np.ones(len(measurements.row), dtype=bool),
-                values=template.values(state),
+                values=values,
                 landmarks=Landmarks(vector=np.zeros((n, 4)), origin_m=np.zeros((n, 3))),
             )
         )
 
-    def _measure(self) -> Measurements:
+    def _measure(self, rig: RigVariables, values: gtsam.Values) -> Measurements:
         """Observations of tracks seen twice or more, carried to the pinholes."""
         obs = self.observations
-        uv, turn, valid = self._carry(np.full(len(obs), _TYPICAL_RANGE_M))
+        uv, turn, valid = self._carry(np.full(len(obs), _TYPICAL_RANGE_M), rig, values)
         self.reason[~valid] = "outside"
         _, track = np.unique(obs.track, return_inverse=True)
         single = valid & (np.bincount(track, valid)[track] < 2)
@@ -120,13 +126,16 @@ class Adjustment:
             whitening=self.noise.select(rows).whiten(turn[rows]),
         )
 
-    def _carry(self, range_m: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        obs, eye = self.observations, self.traverse.image_eye
+    def _carry(
+        self, range_m: FloatArray, rig: RigVariables, values: gtsam.Values
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Pixels as pinholes see them, how their residuals turn back, and which are valid."""
+        obs = self.observations
         uv, turn = np.empty((len(obs), 2)), np.empty((len(obs), 2, 2))
         valid = np.empty(len(obs), dtype=bool)
-        for i, entry in enumerate(self.traverse.rig.eyes):
-            own = eye[obs.image] == i
-            uv[own], turn[own], valid[own] = carry_to_pinhole(entry.camera, obs.uv_px[own], range_m[own])
+        for camera, images in rig.cameras(values):
+            own = images[obs.image]
+            uv[own], turn[own], valid[own] = carry_to_pinhole(camera, obs.uv_px[own], range_m[own])
         return uv, turn, valid
 
     # --- the rounds ---
@@ -151,6 +160,9 @@ class Adjustment:
         distance = np.linalg.norm(first.points_m()[m.landmark] - views.world_t_camera[m.image], axis=1)
         focal = views.calibration[m.image, 0, 0]
         telemetry_px = focal * np.sqrt(frame**2 + stop_rad**2 + (stop_m / distance.clip(1.0)) ** 2)
+        rig_px, rig_m = p.template.rig_variables.start_error()
+        shift_px = focal * rig_m[m.image] / distance.clip(1.0)
+        telemetry_px = np.hypot(telemetry_px, np.hypot(rig_px[m.image], shift_px))
         noise = self.noise.select(m.row)
         screening = screen(
             p.landmarks,
@@ -257,27 +269,31 @@ class Adjustment:
     # --- what the rounds share ---
 
     def _recarry(self) -> bool:
-        """Carry pixels again where that depends on the range; whether any moved."""
-        if not any(eye.camera.pupil_moves for eye in self.traverse.rig.eyes):
+        """Carry pixels again where that depends on the range or on a free calibration; whether any moved."""
+        m, rig = self.problem.measurements, self.problem.template.rig_variables
+        if not (rig.pupil_moves or rig.distortion_moves):
             return False
-        m = self.problem.measurements
-        centre = self.problem.views.world_t_camera[m.image]
-        found = np.linalg.norm(self.problem.points_m()[m.landmark] - centre, axis=1)
+        carried = self._carried(self.problem)
+        if np.linalg.norm(carried.uv_px - m.uv_px, axis=1).max(initial=0.0) < _CARRIED_PX:
+            return False
+        self.problem = replace(self.problem, measurements=carried)
+        return True
+
+    def _carried(self, problem: Problem) -> Measurements:
+        """The measurements as the problem's own cameras and ranges carry them."""
+        m = problem.measurements
+        centre = problem.views.world_t_camera[m.image]
+        found = np.linalg.norm(problem.points_m()[m.landmark] - centre, axis=1)
         range_m = np.full(len(self.observations), _TYPICAL_RANGE_M)
         range_m[m.row] = np.where(np.isfinite(found), found, _TYPICAL_RANGE_M)
-        uv, turn, valid = self._carry(range_m)
-        shift = np.where(valid[m.row], np.linalg.norm(uv[m.row] - m.uv_px, axis=1), 0.0)
-        if shift.max(initial=0.0) < _CARRIED_PX:
-            return False
+        uv, turn, valid = self._carry(range_m, problem.template.rig_variables, problem.values)
         keep = valid[m.row, None]
         whitening = self.noise.select(m.row).whiten(turn[m.row])
-        carried = replace(
+        return replace(
             m,
             uv_px=np.where(keep, uv[m.row], m.uv_px),
             whitening=np.where(keep[:, :, None], whitening, m.whitening),
         )
-        self.problem = replace(self.problem, measurements=carried)
-        return True
 
     def _noise_factor(self) -> float:
         """By how much residuals exceed the noise assumed: the square root of the variance factor."""
@@ -306,6 +322,8 @@ class Adjustment:
         first = self.first
         if m is not first.measurements or not p.accepted.all():
             first = _triangulated(replace(first, measurements=m, accepted=p.accepted)).placed()
+            if p.template.rig_variables.distortion_moves:
+                first = replace(first, measurements=self._carried(first)).placed()
         return Solution(
             traverse=t,
             model=self.options.model,
@@ -328,14 +346,17 @@ class Adjustment:
             stop_covariance=found.stop_covariance,
             angle_sigma_rad=found.angle_sigma_rad,
             landmark_covariance_m2=found.landmark_covariance_m2,
+            refined=p.template.rig_variables.refined(p.values, found.rig_sigmas),
             warnings=(*self.warnings, *self._late_warnings(used), *connection_warnings(t, used)),
         )
 
     def _uncertainty(self) -> Uncertainty:
         """Covariances; NaN and a warning where a direction is free. Warns of landmarks without a place."""
         t, wanted, problem = self.traverse, self.options.landmark_covariances, self.regular
+        # Radii of circles are free unasked: what holds them is then no news.
+        asked = (self.options.sharing or t.sharing) is not None
         try:
-            found = uncertainty(problem, self.final, self._reduced(problem), landmarks=wanted)
+            found = uncertainty(problem, self.final, self._reduced(problem), landmarks=wanted, unseen=asked)
         except SolveError as error:
             self.warnings.append(f"no uncertainties: {error}")
             n = len(self.landmark_track)
@@ -346,6 +367,12 @@ class Adjustment:
                 if self.options.landmark_covariances
                 else None,
                 undetermined=np.zeros(n, dtype=bool),
+                rig_sigmas=None,
+            )
+        if found.unseen:
+            self.warnings.append(
+                f"images say next to nothing of {listed(found.unseen, 'direction')} of the rig: telemetry "
+                "and priors hold them, and their sigmas are as good as these"
             )
         tracks = [str(track) for track in self.landmark_track[found.undetermined]]
         if tracks:
@@ -361,7 +388,7 @@ class Adjustment:
         problem = self.problem
         if self.options.firm_tie == "hard" and isinstance(problem.template, SoftTemplate):
             # The inverse of a system with a tie of 1e-8 would have lost half its digits.
-            return problem.on(HardTemplate(self.traverse))
+            return problem.on(HardTemplate(self.traverse, self.sharing))
         return problem
 
     def _reduced(self, problem: Problem) -> ReducedSystem:
@@ -397,14 +424,14 @@ class Adjustment:
         return warnings
 
 
-def _template(traverse: Traverse, options: SolveOptions) -> FactorTemplate:
+def _template(traverse: Traverse, options: SolveOptions, sharing: Sharing) -> FactorTemplate:
     """The rig as variables and factors, as the options have it."""
     if options.firm_tie == "soft":
-        return SoftTemplate(traverse, options.model, options.firm_flex)
+        return SoftTemplate(traverse, options.model, options.firm_flex, sharing)
     if options.landmarks == "eliminated":
-        return HardTemplate(traverse)
+        return HardTemplate(traverse, sharing)
     # GTSAM's projections want camera poses: a tie far below what images can tell makes them rigid.
-    return SoftTemplate(traverse, options.model, RIGID)
+    return SoftTemplate(traverse, options.model, RIGID, sharing)
 
 
 def _triangulated(problem: Problem) -> Problem:

@@ -60,9 +60,9 @@ class EliminatedSolver(Solver):
         A step from afar bends a firm tie by more than its sigma: a straight step of poses leaves the circle.
         """
         rule = StopRule(max_iterations=20, relative_decrease=1e-4)
-        found, outcome = self._minimise(
-            problem.on(HardTemplate(problem.template.traverse)), rule, loss, stage
-        )
+        template = problem.template
+        rigid = HardTemplate(template.traverse, template.rig_variables.sharing)
+        found, outcome = self._minimise(problem.on(rigid), rule, loss, stage)
         return found.on(problem.template), outcome
 
     def _minimise(self, problem: Problem, rule: StopRule, loss: Loss, stage: str) -> tuple[Problem, Outcome]:

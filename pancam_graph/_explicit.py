@@ -60,7 +60,7 @@ class ExplicitSolver(Solver):
         problem = _placed(problem, loss)
         template = _soft(problem)
         explicit, present = ExplicitLandmarks(template, problem.measurements), problem.present
-        observed = gtsam.NonlinearFactorGraph(problem.factors)
+        observed = explicit.calibrations.in_place(problem.factors)
         observed.push_back(explicit.factors(problem.kept, loss))
 
         def values_of(p: Problem) -> gtsam.Values:
@@ -76,7 +76,7 @@ class ExplicitSolver(Solver):
             step = elimination.step(graph, values_of(problem))
             before = cost
             for shrink in (1.0, 0.25, 0.0625, 0.0156):
-                moved = template.retract(problem.values, step, shrink)
+                moved = explicit.retract(problem.values, step, shrink)
                 trial = _placed(replace(problem, values=moved), loss)
                 cost = float(observed.error(values_of(trial)))
                 if cost < before:
@@ -122,7 +122,7 @@ class ExplicitSolver(Solver):
             _weak(problem),
         )
         points = problem.points_m()
-        graph = gtsam.NonlinearFactorGraph(problem.factors)
+        graph = explicit.calibrations.in_place(problem.factors)
         graph.push_back(explicit.factors(problem.kept))
         graph.push_back(explicit.proximal_factors(points, weak.prior_m, weak.needs_prior))
         values = explicit.with_landmarks(problem.values, points, present)
@@ -133,11 +133,17 @@ class ExplicitSolver(Solver):
             rule,
             elimination,
             n_observations=int(problem.kept.sum()),
-            held=template.held_columns(),
+            held=explicit.calibrations.held(template.held_columns()),
             on_iteration=self.on_iteration,
         )
-        found = np.where(present[:, None], explicit.points_m(outcome.values, present), points)
-        return problem.at(template.only_cameras(outcome.values), problem.landmarks.moved_to(found)), outcome
+        points = np.where(present[:, None], explicit.points_m(outcome.values, present), points)
+        found = problem.at(explicit.only_cameras(outcome.values), problem.landmarks.moved_to(points))
+        if explicit.calibrations.any and not found.residuals()[1][problem.kept].all():
+            raise SolveError(
+                "explicit landmarks: expected all in front of their cameras, found some behind, which "
+                "GTSAM's factor of a free calibration does not count; eliminated landmarks bear it"
+            )
+        return found, outcome
 
 
 def _soft(problem: Problem) -> SoftTemplate:

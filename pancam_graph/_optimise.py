@@ -188,7 +188,7 @@ class Elimination:
     def __init__(
         self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, *, by_qr: bool = False
     ) -> None:
-        last = [key for key in values.keys() if chr(gtsam.symbolChr(key)) in "AMR"]  # noqa: SIM118  gtsam.Values
+        last = [key for key in values.keys() if chr(gtsam.symbolChr(key)) in "ACEMRT"]  # noqa: SIM118  gtsam.Values
         self.ordering = gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(graph, last, False)
         self.by_qr = by_qr
 

@@ -40,8 +40,26 @@ def joint_root(
     template: FactorTemplate, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, panels: Panels
 ) -> Root:
     """Square root of what is left of the landmarks, with priors and ties added. Destroys the panels."""
-    if template.linkage.key:
-        _add(panels, template.linkage, factors.linearize(values))
+    _add(panels, template.linkage, factors.linearize(values))
+    panels.hold(held_columns(template))
+    return panels.root()
+
+
+def loosened_root(problem: Problem, system: LandmarkSystem, factor: float) -> Root:
+    """The square root at a problem's values, with the sigmas of all priors multiplied; not those of ties.
+
+    `system` is the problem's, and is linearised anew.
+    """
+    template, link = problem.template, problem.template.linkage
+    priors, ties = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
+    for i in range(problem.factors.size()):
+        one = problem.factors.at(i)
+        # Where telemetry holds all else, a tie is of its camera pose alone.
+        of_camera = any(chr(gtsam.symbolChr(key)) == "X" for key in one.keys())  # noqa: SIM118  a gtsam factor
+        (ties if of_camera else priors).push_back(one)
+    panels = system.linearise(template.posture(problem.values))
+    _add(panels, link, ties.linearize(problem.values))
+    _add(panels, link, priors.linearize(problem.values), weight=factor**-2)
     panels.hold(held_columns(template))
     return panels.root()
 
@@ -58,18 +76,20 @@ def held_columns(template: FactorTemplate) -> dict[int, IntArray]:
     return out
 
 
-def _add(panels: Panels, linkage: Linkage, linear: gtsam.GaussianFactorGraph) -> None:
+def _add(panels: Panels, linkage: Linkage, linear: gtsam.GaussianFactorGraph, weight: float = 1.0) -> None:
     """Add priors and ties, as GTSAM linearises them."""
-    row, column, entry = linear.sparseJacobian_()
     # GTSAM counts from 1, takes keys in ascending order, and appends the right-hand side as a last column.
-    keys = sorted(linkage.key)
+    keys = sorted(linear.keys())
+    if not keys:
+        return
+    row, column, entry = linear.sparseJacobian_()
     dims = [int(linkage.dim[linkage.row[key]]) for key in keys]
     shape = (int(row.max(initial=0)), sum(dims) + 1)
     jacobian = csc_array((entry, (row.astype(int) - 1, column.astype(int) - 1)), shape=shape)
     own = [linkage.columns_of(key) for key in keys]
     group = np.repeat([int(linkage.group[linkage.row[key]]) for key in keys], dims)
     within = np.concatenate([np.arange(s.start, s.stop) for s in own])
-    normal = coo_array(jacobian.T @ jacobian)
+    normal = weight * coo_array(jacobian.T @ jacobian)
     i, j = normal.coords
     left = (i < shape[1] - 1) & (j < shape[1] - 1)
     panels.add_entries(group[i[left]], within[i[left]], group[j[left]], within[j[left]], normal.data[left])

@@ -6,6 +6,7 @@ from typing import Literal
 from pancam_graph.errors import InputError
 from pancam_graph.graph import DEFAULT_FLEX, Flex, Model, Tie
 from pancam_graph.losses import LossName, loss_of
+from pancam_graph.sharing import Sharing
 from pancam_graph.stopping import StopRule
 
 __all__ = ["SolveOptions"]
@@ -31,6 +32,9 @@ class SolveOptions(StopRule):
     variables that a sigma holds near there. Default: hard for "mast", soft for the others."""
     flex: Flex | None = None
     """That sigma; default: the model's own (graph.DEFAULT_FLEX)."""
+    sharing: Sharing | None = None
+    """What of the rig is free, and who shares it; default: what the traverse says, or else nothing but the
+    radii of the model "circle"."""
     outlier_sigma: float = 4.0
     """An observation goes where noise would take it less often than a Gaussian beyond this many sigmas."""
     rescale_noise: bool | None = None
@@ -54,6 +58,8 @@ class SolveOptions(StopRule):
             raise InputError(
                 f"tie: expected soft for the model {self.model}, found hard: its poses are variables"
             )
+        if self.sharing is not None:
+            self.sharing.for_model(self.model)
         if self.flex is not None and self.firm_tie == "hard":
             raise InputError("flex: expected none with a hard tie, which has no sigma")
         if not self.outlier_sigma > 0:

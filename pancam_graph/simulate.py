@@ -13,7 +13,16 @@ import numpy as np
 from pancam_graph._terrain import Terrain
 from pancam_graph.cameras import Camera
 from pancam_graph.errors import InputError
-from pancam_graph.geometry import BoolArray, FloatArray, IntArray, compose, pose_arrays, rz, wrap_angle
+from pancam_graph.geometry import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    compose,
+    corrected_poses,
+    pose_arrays,
+    rz,
+    wrap_angle,
+)
 from pancam_graph.rigs import Rig
 from pancam_graph.traverse import Frame, Image, Observations, Stop, Traverse
 
@@ -79,6 +88,14 @@ class SimulationOptions:
     """Standard deviation of each component of a stop's position, but the first, which is held."""
     sigma_stop_rad: float = 0.01
     """Standard deviation of each component of a stop's rotation, but the first, which is held."""
+    focal_error: float = 0.0
+    """Standard deviation of the focal length of each eye in the rig that the traverse claims, as a share."""
+    mount_error_rad: float = 0.0
+    """Standard deviation of each component of the rotation of its mounts."""
+    mount_error_m: float = 0.0
+    """Standard deviation of each component of where they sit."""
+    radius_error_m: float = 0.0
+    """Standard deviation of the radius of its circle, at the mean tilt."""
     prior: Literal["telemetry", "truth"] = "telemetry"
     """Where the traverse's stop poses and angles are: at the disturbed telemetry, or at the truth.
 
@@ -108,6 +125,10 @@ class SimulationOptions:
             "pointing_scale",
             "sigma_stop_m",
             "sigma_stop_rad",
+            "focal_error",
+            "mount_error_rad",
+            "mount_error_m",
+            "radius_error_m",
         ):
             self._require(name, 0 <= getattr(self, name) < np.inf, "a number of 0 or above")
         self._require("noise_stretch", 1 <= self.noise_stretch <= 1e4, "a number from 1 to 10000")
@@ -131,6 +152,8 @@ class SimulationOptions:
 class Truth:
     """What really was, in the order of the traverse's entries. No solver may see it."""
 
+    rig: Rig
+    """That made the images."""
     world_T_mast: tuple[gtsam.Pose3, ...]
     """Mast pose of each stop."""
     pan_tilt_rad: FloatArray
@@ -168,18 +191,18 @@ class Simulation:
 def simulate(rig: Rig, options: SimulationOptions | None = None, *, seed: int = 0) -> Simulation:
     """Drive `rig` over random terrain and take panoramas. The same arguments give the same numbers.
 
-    Terrain, drive, lines of sight, detections, noise, outliers and telemetry errors are drawn
-    independently of each other: another noise leaves the terrain and the errors of the mast alone.
+    `rig` makes the images; the traverse claims one with errors where `options` say so. Terrain, drive, lines
+    of sight, detections, noise, outliers, errors of telemetry and of the rig are drawn independently of each
+    other: another noise leaves the terrain and the errors of the mast alone.
     Occlusion is not simulated, except for the image that finds a point. Raises InputError for a negative
     seed, and where no point is seen by `options.min_views` images (all rows of the panorama in the sky).
     """
     options = options if options is not None else SimulationOptions()
     if seed < 0:
         raise InputError(f"simulation: seed: expected 0 or more, found {seed}")
-    streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(8)]
-    rng_terrain, rng_drive, rng_sight, rng_detection, rng_noise, rng_outlier, rng_telemetry, rng_ellipse = (
-        streams
-    )
+    streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(9)]
+    rng_terrain, rng_drive, rng_sight, rng_detection, rng_noise, rng_outlier, *streams = streams
+    rng_telemetry, rng_ellipse, rng_rig = streams
 
     terrain, world_T_mast = _drive(rig, options, rng_terrain, rng_drive)
     angles = _panorama(rig, options)
@@ -225,6 +248,7 @@ def simulate(rig: Rig, options: SimulationOptions | None = None, *, seed: int = 
 
     start = _telemetry(rig, options, world_T_mast, pan_tilt, rng_telemetry)
     truth = Truth(
+        rig=rig,
         world_T_mast=world_T_mast,
         pan_tilt_rad=pan_tilt,
         landmarks_m=points[kept],
@@ -233,7 +257,8 @@ def simulate(rig: Rig, options: SimulationOptions | None = None, *, seed: int = 
         terrain=terrain,
     )
     centre = truth if options.prior == "truth" else start
-    traverse = _traverse(rig, options, centre.world_T_mast, centre.pan_tilt_rad, observations, seed)
+    claimed = _claimed(rig, options, float(np.mean(angles[:, 1])), rng_rig)
+    traverse = _traverse(claimed, options, centre.world_T_mast, centre.pan_tilt_rad, observations, seed)
     return Simulation(traverse=traverse, truth=truth, telemetry_start=start)
 
 
@@ -431,6 +456,30 @@ def _pointing_sigma_rad(rig: Rig, options: SimulationOptions) -> FloatArray:
     """Standard deviation of pan and tilt telemetry (2,); 0 where the rig does not turn."""
     sigma = np.array([rig.pointing_sigma.pan_rad, rig.pointing_sigma.tilt_rad])
     return options.pointing_scale * rig.turns * sigma
+
+
+def _claimed(rig: Rig, options: SimulationOptions, tilt_rad: float, rng: np.random.Generator) -> Rig:
+    """The rig with errors in each eye: of its focal length, its mount, and its circle at a tilt."""
+    head_R, _ = rig.mast_T_head(np.zeros(1), np.array([tilt_rad]))
+    draws = rng.standard_normal((len(rig.eyes), 8))
+    sigmas = np.repeat([options.mount_error_rad, options.mount_error_m], 3)
+    eyes = []
+    for i, (eye, draw) in enumerate(zip(rig.eyes, draws, strict=True)):
+        camera, mount = eye.camera, eye.head_T_camera
+        if options.focal_error:
+            calibration = camera.pinhole.calibration_matrix
+            calibration[:2, :2] *= 1 + options.focal_error * draw[0]
+            camera = camera.with_calibration(calibration)
+        if options.radius_error_m:
+            _, phase_rad, _ = rig.circle(i, tilt_rad)
+            shift = options.radius_error_m * draw[1] * (head_R[0].T @ rz(phase_rad)[:, 0])
+            mount = gtsam.Pose3(mount.rotation(), mount.translation() + shift)
+        if sigmas.any():
+            nominal = mount.rotation().matrix(), mount.translation()
+            rotation, translation = corrected_poses(*nominal, sigmas * draw[2:])
+            mount = gtsam.Pose3(gtsam.Rot3(rotation), translation)
+        eyes.append(replace(eye, camera=camera, head_T_camera=mount))
+    return replace(rig, eyes=tuple(eyes))
 
 
 def _traverse(

@@ -1,16 +1,55 @@
 """What an adjustment returns."""
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import gtsam
 import numpy as np
 
 from pancam_graph._honest import CrossValidation
-from pancam_graph.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.geometry import BoolArray, FloatArray, IntArray, corrected_poses
+from pancam_graph.rigs import Rig
+from pancam_graph.sharing import Quantity
 from pancam_graph.traverse import Traverse
 
-__all__ = ["Seconds", "Solution", "State", "rms_px"]
+__all__ = ["Refined", "RigCorrection", "Seconds", "Solution", "State", "rms_px"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RigCorrection:
+    """By how much a rig's numbers differ from what the traverse's rig says; 0 where they were held."""
+
+    calibration_px: FloatArray
+    """(images, 5) added to fx, fy, skew, cx and cy of each image's camera."""
+    mount: FloatArray
+    """(images, 6) of each image's `head_T_camera`: rotation vector, radians, and shift, metres, in the
+    camera's own frame (geometry.corrected_poses)."""
+    pan_T_tilt: FloatArray
+    """(stops, 6) the same of the tilt axis."""
+    radius_m: FloatArray
+    """(images,) added to the radius of the image's circle; model `circle`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refined:
+    """One free entry of the rig, as the adjustment found it."""
+
+    quantity: Quantity
+    entry: str
+    camera: str | None
+    """Name of the eye; None: of all eyes."""
+    stop: str | None
+    """Id of the stop that has it for itself; None: of the whole traverse."""
+    image: str | None
+    """Id of the image that has it for itself; None: of all images of the eye, or of the eye at the stop."""
+    nominal: float | None
+    """What the rig says; 0 for entries of a pose, 1 for `focal`; None where those who share it differ."""
+    change: float
+    sigma: float
+    """Formal standard deviation, all else marginalised; NaN where a direction is free."""
+    prior_sigma: float
+    """Of the prior about the rig's value; infinite where there was none."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -27,6 +66,8 @@ class State:
     """(images, 3) centre of each image's camera, metres."""
     landmarks_m: FloatArray
     """(landmarks, 3) terrain points; a row of NaN where there is no usable point."""
+    rig: RigCorrection | None = None
+    """How the rig differs from the traverse's; None: in nothing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,6 +135,8 @@ class Solution:
     """(observations, 2, 2) covariance each was weighted with in the end, where the input has covariances."""
     landmark_covariance_m2: FloatArray | None = None
     """(landmarks, 3, 3) of `final.landmarks_m`, all else marginalised; formal; where it was asked for."""
+    refined: tuple[Refined, ...] = ()
+    """Entries of the rig that were free (`Sharing`), in the order of quantity and owner."""
     cross_validation: CrossValidation | None = None
     """What solutions from halves of the tracks say of the sigmas; where it was asked for."""
     warnings: tuple[str, ...] = ()
@@ -108,6 +151,32 @@ class Solution:
     def rms_final_px(self) -> float:
         """RMS residual length of the used observations at the end, raw image pixels."""
         return rms_px(self.residual_final_px[self.used])
+
+    @cached_property
+    def rig(self) -> Rig:
+        """The rig as adjusted: its tilt axis, and each eye's calibration and mount.
+
+        Only what serves the whole traverse: what stops or images have for themselves (`final.rig` has it) is
+        left as the input has it. Nothing was free: the input's own.
+        """
+        rig, found, t = self.traverse.rig, self.final.rig, self.traverse
+        if found is None:
+            return rig
+        eyes = []
+        for i, eye in enumerate(rig.eyes):
+            own = t.image_eye == i
+            calibration, mount = _common(found.calibration_px[own]), _common(found.mount[own])
+            camera, head_T_camera = eye.camera, eye.head_T_camera
+            if calibration.any():
+                fx, fy, skew, cx, cy = calibration
+                change = np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 0.0]])
+                camera = camera.with_calibration(camera.pinhole.calibration_matrix + change)
+            if mount.any():
+                head_T_camera = _corrected(head_T_camera, mount)
+            eyes.append(replace(eye, camera=camera, head_T_camera=head_T_camera))
+        axis = _common(found.pan_T_tilt)
+        pan_T_tilt = _corrected(rig.pan_T_tilt, axis) if axis.any() else rig.pan_T_tilt
+        return replace(rig, eyes=tuple(eyes), pan_T_tilt=pan_T_tilt)
 
     @property
     def correction_rad(self) -> FloatArray:
@@ -132,3 +201,14 @@ class Solution:
         from pancam_graph.io import save_solution  # noqa: PLC0415  io imports this module
 
         return save_solution(self, Path(out), report=report)
+
+
+def _common(corrections: FloatArray) -> FloatArray:
+    """The correction that all rows (n, m) are, (m,); 0 where they differ."""
+    same = len(corrections) > 0 and bool(np.all(corrections == corrections[0]))
+    return corrections[0] if same else np.zeros(corrections.shape[1])
+
+
+def _corrected(pose: gtsam.Pose3, correction: FloatArray) -> gtsam.Pose3:
+    rotation, translation = corrected_poses(pose.rotation().matrix(), pose.translation(), correction)
+    return gtsam.Pose3(gtsam.Rot3(rotation), translation)

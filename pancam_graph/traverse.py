@@ -18,6 +18,7 @@ from pancam_graph._noise import PixelNoise, mean_sigma_px
 from pancam_graph.errors import InputError
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray, compose, pose_arrays
 from pancam_graph.rigs import Rig
+from pancam_graph.sharing import Sharing
 
 __all__ = ["Frame", "Image", "Observations", "Stop", "Traverse"]
 
@@ -130,6 +131,8 @@ class Traverse:
     images: tuple[Image, ...]
     observations: Observations | None = None
     """None: to be found in the image files."""
+    sharing: Sharing | None = None
+    """What of the rig is free, and who shares it, where a solve's options do not say; None: nothing said."""
     folder: Path | None = None
     """Where image files are relative to; None for a traverse made in memory."""
     warnings: tuple[str, ...] = field(default=())

@@ -8,12 +8,14 @@ Exit status: 0 solved, 1 not converged (results are written), 2 bad input (nothi
 """
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from pancam_graph import SolveOptions, cross_validate, find_observations, read_input, solve
 from pancam_graph.io import check_out
 from pancam_graph.kernel import must_compile
-from pancam_graph.program import Parser, Progress, print_summary, run, show_log
+from pancam_graph.program import SHARING_HELP, Parser, Progress, print_summary, run, show_log
+from pancam_graph.sharing import parse_sharing
 from pancam_graph.solve import COMPILING
 from pancam_graph.stopping import criteria
 
@@ -50,6 +52,7 @@ def main() -> int:
         help="when the final iterations end; may be given for each of max_iterations (default 100), "
         "relative_decrease (of the cost, 1e-7), relative_step, max_gradient, residual_sigmas; 0: not used",
     )
+    parser.add_argument("--sharing", nargs="+", default=(), metavar="WORD", help=SHARING_HELP)
     parser.add_argument(
         "--cross-validate",
         action="store_true",
@@ -59,13 +62,15 @@ def main() -> int:
     arguments = parser.parse_args()
     show_log(verbose=arguments.verbose)
     choices = {name: getattr(arguments, name) for name in ("model", "landmarks", "loss")}
-    options = SolveOptions(**choices, **criteria(arguments.stop))
+    sharing = parse_sharing(arguments.sharing)
+    options = SolveOptions(**choices, sharing=sharing, **criteria(arguments.stop))
     progress = Progress()
 
     begin = time.perf_counter()
     with progress.shown(f"reading {arguments.traverse}"):
         check_out(arguments.out)
         traverse = read_input(arguments.traverse)
+        options = replace(options, sharing=parse_sharing(arguments.sharing, traverse.sharing))
         if traverse.observations is None:
             traverse = find_observations(traverse, progress=progress.counted)
         read_s = time.perf_counter() - begin

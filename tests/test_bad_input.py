@@ -165,6 +165,34 @@ ENTRIES: dict[str, tuple[Change, str, str]] = {
     "observations above, Windows": (put("observations", to="..\\a.npz"), "observations", '"..\\\\a.npz"'),
     "observations of no name": (put("observations", to=""), "observations", '""'),
     "NUL in a name": (put("observations", to="a\0.npz"), "observations", '"a\\u0000.npz"'),
+    "sharing": (put("sharing", to="eye"), "sharing", '"eye"'),
+    "sharing of what": (put("sharing", to={"focal": {"scope": "eye"}}), "sharing.focal", "the unknown key"),
+    "sharing without scope": (put("sharing", to={"mounts": {}}), "sharing.mounts.scope", "without it"),
+    "sharing scope": (
+        put("sharing", to={"mounts": {"scope": "all"}}),
+        "sharing: mounts: scope",
+        "'all': each eye has its own mount",
+    ),
+    "fixed and free": (
+        put("sharing", to={"calibration": {"scope": "fixed", "free": ["fx_px"]}}),
+        "sharing: calibration: expected a scope other than fixed",
+        "fixed with fx_px",
+    ),
+    "unknown entry": (
+        put("sharing", to={"calibration": {"scope": "eye", "free": ["k1"]}}),
+        "sharing: calibration: free: expected entries of focal, fx_px, fy_px",
+        "'k1'",
+    ),
+    "sigma as text": (
+        put("sharing", to={"mounts": {"scope": "eye", "sigma": {"x_m": "wide"}}}),
+        "sharing.mounts.sigma.x_m",
+        '"wide"',
+    ),
+    "sigma below 0": (
+        put("sharing", to={"mounts": {"scope": "eye", "sigma": {"x_m": -1.0}}}),
+        "sharing: mounts: sigma: x_m",
+        "-1.0",
+    ),
     "image absolute": (put("images", 0, "file", to="/etc/a.png"), "images[0].file", '"/etc/a.png"'),
     "image above": (put("images", 0, "file", to="a/../../b.png"), "images[0].file", '"a/../../b.png"'),
 }

@@ -128,6 +128,29 @@ def test_jacobians_against_differences(camera: Camera) -> None:
         assert numeric == pytest.approx(d_origin[:, :, axis], abs=2e-9)
 
 
+@pytest.mark.parametrize("camera", ALL, ids=IDS)
+def test_another_calibration_leaves_all_but_the_pixels(camera: Camera) -> None:
+    """Pixels in units of K are the same before and after, distortion included."""
+    before = camera.pinhole.calibration_matrix
+    after = before * [[1.02, 1.0, 1.01], [1.0, 0.98, 0.99], [1.0, 1.0, 1.0]] + [
+        [0, 0.7, 0],
+        [0, 0, 0],
+        [0, 0, 0],
+    ]
+    changed = camera.with_calibration(after)
+    assert type(changed) is type(camera)
+    assert changed.pinhole.calibration_matrix == pytest.approx(after, rel=1e-13, abs=1e-11)
+    points = scene(camera)
+    unit = []
+    for one, k in ((camera, before), (changed, after)):
+        uv, valid = one.project(points)
+        assert valid.all()
+        unit.append(np.linalg.solve(k, np.column_stack([uv, np.ones(len(uv))]).T))
+    assert unit[1] == pytest.approx(unit[0], abs=1e-12)
+    with pytest.raises(CameraError, match="focal length"):
+        camera.with_calibration(np.diag([-1.0, 1.0, 1.0]) @ after)
+
+
 def test_jacobian_on_the_optical_axis_of_a_fisheye() -> None:
     camera = FISHEYES[0]
     point = camera.C + 5 * camera.O

@@ -8,6 +8,7 @@ import pytest
 
 from pancam_graph.factors import (
     CircleOffset,
+    Corrected,
     Fixed,
     Key,
     circle_factor,
@@ -18,7 +19,7 @@ from pancam_graph.geometry import FloatArray, pose_arrays
 from pancam_graph.rigs import Eye, Rig, exomars_pancam
 
 UNIT3, UNIT6 = gtsam.noiseModel.Unit.Create(3), gtsam.noiseModel.Unit.Create(6)
-X, M, A, E, R = (gtsam.symbol(c, 0) for c in "XMAER")
+X, M, A, E, R, T = (gtsam.symbol(c, 0) for c in "XMAERT")
 PAN_T_TILT = gtsam.Pose3(gtsam.Rot3.Rodrigues(0.02, -0.01, 0.03), np.array([0.03, -0.02, 0.05]))
 
 
@@ -42,14 +43,21 @@ def chain(pan: float, tilt: float) -> gtsam.Pose3:
     return gtsam.Pose3(gtsam.Rot3.Rz(pan), zero) * PAN_T_TILT * gtsam.Pose3(gtsam.Rot3.Ry(-tilt), zero)
 
 
-def check_jacobians(factor: gtsam.CustomFactor, values: gtsam.Values, *, tolerance: float = 2e-7) -> None:
+def check_jacobians(
+    factor: gtsam.CustomFactor,
+    values: gtsam.Values,
+    *,
+    tolerance: float = 2e-7,
+    vectors: tuple[int, ...] = (),
+) -> None:
     """Analytic Jacobians against central differences of the factor's own error."""
     gaussian = factor.linearize(values)
     jacobian = gaussian.jacobian()[0]
     column = 0
     for key in factor.keys():  # noqa: SIM118  a gtsam factor, not a dictionary
-        delta = gtsam.VectorValues()
-        dim = 1 if key == R else 2 if key == A else 6
+        dim = 1 if key == R else 6
+        if key == A or key in vectors:
+            dim = len(values.atVector(key))
         for i in range(dim):
             errors = []
             for h in (1e-6, -1e-6):
@@ -75,14 +83,39 @@ def test_mast_jacobians(name: str, angle: float, length: float) -> None:
     rng = np.random.default_rng(len(name))
     for _ in range(5):
         values = mast_values(rng, angle, length)
-        factor = mast_factor(UNIT6, Key(X), Key(M), Key(A), Key(E), PAN_T_TILT)
+        values.insert(T, PAN_T_TILT)
+        factor = mast_factor(UNIT6, Key(X), Key(M), Key(A), Key(E), Key(T))
         check_jacobians(factor, values, tolerance=1e-6)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-7, 0.1, 1.0])
+@pytest.mark.parametrize("free", [tuple(range(6)), (1,), (0, 2, 5), (3, 4)])
+def test_mast_jacobians_by_corrections(free: tuple[int, ...], size: float) -> None:
+    """Of mount and tilt axis, of their free entries alone, at and away from the rig's own poses."""
+    rng = np.random.default_rng(len(free))
+    values = mast_values(rng, 0.1, 0.1)
+    mount = values.atPose3(E)
+    values.erase(E)
+    values.insert(E, size * rng.normal(size=len(free)))
+    values.insert(T, size * rng.normal(size=len(free)))
+    slots = Corrected(E, mount, free), Corrected(T, PAN_T_TILT, free)
+    factor = mast_factor(UNIT6, Key(X), Key(M), Key(A), *slots)
+    check_jacobians(factor, values, tolerance=1e-6, vectors=(E, T))
+    assert list(factor.keys()) == [X, M, A, E, T]
+    known = gtsam.Values()
+    for key, slot in zip((E, T), slots, strict=True):
+        known.insert(key, slot.pose(values)[0])
+    for key in (X, M):
+        known.insert(key, values.atPose3(key))
+    known.insert(A, values.atVector(A))
+    same = mast_factor(UNIT6, Key(X), Key(M), Key(A), Key(E), Key(T))
+    assert factor.unwhitenedError(values) == pytest.approx(same.unwhitenedError(known), abs=1e-14)
 
 
 def test_mast_residual_is_zero_on_the_chain_and_the_offset_beside_it() -> None:
     rng = np.random.default_rng(0)
     values = mast_values(rng, 0.0, 0.0)
-    factor = mast_factor(UNIT6, Key(X), Key(M), Key(A), Key(E), PAN_T_TILT)
+    factor = mast_factor(UNIT6, Key(X), Key(M), Key(A), Key(E), Fixed(PAN_T_TILT))
     assert factor.unwhitenedError(values) == pytest.approx(np.zeros(6), abs=1e-12)
     offset = gtsam.Pose3(gtsam.Rot3.Expmap(np.array([0.1, -0.2, 0.05])), np.array([1.0, 2.0, 3.0]))
     values.update(X, values.atPose3(X) * offset)
@@ -94,7 +127,7 @@ def test_mast_factor_agrees_with_the_native_between_factor() -> None:
     rng = np.random.default_rng(3)
     values = mast_values(rng, 1e-5, 1e-5)
     pan_tilt, mount = values.atVector(A), values.atPose3(E)
-    ours = mast_factor(UNIT6, Key(X), Key(M), Fixed(pan_tilt), Fixed(mount), PAN_T_TILT)
+    ours = mast_factor(UNIT6, Key(X), Key(M), Fixed(pan_tilt), Fixed(mount), Fixed(PAN_T_TILT))
     native = gtsam.BetweenFactorPose3(M, X, chain(*pan_tilt) * mount, UNIT6)
     assert list(ours.keys()) == [X, M]
     assert ours.error(values) == pytest.approx(native.error(values), rel=1e-4)
@@ -116,7 +149,7 @@ def test_rig_chain_agrees_with_the_factor() -> None:
         values.insert(X, gtsam.Pose3(gtsam.Rot3(rotations[i]), centres[i]))
         mount = eyes[eye[i]].head_T_camera
         factor = mast_factor(
-            UNIT6, Key(X), Fixed(gtsam.Pose3()), Fixed(pan_tilt[i]), Fixed(mount), PAN_T_TILT
+            UNIT6, Key(X), Fixed(gtsam.Pose3()), Fixed(pan_tilt[i]), Fixed(mount), Fixed(PAN_T_TILT)
         )
         assert factor.unwhitenedError(values) == pytest.approx(np.zeros(6), abs=1e-12)
         # and the eye's circle passes through its centre (thesis eq. 4.8)
@@ -157,7 +190,9 @@ def test_circle_factor_matches_the_thesis_formula() -> None:
 def test_an_exception_in_a_factor_reaches_the_caller() -> None:
     values = gtsam.Values()
     values.insert(X, gtsam.Pose3())
-    factor = mast_factor(UNIT6, Key(X), Fixed(gtsam.Pose3()), Fixed(None), Fixed(gtsam.Pose3()), PAN_T_TILT)
+    factor = mast_factor(
+        UNIT6, Key(X), Fixed(gtsam.Pose3()), Fixed(None), Fixed(gtsam.Pose3()), Fixed(PAN_T_TILT)
+    )
     graph = gtsam.NonlinearFactorGraph()
     graph.add(factor)
     call: Callable[[gtsam.Values], float] = graph.error

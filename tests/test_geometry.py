@@ -12,6 +12,8 @@ from pancam_graph.geometry import (
     HEAD_R_FORWARD_CAMERA,
     Z_DOWN_R_Z_UP,
     compose,
+    corrected_poses,
+    correction_twists,
     d_pan_tilt_rotation,
     pan_tilt_from_rotation,
     pan_tilt_rotation,
@@ -22,7 +24,10 @@ from pancam_graph.geometry import (
     ry,
     rz,
     skew,
+    so3_exp,
+    so3_right_jacobian,
     so3_right_jacobian_inverse,
+    twists_in_parent,
     wrap_angle,
     wxyz_from_rotation,
 )
@@ -161,6 +166,53 @@ def test_right_jacobian_inverse_inverts_the_right_jacobian(angle) -> None:
     sinc, versine = np.sin(angle) / angle, 2 * np.sin(angle / 2) ** 2 / angle
     right = sinc * np.eye(3) + (1 - sinc) * np.outer(axis, axis) - versine * k
     assert so3_right_jacobian_inverse(angle * axis) @ right == pytest.approx(np.eye(3), abs=1e-9)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 0.99e-2, 1.01e-2, 0.1, 1.0, 3.0, np.pi, 6.0])
+def test_exponential_and_right_jacobian_are_gtsams(angle) -> None:
+    w = angle * np.array([[2.0, -1.0, 2.0], [0.0, 0.0, 3.0]]) / 3
+    for found, jacobian, one in zip(so3_exp(w), so3_right_jacobian(w), w, strict=True):
+        assert found == pytest.approx(gtsam.Rot3.Expmap(one).matrix(), abs=1e-14)
+        assert jacobian == pytest.approx(gtsam.Rot3.ExpmapDerivative(one), abs=1e-12)
+
+
+def test_a_correction_of_nothing_changes_no_bit() -> None:
+    rng = np.random.default_rng(3)
+    pose = pose_arrays([gtsam.Pose3.Expmap(rng.normal(size=6)) for _ in range(20)])
+    for held in (slice(0, 6), slice(0, 3), slice(3, 6)):
+        correction = rng.normal(size=(20, 6))
+        correction[:, held] = 0.0
+        rotation, translation = corrected_poses(*pose, correction)
+        if held.start == 0:
+            assert np.array_equal(rotation, pose[0])
+        if held.stop == 6:
+            assert np.array_equal(translation, pose[1])
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-7, 0.3, 2.0])
+def test_twists_of_corrections_against_differences(size) -> None:
+    rng = np.random.default_rng(4)
+    (rotation,), (translation,) = pose_arrays([gtsam.Pose3.Expmap(rng.normal(size=6))])
+    correction, h = size * rng.normal(size=6), 1e-6
+
+    def moved(step) -> gtsam.Pose3:
+        a_R_b, a_t_b = corrected_poses(rotation, translation, correction + step)
+        return gtsam.Pose3(gtsam.Rot3(a_R_b), a_t_b)
+
+    here = moved(np.zeros(6))
+    differences = [
+        (here.localCoordinates(moved(h * e)) - here.localCoordinates(moved(-h * e))) / (2 * h)
+        for e in np.eye(6)
+    ]
+    assert correction_twists(correction) == pytest.approx(np.array(differences).T, abs=1e-8)
+
+
+def test_twists_in_the_parent_are_gtsams_adjoint() -> None:
+    rng = np.random.default_rng(5)
+    poses = [gtsam.Pose3.Expmap(rng.normal(size=6)) for _ in range(4)]
+    twists = rng.normal(size=(4, 6, 2))
+    for pose, given_, found in zip(poses, twists, twists_in_parent(*pose_arrays(poses), twists), strict=True):
+        assert found == pytest.approx(pose.AdjointMap() @ given_, abs=1e-13)
 
 
 @REPEATABLE

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import gtsam
 import io_samples
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ import pytest
 import pancam_graph.report
 from pancam_graph.errors import InputError
 from pancam_graph.io import check_out, read_solution_json, save_solution
-from pancam_graph.solution import Solution
+from pancam_graph.solution import Refined, RigCorrection, Solution
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -87,6 +88,47 @@ def test_cameras_are_those_of_a_traverse(tmp_path: Path) -> None:
     assert [c.name for c in cameras] == [e.name for e in solution.traverse.rig.eyes]
     for entry, eye in zip(cameras, solution.traverse.rig.eyes, strict=True):
         assert type(entry.eye("camera").camera) is type(eye.camera)
+
+
+def test_refined_cameras_and_entries(tmp_path: Path) -> None:
+    """Of each eye what all its images agree on; of an eye whose images differ, what the input has."""
+    plain = io_samples.solution()
+    t = plain.traverse
+    n = len(t.images)
+    calibration, mount = np.zeros((n, 5)), np.zeros((n, 6))
+    calibration[:] = [1.0, 2.0, 0.1, -0.5, 0.25]
+    mount[:] = [0.01, -0.02, 0.03, 0.1, 0.2, 0.3]
+    calibration[0, 0] = 7.0  # image 0 is of eye 0
+    rig = RigCorrection(
+        calibration_px=calibration, mount=mount, pan_T_tilt=np.zeros((len(t.stops), 6)), radius_m=np.zeros(n)
+    )
+    entry = Refined(
+        quantity="calibration",
+        entry="fx_px",
+        camera="brown",
+        stop=None,
+        image=None,
+        nominal=None,
+        change=1.0,
+        sigma=np.nan,
+        prior_sigma=np.inf,
+    )
+    solution = io_samples.solution(final=replace(plain.final, rig=rig), refined=(entry,))
+    save_solution(solution, tmp_path / "out")
+    found = read_solution_json(tmp_path / "out" / "solution.json")
+    [refined] = found.refined
+    assert (refined.camera, refined.entry, refined.change) == ("brown", "fx_px", 1.0)
+    assert (refined.stop, refined.image, refined.nominal, refined.sigma, refined.prior_sigma) == (None,) * 5
+    for i, (camera, eye) in enumerate(zip(found.cameras, t.rig.eyes, strict=True)):
+        read = camera.eye("camera")
+        change = read.camera.pinhole.calibration_matrix - eye.camera.pinhole.calibration_matrix
+        expected = np.array([[1.0, 0.1, -0.5], [0.0, 2.0, 0.25], [0.0, 0.0, 0.0]])
+        assert change == pytest.approx(np.zeros((3, 3)) if i == 0 else expected, abs=1e-12)
+        between = eye.head_T_camera.between(read.head_T_camera)
+        assert gtsam.Rot3.Logmap(between.rotation()) == pytest.approx(mount[0, :3], abs=1e-13)
+        assert between.translation() == pytest.approx(mount[0, 3:], abs=1e-13)
+        if hasattr(eye.camera, "distortion"):
+            assert read.camera.distortion == eye.camera.distortion  # type: ignore[attr-defined]  # a Brown camera
 
 
 def test_what_is_not_finite_becomes_null(tmp_path: Path) -> None:

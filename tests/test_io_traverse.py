@@ -12,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pancam_graph import Image, Observations, Traverse
+from pancam_graph import Freedom, Image, Observations, Sharing, Traverse
 from pancam_graph.cameras import CAHV, Camera
 from pancam_graph.errors import InputError
 from pancam_graph.io import read_input, read_traverse, write_traverse
@@ -33,6 +33,7 @@ def assert_same_camera(found: Camera, expected: Camera) -> None:
 def assert_same(found: Traverse, expected: Traverse) -> None:
     assert (found.name, found.rig.name) == (expected.name, expected.rig.name)
     assert (found.frames, found.images) == (expected.frames, expected.images)
+    assert found.sharing == expected.sharing
     for a, b in zip(found.stops, expected.stops, strict=True):
         assert (a.id, a.sigma_rotation_rad, a.sigma_translation_m) == (
             b.id,
@@ -126,6 +127,52 @@ def test_what_may_be_left_out_of_the_file(tmp_path: Path) -> None:
     assert found.name == tmp_path.name
     assert found.rig.pinholes[0].skew_px == 0
     assert found.images[0].file is None
+
+
+SIGMA = st.floats(1e-300, 1e300) | st.just(np.inf)
+MOUNTS = st.fixed_dictionaries({}, optional=dict.fromkeys(("rx_rad", "x_m", "z_m"), SIGMA))
+SHARINGS = st.builds(
+    Sharing,
+    calibration=st.sampled_from(
+        [
+            Freedom(),
+            Freedom(scope="all"),
+            Freedom(scope="image", free=("cy_px", "focal"), sigma={"focal": 0.1 + 0.2}),
+        ]
+    ),
+    mounts=MOUNTS.map(lambda sigma: Freedom(scope="stop", free=("z_m", "x_m", "rx_rad"), sigma=sigma)),
+    pan_T_tilt=st.sampled_from([Freedom(), Freedom(scope="all", free=("y_m",))]),
+    radius=st.sampled_from([None, Freedom(), Freedom(scope="eye", sigma={"radius_m": 1e-3})]),
+)
+
+
+@settings(
+    max_examples=30,
+    derandomize=True,
+    database=None,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(SHARINGS)
+def test_any_sharing_returns(tmp_path: Path, sharing: Sharing) -> None:
+    expected = replace(io_samples.traverse(), sharing=sharing)
+    write_traverse(expected, tmp_path, overwrite=True)
+    assert_same(read_traverse(tmp_path), expected)
+
+
+def test_a_sharing_in_the_file(tmp_path: Path) -> None:
+    write_traverse(io_samples.traverse(), tmp_path)
+    path = tmp_path / "traverse.json"
+    data = json.loads(path.read_text())
+    assert "sharing" not in data  # where nothing is said, nothing is written
+    data["sharing"] = {
+        "calibration": {"scope": "eye", "free": ["focal"], "sigma": {"focal": None}},
+        "radius": None,
+    }
+    path.write_text(json.dumps(data))
+    assert read_traverse(tmp_path).sharing == Sharing(
+        calibration=Freedom(scope="eye", free=("focal",), sigma={"focal": np.inf})
+    )
 
 
 def test_a_quaternion_of_another_length_is_the_same_rotation(tmp_path: Path) -> None:

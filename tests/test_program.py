@@ -182,6 +182,38 @@ def test_wrong_stopping_is_one_sentence_before_anything_is_read(run: Run, text: 
         assert part in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["mounts"], "expected QUANTITY=SCOPE"),
+        (["calibration=eye:k1"], "found 'k1'"),
+        (["radius=eye"], "expected fixed with the model mast"),
+        (["calibration=fixed:fx_px"], "found fixed with fx_px"),
+    ],
+)
+def test_a_sharing_that_means_nothing_is_one_line(
+    run: Run, traverse_folder: Path, tmp_path: Path, words: list[str], text: str
+) -> None:
+    done = run("optimize_traverse.py", "traverse", "--out", "out", "--sharing", *words)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert text in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command_line_goes_before_the_file(run: Run, traverse_folder: Path, tmp_path: Path) -> None:
+    """Quantity by quantity: what it does not name stays as the file has it."""
+    edit(traverse_folder, sharing={"mounts": {"scope": "eye"}, "calibration": {"scope": "image"}})
+    words = ("calibration=eye:focal~0.01", "pan_T_tilt=fixed")
+    done = run("optimize_traverse.py", "traverse", "--out", "out", "--sharing", *words)
+    assert done.returncode == 0, done.stderr
+    refined = read_solution_json(tmp_path / "out" / "solution.json").refined
+    assert [r.entry for r in refined if r.quantity == "calibration"] == ["focal", "focal"]
+    assert [r.prior_sigma for r in refined if r.quantity == "calibration"] == [0.01, 0.01]
+    assert len([r for r in refined if r.quantity == "mounts"]) == 12
+    assert "<h2>Rig</h2>" in (tmp_path / "out" / "report.html").read_text()
+
+
 def test_no_observation_twice_is_bad_input(run: Run, tmp_path: Path) -> None:
     simulation = simulate(mer_navcam(), SMALL, seed=0)
     t = simulation.traverse

@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from pancam_graph.report._page import headline, lead, make_page
 from pancam_graph.report._scene import eye_circles, label_stops, make_masts, make_scene
 from pancam_graph.report._terrain import landmark_residuals, make_terrain
 from pancam_graph.rigs import Rig, mer_navcam
-from pancam_graph.solution import Seconds, Solution, State
+from pancam_graph.solution import Refined, Seconds, Solution, State
 
 VOID = {"meta", "link", "br", "img", "input", "hr"}
 
@@ -414,6 +415,38 @@ def test_image_table_counts_what_the_solution_says(solution: Solution, page: str
     total = sum(e.used * e.after_px**2 for e in table) / solution.used.sum()
     assert np.sqrt(total) == pytest.approx(solution.rms_final_px)
     assert page.count("<tr><td") == len(solution.traverse.images) + len(solution.traverse.stops)
+
+
+def test_rig_table_says_what_was_free(solution: Solution, page: str) -> None:
+    assert "<h2>Rig</h2>" not in page
+    common: dict[str, Any] = {"stop": None, "image": None, "sigma": 1e-3, "prior_sigma": np.inf}
+    entries = (
+        Refined(quantity="calibration", entry="focal", camera="<left>", nominal=1.0, change=2e-3, **common),
+        Refined(quantity="mounts", entry="rx_rad", camera="<left>", nominal=0.0, change=0.1, **common),
+        Refined(
+            quantity="radius",
+            entry="radius_m",
+            camera="right",
+            stop="s1",
+            image="im1",
+            nominal=0.25,
+            change=-2e-3,
+            sigma=np.nan,
+            prior_sigma=5e-3,
+        ),
+        Refined(quantity="calibration", entry="cx_px", camera=None, nominal=None, change=1.5, **common),
+    )
+    page = make_page(replace(solution, refined=entries))
+    text = parsed(page).text
+    assert "Rig" in text
+    rows = re.findall(r"<tr>(.*?)</tr>", page[page.index("<h2>Rig</h2>") :])[1:5]
+    found = [[unescape(cell) for cell in re.findall(r"<td[^>]*>(.*?)</td>", row)] for row in rows]
+    assert found == [
+        ["calibration", "<left>", "focal", "", "1.000000", "0.002000", "0.001000", "none"],
+        ["mounts", "<left>", "rx", "°", "0.0000", "5.7296", "0.0573", "none"],
+        ["radius", "im1", "radius", "mm", "250.00", "-2.00", "\N{EN DASH}", "5.00"],
+        ["calibration", "all", "cx", "px", "differs", "1.500", "0.001", "none"],
+    ]
 
 
 def test_vectors_are_those_of_the_image_worst_first(solution: Solution) -> None:

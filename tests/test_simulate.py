@@ -242,6 +242,44 @@ def test_noise_outliers_and_telemetry_do_not_move_the_rest() -> None:
     np.testing.assert_allclose(larger, 3 * angle, atol=1e-12)
 
 
+def test_a_wrong_rig_is_claimed_and_the_true_one_makes_the_images() -> None:
+    rig = rig_template("exomars-pancam")
+    base = simulate(rig, SMALL)
+    assert base.truth.rig is rig
+    assert base.traverse.rig.eyes == rig.eyes
+    errors = {"focal_error": 0.01, "mount_error_rad": 0.01, "mount_error_m": 0.02}
+    wrong = simulate(rig, replace(SMALL, **errors))
+    np.testing.assert_array_equal(observed(base).uv_px, observed(wrong).uv_px)
+    np.testing.assert_array_equal(base.traverse.pan_tilt_rad, wrong.traverse.pan_tilt_rad)
+    assert wrong.truth.rig is rig
+    drawn = []
+    for seed in range(30):
+        claimed = simulate(
+            rig, replace(SMALL, **errors, stops=1, pans=1, points_per_image=2), seed=seed
+        ).traverse.rig
+        for eye, true in zip(claimed.eyes, rig.eyes, strict=True):
+            before, after = true.camera.pinhole, eye.camera.pinhole
+            assert (after.cx_px, after.cy_px) == pytest.approx((before.cx_px, before.cy_px))
+            assert after.fx_px / before.fx_px == pytest.approx(after.fy_px / before.fy_px)
+            between = true.head_T_camera.between(eye.head_T_camera)
+            turn, shift = gtsam.Rot3.Logmap(between.rotation()), between.translation()
+            drawn.append([(after.fx_px / before.fx_px - 1) / 0.01, *(turn / 0.01), *(shift / 0.02)])
+    square = np.mean(np.array(drawn) ** 2, axis=0)
+    assert np.all(np.abs(square - 1) < 4 * np.sqrt(2 / len(drawn)))
+    assert np.all(np.abs(np.mean(drawn, axis=0)) < 4 / np.sqrt(len(drawn)))
+
+
+def test_an_error_of_radius_is_one_of_nothing_else_at_the_mean_tilt() -> None:
+    rig = cahvor_rig()
+    options = replace(SMALL, radius_error_m=0.01, tilts_rad=(-0.1, -0.5))
+    claimed = simulate(rig, options).traverse.rig
+    for eye in range(2):
+        radius, phase, height = rig.circle(eye, -0.3)
+        found = claimed.circle(eye, -0.3)
+        assert 1e-4 < abs(found[0] - radius) < 0.04
+        assert found[1:] == pytest.approx((phase, height), abs=1e-12)
+
+
 def test_start_is_the_telemetry_wherever_the_priors_are() -> None:
     rig = rig_template("mer-navcam")
     usual = simulate(rig, SMALL)
@@ -333,6 +371,10 @@ def test_how_differently_a_point_may_look_is_an_option() -> None:
         ("max_turn_rad", 4.0),
         ("max_zoom", 0.9),
         ("max_zoom", float("inf")),
+        ("focal_error", -1e-3),
+        ("mount_error_rad", float("nan")),
+        ("mount_error_m", -1e-3),
+        ("radius_error_m", float("inf")),
         ("prior", "wish"),
     ],
 )

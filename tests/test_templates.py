@@ -7,13 +7,14 @@ import gtsam
 import numpy as np
 import pytest
 
-from pancam_graph import Frame, Image, Stop, Traverse
+from pancam_graph import Frame, Freedom, Image, Sharing, Stop, Traverse
 from pancam_graph.elimination import Covariance
 from pancam_graph.factors import Fixed, Key
 from pancam_graph.geometry import FloatArray
 from pancam_graph.graph import DEFAULT_FLEX, FactorTemplate, HardTemplate, SoftTemplate, read_variable
 from pancam_graph.rigs import Rig, exomars_pancam, mer_navcam
-from pancam_graph.solution import State
+from pancam_graph.sharing import ENTRIES, Quantity, Scope
+from pancam_graph.solution import RigCorrection, State
 
 PAN_T_TILT = gtsam.Pose3(gtsam.Rot3.Rodrigues(0.2, -0.1, 0.3), np.array([0.03, -0.02, 0.05]))
 
@@ -84,22 +85,71 @@ def state_of(t: Traverse, seed: int = 1) -> State:
     )
 
 
-def templates(t: Traverse) -> dict[str, FactorTemplate]:
-    soft = {m: SoftTemplate(t, m, DEFAULT_FLEX[m]) for m in ("mast", "circle", "free")}  # type: ignore[arg-type,index]  # literals
-    return {"hard": HardTemplate(t), **soft}
+def free(quantity: Quantity, scope: Scope, *entries: str) -> Sharing:
+    return Sharing(**{quantity: Freedom(scope=scope, free=entries or None)})  # type: ignore[arg-type]  # by name
+
+
+ALL = Sharing(calibration=Freedom(scope="eye"), mounts=Freedom(scope="eye"), pan_T_tilt=Freedom(scope="all"))
+SHARINGS: dict[str, Sharing] = {
+    "nothing": Sharing(),
+    "all": ALL,
+    "per stop": Sharing(
+        calibration=Freedom(scope="stop", free=("fx_px", "cy_px")),
+        mounts=Freedom(scope="stop", free=("rx_rad", "rz_rad", "z_m")),
+        pan_T_tilt=Freedom(scope="stop", free=("ry_rad", "x_m")),
+    ),
+    "per image": Sharing(
+        calibration=Freedom(scope="image", free=("focal",)), mounts=Freedom(scope="image", free=("y_m",))
+    ),
+    "focal of all": free("calibration", "all", "focal", "skew_px"),
+    "mounts": free("mounts", "eye"),
+    "axis": free("pan_T_tilt", "all", "rx_rad", "rz_rad", "y_m"),
+}
+
+
+def off(t: Traverse, state: State, seed: int = 2) -> State:
+    """The state with a rig that is far off; cameras stay where they were."""
+    rng = np.random.default_rng(seed)
+    n = len(t.images)
+    rig = RigCorrection(
+        calibration_px=rng.normal(0, 20, (n, 5)),
+        mount=rng.normal(0, 0.3, (n, 6)),
+        pan_T_tilt=rng.normal(0, 0.3, (len(t.stops), 6)),
+        radius_m=rng.normal(0, 0.01, n),
+    )
+    return replace(state, rig=rig)
+
+
+def templates(t: Traverse, sharing: Sharing | None = None) -> dict[str, FactorTemplate]:
+    given = sharing or Sharing()
+    soft = {
+        m: SoftTemplate(t, m, DEFAULT_FLEX[m], given.for_model(m) if m == "mast" else None)  # type: ignore[arg-type,index]  # literals
+        for m in ("mast", "circle", "free")
+    }
+    return {"hard": HardTemplate(t, given), **soft}
 
 
 @pytest.mark.parametrize(
-    ("name", "kind"),
-    [*((name, "hard") for name in TRAVERSES), ("all free", "mast"), ("a stop held", "circle")],
+    ("name", "kind", "sharing"),
+    [
+        *((name, "hard", "nothing") for name in TRAVERSES),
+        *((name, "hard", "all") for name in TRAVERSES),
+        *(("all free", "hard", sharing) for sharing in SHARINGS),
+        *(("all free", "mast", sharing) for sharing in SHARINGS),
+        ("a stop held", "circle", "nothing"),
+    ],
 )
-def test_chains_move_cameras_as_values_do(name: str, kind: str) -> None:
-    """A unit's twist moves all its cameras as one body: world_R (w x (c - base) + v), by differences."""
+def test_chains_move_cameras_as_values_do(name: str, kind: str, sharing: str) -> None:
+    """A unit's twist moves all its cameras as one body: world_R (w x (c - base) + v), by differences.
+
+    Calibrations move by the rows after it. The rig is far off, where a derivative at zero would be wrong.
+    """
     t = TRAVERSES[name]()
-    template = templates(t)[kind]
-    link, values = template.linkage, template.values(state_of(t))
+    template = templates(t, SHARINGS[sharing])[kind]
+    link, values = template.linkage, template.values(off(t, state_of(t)))
     posture = template.posture(values)
-    h = 1e-6
+    n_rows, h = posture.chain.shape[1], 1e-6
+    unit = link.image_unit
     for key, dim in zip(link.key, link.dim, strict=True):
         for k in range(int(dim)):
             views = []
@@ -109,19 +159,21 @@ def test_chains_move_cameras_as_values_do(name: str, kind: str) -> None:
                 views.append(template.views(values.retract(step)))
             velocity = (views[0].world_t_camera - views[1].world_t_camera) / (2 * h)
             turning = (views[0].world_R_camera - views[1].world_R_camera) / (2 * h)
-            twist = np.zeros((len(link.segment_begin) - 1, 6))
-            for unit in range(len(twist)):
-                for s in range(link.segment_begin[unit], link.segment_begin[unit + 1]):
+            change = (views[0].calibration - views[1].calibration) / (2 * h)
+            twist = np.zeros((len(link.segment_begin) - 1, 11))
+            for u in range(len(twist)):
+                for s in range(link.segment_begin[u], link.segment_begin[u + 1]):
                     column = k - link.segment_column[s]
                     if link.segment_variable[s] == link.row[key] and 0 <= column < link.segment_width[s]:
-                        twist[unit] += posture.chain[s][:, column]
-            for image, unit in enumerate(link.image_unit):
-                R, base = posture.unit_R[unit], posture.unit_t[unit]
-                w, v = R @ twist[unit, :3], R @ twist[unit, 3:]
-                centre = posture.views.world_t_camera[image]
-                assert velocity[image] == pytest.approx(v + np.cross(w, centre - base), abs=2e-8)
-                spin = np.cross(w, posture.views.world_R_camera[image], axisb=0, axisc=0)
-                assert turning[image] == pytest.approx(spin, abs=2e-8)
+                        twist[u, :n_rows] += posture.chain[s][:, column]
+            R, base = posture.unit_R[unit], posture.unit_t[unit]
+            w, v = (np.einsum("nij,nj->ni", R, twist[unit, i : i + 3]) for i in (0, 3))
+            expected = v + np.cross(w, posture.views.world_t_camera - base)
+            assert velocity == pytest.approx(expected, abs=2e-8)
+            spin = np.cross(w[:, None], posture.views.world_R_camera.transpose(0, 2, 1)).transpose(0, 2, 1)
+            assert turning == pytest.approx(spin, abs=2e-8)
+            rows, columns = [0, 1, 0, 0, 1], [0, 1, 1, 2, 2]
+            assert change[:, rows, columns] == pytest.approx(twist[unit, 6:], abs=1e-5)
 
 
 @pytest.mark.parametrize("name", TRAVERSES)
@@ -140,7 +192,7 @@ def test_hard_cameras_stand_where_the_rig_says(name: str) -> None:
 @pytest.mark.parametrize("name", TRAVERSES)
 def test_values_and_states_are_each_others_inverse(name: str, kind: str) -> None:
     t = TRAVERSES[name]()
-    template, state = templates(t)[kind], state_of(t)
+    template, state = templates(t, ALL)[kind], state_of(t)
     values = template.values(state)
     back = template.state(values, state.landmarks_m)
     for found, given in zip(back.world_T_mast, state.world_T_mast, strict=True):
@@ -154,6 +206,78 @@ def test_values_and_states_are_each_others_inverse(name: str, kind: str) -> None
         a, b = read_variable(values, key), read_variable(again, key)
         same = a.equals(b, 1e-12) if isinstance(a, gtsam.Pose3) else np.allclose(a, b, atol=1e-12)
         assert same
+
+
+@pytest.mark.parametrize("kind", ["hard", "mast"])
+@pytest.mark.parametrize("sharing", SHARINGS)
+def test_a_state_keeps_what_of_the_rig_is_free_and_only_that(sharing: str, kind: str) -> None:
+    t = TRAVERSES["all free"]()
+    template = templates(t, SHARINGS[sharing])[kind]
+    values = template.values(off(t, state_of(t)))
+    state = template.state(values, np.zeros((0, 3)))
+    if sharing == "nothing":
+        assert state.rig is None
+        return
+    assert state.rig is not None
+    again = template.values(state)
+    for v in template.rig_variables.variables:
+        assert again.atVector(v.key) == pytest.approx(values.atVector(v.key), rel=1e-12, abs=1e-14)
+    found = {
+        "calibration": state.rig.calibration_px,
+        "mounts": state.rig.mount,
+        "pan_T_tilt": state.rig.pan_T_tilt,
+    }
+    for quantity, corrections in found.items():
+        entries = getattr(SHARINGS[sharing], quantity).entries(quantity)
+        names = ENTRIES[quantity]  # type: ignore[index]  # a literal
+        free_columns = [e in entries or ("focal" in entries and e in {"fx_px", "fy_px"}) for e in names]
+        assert corrections.any(axis=0).tolist() == free_columns
+
+
+def test_what_is_held_of_the_rig_stays_bit_for_bit() -> None:
+    t = TRAVERSES["all free"]()
+    sharing = replace(SHARINGS["per stop"], pan_T_tilt=Freedom())
+    for template in (templates(t, sharing)[kind] for kind in ("hard", "mast")):
+        values = template.values(off(t, state_of(t)))
+        k = template.rig_variables.calibration(values)
+        nominal = np.array([p.calibration_matrix for p in t.rig.pinholes])[t.image_eye]
+        held = np.ones((3, 3), dtype=bool)
+        held[0, 0] = held[1, 2] = False
+        assert np.array_equal(k[:, held], nominal[:, held])
+        assert not np.any(k[:, ~held] == nominal[:, ~held])
+        assert template.rig_variables.axes(values) is None
+
+
+@pytest.mark.parametrize("kind", ["hard", "mast"])
+def test_who_shares_a_variable(kind: str) -> None:
+    """Numbers of variables and their owners, by scope."""
+    t = TRAVERSES["all free"]()
+    n_eyes, n_stops, n_images = len(t.rig.eyes), len(t.stops), len(t.images)
+    scopes: tuple[tuple[Scope, int], ...] = (
+        ("all", 1),
+        ("eye", n_eyes),
+        ("stop", n_eyes * n_stops),
+        ("image", n_images),
+    )
+    for scope, count in scopes:
+        template = templates(t, free("calibration", scope))[kind]
+        rig, values = template.rig_variables, template.values(state_of(t))
+        variables = rig.of["calibration"]
+        assert len(variables) == count
+        for v in variables:
+            step = gtsam.VectorValues()
+            step.insert(v.key, np.ones(5))
+            moved = rig.calibration(values.retract(step)) != rig.calibration(values)
+            own = np.ones(n_images, dtype=bool)
+            if v.eye is not None:
+                own &= t.image_eye == v.eye
+            if v.stop is not None:
+                own &= t.image_stop == v.stop
+            if v.image is not None:
+                own &= np.arange(n_images) == v.image
+            assert moved.any(axis=(1, 2)).tolist() == own.tolist()
+            group = template.linkage.group[template.linkage.row[v.key]]
+            assert group == (n_stops if v.stop is None else v.stop)
 
 
 @pytest.mark.parametrize("kind", ["hard", "mast", "circle", "free"])

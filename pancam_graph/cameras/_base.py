@@ -64,6 +64,13 @@ class Camera(ABC):
     def pinhole(self) -> "Pinhole":
         """The pinhole of the same camera: what is left without distortion, with the same axes."""
 
+    @abstractmethod
+    def with_calibration(self, calibration: FloatArray) -> "Camera":
+        """The same camera, distortion included, with another K (3, 3) of its pinhole.
+
+        Raises CameraError for focal lengths that are not above 0.
+        """
+
     @property
     def pupil_moves(self) -> bool:
         """Whether rays of different pixels start at different points, so that near and far points differ."""

@@ -106,6 +106,15 @@ class CAHV(Camera):
             skew_px=float(k[0, 1]),
         )
 
+    def with_calibration(self, calibration: FloatArray) -> "CAHV":
+        """The same camera with another K; see `Camera.with_calibration`. Distortion stays about O."""
+        if not (calibration[0, 0] > 0 and calibration[1, 1] > 0):
+            found = f"{calibration[0, 0]} and {calibration[1, 1]}"
+            raise CameraError(f"focal length: expected fx_px and fy_px above 0, found {found}")
+        _, camera_R_frame = self._split_axes()
+        H, V = float(np.linalg.norm(self.A)) * calibration[:2] @ camera_R_frame
+        return replace(self, H=H, V=V)
+
     def split(self) -> tuple["CAHV", gtsam.Pose3]:
         """This camera in its own camera frame, and `frame_T_camera` which brings it back.
 

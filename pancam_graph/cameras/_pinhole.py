@@ -1,6 +1,6 @@
 """Pinhole with five numbers, and the same with Brown distortion."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -58,6 +58,18 @@ class Pinhole(Camera):
             cx_px=self.cx_px,
             cy_px=self.cy_px,
             skew_px=self.skew_px,
+        )
+
+    def with_calibration(self, calibration: FloatArray) -> "Pinhole":
+        """The same camera with another K; see `Camera.with_calibration`."""
+        k = calibration
+        return replace(
+            self,
+            fx_px=float(k[0, 0]),
+            fy_px=float(k[1, 1]),
+            cx_px=float(k[0, 2]),
+            cy_px=float(k[1, 2]),
+            skew_px=float(k[0, 1]),
         )
 
     def distort(self, xy: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -1,9 +1,10 @@
 """Camera poses computed from the mast: the rig as a factor template without flex.
 
-Variables: `M` mast pose per stop (Pose3), `A` pan and tilt of a stop's frames, stacked (vector). What
-telemetry holds (sigma 0) is not a variable.
+Variables: `M` mast pose per stop (Pose3), `A` pan and tilt of a stop's frames, stacked (vector), and those of
+the rig that are free (`_rig_variables`). What telemetry holds (sigma 0) is not a variable.
 """
 
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import gtsam
@@ -11,20 +12,33 @@ import numpy as np
 
 from pancam_graph.elimination import Covariance, Linkage, Posture
 from pancam_graph.factors import Key
-from pancam_graph.geometry import FloatArray, IntArray, compose, pan_tilt_rotation, pose_arrays
+from pancam_graph.geometry import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    compose,
+    pan_tilt_rotation,
+    pose_arrays,
+    twists_in_parent,
+)
 from pancam_graph.graph._template import Factors, FactorTemplate, diagonal_noise
 from pancam_graph.landmarks import CameraViews
+from pancam_graph.sharing import FIXED, Quantity, Sharing
 from pancam_graph.solution import State
 from pancam_graph.traverse import Traverse
 
 __all__ = ["HardTemplate"]
 
+_ANGLES, _MAST, _AXIS, _MOUNT, _CALIBRATION = range(5)
+"""Kinds of segments, in the order that a unit has them."""
+
 
 class HardTemplate(FactorTemplate):
     """The rigid mast: world_T_camera = world_T_mast . Rz(pan) . pan_T_tilt . Ry(-tilt) . head_T_camera."""
 
-    def __init__(self, traverse: Traverse) -> None:
-        super().__init__(traverse, "mast")
+    def __init__(self, traverse: Traverse, sharing: Sharing | None = None) -> None:
+        """`sharing`: of it calibration, mounts and pan_T_tilt; circles follow from mounts here."""
+        super().__init__(traverse, "mast", replace(sharing or Sharing(), radius=FIXED))
         sigmas = np.array([[f.sigma_pan_rad, f.sigma_tilt_rad] for f in traverse.frames])
         self._sigmas = sigmas
         free = sigmas.any(axis=1)
@@ -39,75 +53,133 @@ class HardTemplate(FactorTemplate):
 
     @cached_property
     def linkage(self) -> Linkage:
-        """One unit per frame, for its eyes are rigid to each other; it hangs on its angles and its mast."""
-        t = self.traverse
+        """Units hang on their angles, their mast, and what of the rig is free; see `_segments`."""
+        t, free = self.traverse, self.rig_variables
         keys: list[int] = []
         dims: list[int] = []
         group: list[int] = []
-        angles: dict[int, int] = {}
-        masts: dict[int, int] = {}
+
+        def add(key: int, dim: int, stop: int) -> None:
+            keys.append(key)
+            dims.append(dim)
+            group.append(stop)
+
         for stop, frames in enumerate(self._frames):
             if len(frames):
-                angles[stop] = len(keys)
-                keys.append(self.angles_key(stop))
-                dims.append(2 * len(frames))
-                group.append(stop)
+                add(self.angles_key(stop), 2 * len(frames), stop)
             if isinstance(slot := self.mast(stop), Key):
-                masts[stop] = len(keys)
-                keys.append(slot.key)
-                dims.append(6)
-                group.append(stop)
-        place = {int(f): i for frames in self._frames for i, f in enumerate(frames)}
-        begin, variable, column, width = [0], [], [], []
-        for frame, stop in enumerate(t.frame_stop.tolist()):
-            if frame in place:
-                variable.append(angles[stop])
-                column.append(2 * place[frame])
-                width.append(2)
-            if stop in masts:
-                variable.append(masts[stop])
-                column.append(0)
-                width.append(6)
-            begin.append(len(variable))
+                add(slot.key, 6, stop)
+            for v in free.of_stop(stop):
+                add(v.key, len(v.entries), stop)
+        for v in free.of_stop(None):
+            add(v.key, len(v.entries), len(t.stops))
+
+        row = {key: i for i, key in enumerate(keys)}
+        seg = self._segments
+        variable, column = np.full(seg.present.shape, -1), np.zeros(seg.present.shape, dtype=np.int64)
+        width = np.zeros(seg.present.shape, dtype=np.int64)
+        place = np.zeros(len(t.frames), dtype=np.int64)
+        for frames in self._frames:
+            place[frames] = np.arange(len(frames))
+        stops, stop_of = range(len(t.stops)), t.frame_stop[seg.frame]
+        masts = [slot.key if isinstance(slot := self.mast(stop), Key) else None for stop in stops]
+        column[:, _ANGLES] = 2 * place[seg.frame]
+        variable[:, _ANGLES] = np.array([row.get(self.angles_key(stop), -1) for stop in stops])[stop_of]
+        variable[:, _MAST] = np.array([-1 if key is None else row[key] for key in masts])[stop_of]
+        width[:, _ANGLES], width[:, _MAST] = 2, 6
+        sites: tuple[tuple[int, Quantity, IntArray], ...] = (
+            (_AXIS, "pan_T_tilt", stop_of),
+            (_MOUNT, "mounts", seg.image),
+            (_CALIBRATION, "calibration", seg.image),
+        )
+        for kind, quantity, site in sites:
+            if variables := free.of[quantity]:
+                own_row = np.array([row[v.key] for v in variables])
+                variable[:, kind] = own_row[free.place(quantity)[site]]
+                width[:, kind] = len(variables[0].entries)
         return Linkage(
             key=tuple(keys),
             dim=np.array(dims, dtype=np.int64),
             group=np.array(group, dtype=np.int64),
-            image_unit=t.image_frame,
-            segment_begin=np.array(begin, dtype=np.int64),
-            segment_variable=np.array(variable, dtype=np.int64),
-            segment_column=np.array(column, dtype=np.int64),
-            segment_width=np.array(width, dtype=np.int64),
-            segment_plain=np.array(width, dtype=np.int64) == 6,  # a mast's
+            image_unit=np.arange(len(t.images)) if self._by_image else t.image_frame,
+            segment_begin=np.concatenate([[0], np.cumsum(seg.present.sum(axis=1))]),
+            segment_variable=variable[seg.present],
+            segment_column=column[seg.present],
+            segment_width=width[seg.present],
+            segment_plain=np.nonzero(seg.present)[1] == _MAST,
+        )
+
+    @property
+    def _by_image(self) -> bool:
+        """Whether eyes of one frame move differently; else they are one unit, rigid to each other."""
+        return bool(self.rig_variables.of["mounts"] or self.rig_variables.of["calibration"])
+
+    @cached_property
+    def _segments(self) -> "_Segments":
+        t, free = self.traverse, self.rig_variables
+        frame = t.image_frame if self._by_image else np.arange(len(t.frames))
+        present = np.zeros((len(frame), 5), dtype=bool)
+        present[:, _ANGLES] = np.any(self._sigmas, axis=1)[frame]
+        moved = np.array([isinstance(self.mast(stop), Key) for stop in range(len(t.stops))])
+        present[:, _MAST] = moved[t.frame_stop[frame]]
+        present[:, _AXIS] = bool(free.of["pan_T_tilt"])
+        present[:, _MOUNT] = bool(free.of["mounts"])
+        present[:, _CALIBRATION] = bool(free.of["calibration"])
+        return _Segments(
+            present=present, frame=frame, image=np.arange(len(frame)) if self._by_image else np.zeros(0, int)
         )
 
     def posture(self, values: gtsam.Values) -> Posture:
         """Cameras at the values; a unit's base is the mast of its stop."""
-        t, angles = self.traverse, self._angles(values)
+        t, free, seg = self.traverse, self.rig_variables, self._segments
+        angles, axes = self._angles(values), free.axes(values)
         masts = pose_arrays(self.masts(values))
-        chain = np.zeros((len(self.linkage.segment_width), 6, 6))
-        is_mast = self.linkage.segment_width == 6
-        chain[is_mast] = np.eye(6)
-        free = self._sigmas.any(axis=1)
-        chain[~is_mast, :, :2] = _angle_twists(t, angles[free])
+        frame, stop = seg.frame, t.frame_stop[seg.frame]
+        widest = max([6, *(len(v.entries) for v in free.variables)])
+        rows = 11 if free.of["calibration"] else 6
+        chain = np.zeros((len(seg.present), 5, rows, widest))
+        chain[:, _ANGLES, :6, :2] = _angle_twists(t, angles, axes)[frame]
+        chain[:, _MAST, :6, :6] = np.eye(6)
+        if axes is not None:
+            pan_R = pan_tilt_rotation(angles[frame, 0], np.zeros(len(frame)))
+            pose = compose(pan_R, np.zeros(3), axes[0][stop], axes[1][stop])
+            twists = free.axis_twists(values)[stop]
+            chain[:, _AXIS, :6, : twists.shape[2]] = twists_in_parent(*pose, twists)
+        if free.of["mounts"]:
+            head_R, head_t = self._mast_T_head(angles, axes)
+            pose = compose(head_R[frame], head_t[frame], *free.mounts(values))
+            twists = free.mount_twists(values)
+            chain[:, _MOUNT, :6, : twists.shape[2]] = twists_in_parent(*pose, twists)
+        if free.of["calibration"]:
+            basis = free.basis("calibration")
+            chain[:, _CALIBRATION, 6:, : basis.shape[2]] = basis
         return Posture(
-            views=self._views(masts, angles),
-            unit_R=masts[0][t.frame_stop],
-            unit_t=masts[1][t.frame_stop],
-            chain=chain,
+            views=self._views(masts, angles, values),
+            unit_R=masts[0][stop],
+            unit_t=masts[1][stop],
+            chain=chain[seg.present],
         )
 
     def views(self, values: gtsam.Values) -> CameraViews:
         """Cameras of all images at the values."""
-        return self._views(pose_arrays(self.masts(values)), self._angles(values))
+        return self._views(pose_arrays(self.masts(values)), self._angles(values), values)
 
-    def _views(self, masts: tuple[FloatArray, FloatArray], angles: FloatArray) -> CameraViews:
-        t = self.traverse
+    def _views(
+        self, masts: tuple[FloatArray, FloatArray], angles: FloatArray, values: gtsam.Values
+    ) -> CameraViews:
+        t, free = self.traverse, self.rig_variables
         # Once per frame, not once per image: the eyes share their head.
-        head = compose(masts[0][t.frame_stop], masts[1][t.frame_stop], *t.rig.mast_T_head(*angles.T))
-        mounts = pose_arrays([e.head_T_camera for e in t.rig.eyes])
-        image, eye = t.image_frame, t.image_eye
-        return self.views_of(*compose(head[0][image], head[1][image], mounts[0][eye], mounts[1][eye]))
+        mast_T_head = self._mast_T_head(angles, free.axes(values))
+        head = compose(masts[0][t.frame_stop], masts[1][t.frame_stop], *mast_T_head)
+        image = t.image_frame
+        return self.views_of(*compose(head[0][image], head[1][image], *free.mounts(values)), values)
+
+    def _mast_T_head(
+        self, angles: FloatArray, axes: tuple[FloatArray, FloatArray] | None
+    ) -> tuple[FloatArray, FloatArray]:
+        t = self.traverse
+        own = None if axes is None else (axes[0][t.frame_stop], axes[1][t.frame_stop])
+        return t.rig.mast_T_head(angles[:, 0], angles[:, 1], own)
 
     def _angles(self, values: gtsam.Values) -> FloatArray:
         angles: FloatArray = self.traverse.pan_tilt_rad.copy()
@@ -117,10 +189,13 @@ class HardTemplate(FactorTemplate):
         return angles
 
     def factors(self) -> gtsam.NonlinearFactorGraph:
-        """Priors of the masts and of the angles."""
+        """Priors of the masts, of the angles, and of what of the rig is free."""
         graph = gtsam.NonlinearFactorGraph()
         for stop in range(len(self.traverse.stops)):
             for factor in (*self.stop_factors(stop), *self.angle_factors(stop)):
+                graph.push_back(factor)
+        for owner in (*range(len(self.traverse.stops)), None):
+            for factor in self.rig_variables.prior_factors(owner):
                 graph.push_back(factor)
         return graph
 
@@ -143,6 +218,7 @@ class HardTemplate(FactorTemplate):
                 values.insert(self.angles_key(stop), state.pan_tilt_rad[frames].ravel())
             if isinstance(slot := self.mast(stop), Key):
                 values.insert(slot.key, state.world_T_mast[stop])
+        self.rig_variables.insert(values, state.rig)
         return values
 
     def state(self, values: gtsam.Values, landmarks_m: FloatArray) -> State:
@@ -154,6 +230,7 @@ class HardTemplate(FactorTemplate):
             world_R_camera=views.world_R_camera,
             world_t_camera=views.world_t_camera,
             landmarks_m=landmarks_m,
+            rig=self.rig_variables.correction(values),
         )
 
     def held_columns(self) -> dict[int, IntArray]:
@@ -184,17 +261,36 @@ class HardTemplate(FactorTemplate):
         return sigma
 
 
-def _angle_twists(traverse: Traverse, pan_tilt_rad: FloatArray) -> FloatArray:
-    """Twists of the mast frame (n, 6, 2), rotation first, that move the head as its pan and tilt do.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Segments:
+    """What each unit hangs on: a unit is a frame, or an image where eyes of a frame move differently."""
+
+    present: BoolArray
+    """(units, 5) whether it hangs on its angles, mast, tilt axis, mount and calibration"""
+    frame: IntArray
+    """(units,)"""
+    image: IntArray
+    """(units,) where units are images, else empty"""
+
+
+def _angle_twists(
+    traverse: Traverse, pan_tilt_rad: FloatArray, axes: tuple[FloatArray, FloatArray] | None
+) -> FloatArray:
+    """Twists of the mast frame (frames, 6, 2), rotation first, that move the head as its pan and tilt do.
 
     Pan turns about the mast's z. Tilt turns about minus the tilt axis y, which stands at pan_T_tilt on the
-    pan stage; at the mast's origin such a turn w about a point p moves by p x w.
+    pan stage; at the mast's origin such a turn w about a point p moves by p x w. `axes` are the stops' where
+    they differ from the rig's.
     """
-    axis_T = traverse.rig.pan_T_tilt
     pan = pan_tilt_rad[:, 0]
-    axis_R, axis_t = axis_T.rotation().matrix(), axis_T.translation()
     pan_R = pan_tilt_rotation(pan, np.zeros_like(pan))
-    turn, place = -(pan_R @ axis_R[:, 1]), pan_R @ axis_t
+    if axes is None:
+        axis_T = traverse.rig.pan_T_tilt
+        y, at = axis_T.rotation().matrix()[:, 1], axis_T.translation()
+        turn, place = -(pan_R @ y), pan_R @ at
+    else:
+        y, at = axes[0][traverse.frame_stop, :, 1], axes[1][traverse.frame_stop]
+        turn, place = -(pan_R @ y[:, :, None])[:, :, 0], (pan_R @ at[:, :, None])[:, :, 0]
     twists = np.zeros((len(pan), 6, 2))
     twists[:, 2, 0] = 1.0
     twists[:, :3, 1] = turn

@@ -8,7 +8,9 @@ import gtsam
 import numpy as np
 
 from pancam_graph.geometry import BoolArray, FloatArray
+from pancam_graph.graph._native_calibrations import NativeCalibrations
 from pancam_graph.graph._soft import SoftTemplate
+from pancam_graph.graph._template import read_variable
 from pancam_graph.landmarks import Measurements
 from pancam_graph.losses import SQUARED, Loss
 
@@ -20,12 +22,14 @@ class ExplicitLandmarks:
 
     GTSAM's projections know no distortion: measurements are those of the pinhole of the same camera, and
     the noise model turns residuals back to raw pixels. A landmark that moves behind a camera costs a large
-    constant there, so the optimiser rejects the step.
+    constant there, so the optimiser rejects the step; but where calibrations are free: GTSAM's factor for
+    these says nothing of it, and the caller must look.
     """
 
     def __init__(self, template: SoftTemplate, measurements: Measurements) -> None:
         self.template = template
         self.measurements = measurements
+        self.calibrations = NativeCalibrations(template.rig_variables)
         self._calibration = [
             gtsam.Cal3_S2(p.fx_px, p.fy_px, p.skew_px, p.cx_px, p.cy_px)
             for p in template.traverse.rig.pinholes
@@ -52,12 +56,17 @@ class ExplicitLandmarks:
                 # Not "smart": GTSAM takes a matrix with nothing above its diagonal for a diagonal one.
                 noise = loss.noise_model(gtsam.noiseModel.Gaussian.SqrtInformation(w, False))
             image = int(m.image[i])
+            camera, landmark = self.template.camera_key(image), self.key(int(m.landmark[i]))
+            if self.calibrations.any:
+                own = self.calibrations.key(image)
+                graph.push_back(gtsam.GeneralSFMFactor2Cal3_S2(m.uv_px[i], noise, camera, landmark, own))
+                continue
             graph.push_back(
                 gtsam.GenericProjectionFactorCal3_S2(
                     m.uv_px[i],
                     noise,
-                    self.template.camera_key(image),
-                    self.key(int(m.landmark[i])),
+                    camera,
+                    landmark,
                     self._calibration[eye[image]],
                     False,
                     False,
@@ -80,10 +89,24 @@ class ExplicitLandmarks:
 
     def with_landmarks(self, cameras: gtsam.Values, points_m: FloatArray, present: BoolArray) -> gtsam.Values:
         """The cameras' values together with those of the landmarks that take part."""
-        values = gtsam.Values(cameras)
+        values = self.calibrations.values_of(cameras)
         for j in np.flatnonzero(present):
             values.insert(self.key(int(j)), points_m[j])
         return values
+
+    def only_cameras(self, values: gtsam.Values) -> gtsam.Values:
+        """The template's variables, out of values that hold landmarks too."""
+        kept, free = gtsam.Values(), self.calibrations.free_entries(values)
+        for key in self.template.linkage.key:
+            kept.insert(key, free[key] if key in free else read_variable(values, key))
+        return kept
+
+    def retract(self, cameras: gtsam.Values, step: gtsam.VectorValues, share: float) -> gtsam.Values:
+        """The template's variables moved by a share of a step that may move landmarks too."""
+        own, step = gtsam.VectorValues(), self.calibrations.step(step)
+        for key in cameras.keys():  # noqa: SIM118  gtsam.Values is not a dictionary
+            own.insert(key, share * step.at(key))
+        return cameras.retract(own)
 
     def points_m(self, values: gtsam.Values, present: BoolArray) -> FloatArray:
         """Landmarks (landmarks, 3) from the values; NaN for those that do not take part."""

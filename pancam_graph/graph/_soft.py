@@ -1,7 +1,8 @@
 """Camera poses as variables, tied to the mast: the rig as a factor template with flex.
 
 Variables: `M` mast pose per stop (Pose3), `A` pan and tilt per frame (vector of 2), `X` camera pose per
-image (Pose3), `R` circle radius per eye (double). What telemetry holds (sigma 0) is not a variable.
+image (Pose3), and those of the rig that are free (`_rig_variables`). What telemetry holds (sigma 0) is not a
+variable.
 """
 
 from functools import cached_property
@@ -13,24 +14,23 @@ from pancam_graph.elimination import Linkage, Posture
 from pancam_graph.factors import CircleOffset, Fixed, Key, Slot, circle_factor, mast_factor
 from pancam_graph.geometry import FloatArray, IntArray, pan_tilt_from_rotation, pose_arrays, rz, wrap_angle
 from pancam_graph.graph._options import Flex, Model
-from pancam_graph.graph._template import Factors, FactorTemplate, diagonal_noise, read_variable
+from pancam_graph.graph._template import Factors, FactorTemplate, diagonal_noise
 from pancam_graph.landmarks import CameraViews
+from pancam_graph.sharing import Sharing
 from pancam_graph.solution import State
 from pancam_graph.traverse import Traverse
 
 __all__ = ["SoftTemplate"]
 
-_RADIUS_SIGMA_M = 1e-3
-"""Prior of a circle's radius about the rig's: sources of real rigs differ by millimetres."""
-
-_DIMENSION = {"A": 2, "M": 6, "R": 1, "X": 6}
+_DIMENSION = {"A": 2, "M": 6, "X": 6}
 
 
 class SoftTemplate(FactorTemplate):
     """Factors and variables for camera poses that a tie holds; its sigma stands for the mast's flex."""
 
-    def __init__(self, traverse: Traverse, model: Model, flex: Flex) -> None:
-        super().__init__(traverse, model)
+    def __init__(self, traverse: Traverse, model: Model, flex: Flex, sharing: Sharing | None = None) -> None:
+        """`sharing` as `Sharing.for_model` returns it; None: what the model itself says."""
+        super().__init__(traverse, model, sharing or Sharing().for_model(model))
         self.flex = flex
 
     def pan_tilt(self, frame: int) -> Slot:
@@ -45,55 +45,57 @@ class SoftTemplate(FactorTemplate):
         """Key of an image's camera pose."""
         return int(gtsam.symbol("X", image))
 
-    @staticmethod
-    def radius_key(eye: int) -> int:
-        """Key of the radius of an eye's circle."""
-        return int(gtsam.symbol("R", eye))
-
     @cached_property
     def linkage(self) -> Linkage:
-        """One unit per image, which hangs on its own pose; mast and angles are joined to it by ties alone."""
-        t = self.traverse
+        """One unit per image, which hangs on its own pose and its calibration; ties join it to all else."""
+        t, free = self.traverse, self.rig_variables
         keys: list[int] = []
         group: list[int] = []
         for stop in range(len(t.stops)):
             own = [self.camera_key(int(i)) for i in np.flatnonzero(t.image_stop == stop)]
             slots = [*(self.pan_tilt(int(f)) for f in np.flatnonzero(t.frame_stop == stop)), self.mast(stop)]
             own += [slot.key for slot in slots if isinstance(slot, Key)]
+            own += [v.key for v in free.of_stop(stop)]
             keys += own
             group += [stop] * len(own)
-        if self.model == "circle":
-            radii = [self.radius_key(int(e)) for e in np.unique(t.image_eye)]
-            keys += radii
-            group += [len(t.stops)] * len(radii)
-        row = {key: i for i, key in enumerate(keys)}
-        n = len(t.images)
+        shared = [v.key for v in free.of_stop(None)]
+        keys += shared
+        group += [len(t.stops)] * len(shared)
+        row, n = {key: i for i, key in enumerate(keys)}, len(t.images)
+        dim = _DIMENSION | {chr(gtsam.symbolChr(v.key)): len(v.entries) for v in free.variables}
+        variable = np.array([[row[self.camera_key(i)]] for i in range(n)], dtype=np.int64)
+        width = np.full((n, 1), 6)
+        if free.of["calibration"]:
+            own_K = np.array([row[v.key] for v in free.of["calibration"]])[free.place("calibration")]
+            variable = np.column_stack([variable, own_K])
+            width = np.column_stack([width, np.full(n, free.basis("calibration").shape[2])])
         return Linkage(
             key=tuple(keys),
-            dim=np.array([_DIMENSION[chr(gtsam.symbolChr(key))] for key in keys], dtype=np.int64),
+            dim=np.array([dim[chr(gtsam.symbolChr(key))] for key in keys], dtype=np.int64),
             group=np.array(group, dtype=np.int64),
             image_unit=np.arange(n),
-            segment_begin=np.arange(n + 1),
-            segment_variable=np.array([row[self.camera_key(i)] for i in range(n)], dtype=np.int64),
-            segment_column=np.zeros(n, dtype=np.int64),
-            segment_width=np.full(n, 6),
-            segment_plain=np.ones(n, dtype=bool),
+            segment_begin=np.arange(n + 1) * variable.shape[1],
+            segment_variable=variable.ravel(),
+            segment_column=np.zeros(variable.size, dtype=np.int64),
+            segment_width=width.ravel(),
+            segment_plain=np.tile(np.arange(variable.shape[1]) == 0, n),  # a camera's own pose
         )
 
     def posture(self, values: gtsam.Values) -> Posture:
         """Cameras at the values; a unit's base is the camera itself."""
-        views = self.views(values)
-        return Posture(
-            views=views,
-            unit_R=views.world_R_camera,
-            unit_t=views.world_t_camera,
-            chain=np.broadcast_to(np.eye(6), (len(self.traverse.images), 6, 6)),
-        )
+        views, n = self.views(values), len(self.traverse.images)
+        chain = np.broadcast_to(np.eye(6), (n, 6, 6))
+        if self.rig_variables.of["calibration"]:
+            basis = self.rig_variables.basis("calibration")
+            chain = np.zeros((2 * n, 11, 6))
+            chain[::2, :6] = np.eye(6)
+            chain[1::2, 6:, : basis.shape[2]] = basis
+        return Posture(views=views, unit_R=views.world_R_camera, unit_t=views.world_t_camera, chain=chain)
 
     def views(self, values: gtsam.Values) -> CameraViews:
         """Cameras of all images at the values."""
         poses = [values.atPose3(self.camera_key(i)) for i in range(len(self.traverse.images))]
-        return self.views_of(*pose_arrays(poses))
+        return self.views_of(*pose_arrays(poses), values)
 
     def frame_factors(self, frame: int) -> Factors:
         """The prior of a frame's pan and tilt."""
@@ -107,50 +109,27 @@ class SoftTemplate(FactorTemplate):
         """The tie of an image's camera pose to its mast, and to its circle where the model says so."""
         traverse = self.traverse
         frame, eye = int(traverse.image_frame[image]), int(traverse.image_eye[image])
-        camera, mast = Key(self.camera_key(image)), self.mast(int(traverse.frame_stop[frame]))
-        angles, mount = self.pan_tilt(frame), traverse.rig.eyes[eye].head_T_camera
-        pan_T_tilt, flex = traverse.rig.pan_T_tilt, self.flex
+        stop, free, flex = int(traverse.frame_stop[frame]), self.rig_variables, self.flex
+        camera, mast, angles = Key(self.camera_key(image)), self.mast(stop), self.pan_tilt(frame)
+        mount, axis = free.mount_slot(image), free.axis_slot(stop)
         if self.model != "circle":
             sigmas = np.repeat([flex.rotation_rad, flex.translation_m], 3)
-            return [mast_factor(diagonal_noise(sigmas), camera, mast, angles, Fixed(mount), pan_T_tilt)]
+            return [mast_factor(diagonal_noise(sigmas), camera, mast, angles, mount, axis)]
 
         # The chain ties the rotation, loosely; the circle alone ties the centre.
         entry = traverse.frames[frame]
         radius, phase, height = traverse.rig.circle(eye, entry.tilt_rad)
-        offset = CircleOffset(
-            height_m=height, phase_rad=phase, radius_m=radius - float(self.reference_radius_m[eye])
-        )
+        slot, reference = free.radius_slot(image)
+        offset = CircleOffset(height_m=height, phase_rad=phase, radius_m=radius - reference)
         # The measured tilt places the circle; its error moves the centre by the eye's arm.
-        arm = float(np.linalg.norm(mount.translation()[[0, 2]]))
+        arm = float(np.linalg.norm(traverse.rig.eyes[eye].head_T_camera.translation()[[0, 2]]))
         sigma = float(np.hypot(flex.translation_m, arm * entry.sigma_tilt_rad))
         loose = diagonal_noise(np.repeat([flex.rotation_rad, 1e3], 3))
+        on_circle = gtsam.noiseModel.Isotropic.Sigma(3, sigma)
         return [
-            mast_factor(loose, camera, mast, angles, Fixed(mount), pan_T_tilt),
-            circle_factor(
-                gtsam.noiseModel.Isotropic.Sigma(3, sigma),
-                camera,
-                mast,
-                Key(self.radius_key(eye)),
-                angles,
-                offset,
-            ),
+            mast_factor(loose, camera, mast, angles, mount, axis),
+            circle_factor(on_circle, camera, mast, slot, angles, offset),
         ]
-
-    def shared_factors(self) -> Factors:
-        """Priors of what all stops share: the circles' radii."""
-        if self.model != "circle":
-            return []
-        noise = gtsam.noiseModel.Isotropic.Sigma(1, _RADIUS_SIGMA_M)
-        return [
-            gtsam.PriorFactorDouble(self.radius_key(eye), float(self.reference_radius_m[eye]), noise)
-            for eye in np.unique(self.traverse.image_eye)
-        ]
-
-    @cached_property
-    def reference_radius_m(self) -> FloatArray:
-        """(eyes,) the rig's radius of each eye's circle at the mean measured tilt."""
-        tilt = float(np.mean(self.traverse.pan_tilt_rad[:, 1]))
-        return np.array([self.traverse.rig.circle(e, tilt)[0] for e in range(len(self.traverse.rig.eyes))])
 
     def factors(self) -> gtsam.NonlinearFactorGraph:
         """All factors but those of landmarks."""
@@ -160,7 +139,7 @@ class SoftTemplate(FactorTemplate):
             *(self.stop_factors(i) for i in range(len(t.stops))),
             *(self.frame_factors(i) for i in range(len(t.frames))),
             *(self.image_factors(i) for i in range(len(t.images))),
-            self.shared_factors(),
+            *(self.rig_variables.prior_factors(i) for i in (*range(len(t.stops)), None)),
         ]
         for group in groups:
             for factor in group:
@@ -179,25 +158,8 @@ class SoftTemplate(FactorTemplate):
         for i in range(len(t.images)):
             pose = gtsam.Pose3(gtsam.Rot3(state.world_R_camera[i]), state.world_t_camera[i])
             values.insert(self.camera_key(i), pose)
-        if self.model == "circle":
-            for eye in np.unique(t.image_eye):
-                values.insert(self.radius_key(eye), float(self.reference_radius_m[eye]))
+        self.rig_variables.insert(values, state.rig)
         return values
-
-    def only_cameras(self, values: gtsam.Values) -> gtsam.Values:
-        """The variables of this template out of values that hold landmarks too."""
-        kept = gtsam.Values()
-        for key in self.linkage.key:
-            kept.insert(key, read_variable(values, key))
-        return kept
-
-    @staticmethod
-    def retract(values: gtsam.Values, step: gtsam.VectorValues, share: float) -> gtsam.Values:
-        """The variables of this template moved by a share of a step that may move landmarks too."""
-        own = gtsam.VectorValues()
-        for key in values.keys():  # noqa: SIM118  gtsam.Values is not a dictionary
-            own.insert(key, share * step.at(key))
-        return values.retract(own)
 
     def state(self, values: gtsam.Values, landmarks_m: FloatArray) -> State:
         """The state at values of the variables; inverse of `values`.
@@ -222,6 +184,7 @@ class SoftTemplate(FactorTemplate):
             world_R_camera=rotations,
             world_t_camera=centres,
             landmarks_m=landmarks_m,
+            rig=self.rig_variables.correction(values),
         )
 
     def held_columns(self) -> dict[int, IntArray]:

@@ -11,7 +11,9 @@ from pancam_graph.elimination import Covariance, Linkage, Posture
 from pancam_graph.factors import Fixed, Key, Slot
 from pancam_graph.geometry import FloatArray, IntArray
 from pancam_graph.graph._options import Model
+from pancam_graph.graph._rig_variables import RigVariables
 from pancam_graph.landmarks import CameraViews
+from pancam_graph.sharing import Sharing
 from pancam_graph.solution import State
 from pancam_graph.traverse import Stop, Traverse
 
@@ -23,12 +25,10 @@ Factors = list[gtsam.NonlinearFactor]
 class FactorTemplate(ABC):
     """Factors and variables of a traverse's rig for one model; landmarks are added by others."""
 
-    def __init__(self, traverse: Traverse, model: Model) -> None:
+    def __init__(self, traverse: Traverse, model: Model, sharing: Sharing) -> None:
         self.traverse = traverse
         self.model: Model = model
-        self._calibration = np.array([p.calibration_matrix for p in traverse.rig.pinholes])[
-            traverse.image_eye
-        ]
+        self.rig_variables = RigVariables(traverse, sharing)
 
     @property
     @abstractmethod
@@ -121,10 +121,13 @@ class FactorTemplate(ABC):
                 out[i] = covariance.block(i, i)[rows, rows]
         return out
 
-    def views_of(self, world_R_camera: FloatArray, world_t_camera: FloatArray) -> CameraViews:
-        """Cameras of all images from their poses (images, 3, 3), (images, 3)."""
+    def views_of(
+        self, world_R_camera: FloatArray, world_t_camera: FloatArray, values: gtsam.Values
+    ) -> CameraViews:
+        """Cameras of all images from their poses (images, 3, 3), (images, 3) and the values' calibrations."""
+        calibration = self.rig_variables.calibration(values)
         return CameraViews(
-            world_R_camera=world_R_camera, world_t_camera=world_t_camera, calibration=self._calibration
+            world_R_camera=world_R_camera, world_t_camera=world_t_camera, calibration=calibration
         )
 
 
@@ -152,8 +155,10 @@ def diagonal_noise(sigmas: FloatArray) -> gtsam.noiseModel.Base:
 
 
 def read_variable(values: gtsam.Values, key: int) -> Any:
-    """Value of a template's variable: gtsam.Pose3, vector or number, by the letter of its key."""
+    """Value of a variable by the letter of its key: gtsam.Pose3, vector or number; of `C` five numbers."""
     kind = chr(gtsam.symbolChr(key))
     if kind in "MX":
         return values.atPose3(key)
-    return values.atVector(key) if kind == "A" else values.atDouble(key)
+    if kind == "C":
+        return values.atCal3_S2(key).vector()
+    return values.atDouble(key) if kind == "R" else values.atVector(key)

@@ -4,6 +4,8 @@ Keys and units are those of the file contract. Every model is strict: no unknown
 string, nothing that is not finite. References between entries are the data model's business.
 """
 
+import math
+from dataclasses import fields
 from typing import Annotated, Any, Literal
 
 import gtsam
@@ -14,6 +16,7 @@ from pancam_graph.errors import GeometryError, InputError
 from pancam_graph.geometry import pose_from_wxyz, wxyz_from_rotation
 from pancam_graph.io._json import prefixed
 from pancam_graph.rigs import Eye, Rig, rig_template
+from pancam_graph.sharing import Freedom, Sharing
 
 __all__ = [
     "SOLUTION_FORMAT",
@@ -24,6 +27,7 @@ __all__ = [
     "ImageEntry",
     "OwnRigEntry",
     "PoseEntry",
+    "SharingEntry",
     "StopEntry",
     "TemplateRigEntry",
     "TraverseFile",
@@ -237,6 +241,55 @@ class ImageEntry(Entry):
     file: Label | None = None
 
 
+class FreedomEntry(Entry):
+    """How free a quantity of the rig is."""
+
+    scope: str
+    free: list[str] | None = None
+    sigma: dict[str, float | None] = {}
+    """Of the priors; null: none."""
+
+    def freedom(self) -> Freedom:
+        """The freedom. `Sharing` checks it."""
+        sigma = {name: math.inf if value is None else value for name, value in self.sigma.items()}
+        return Freedom(
+            scope=self.scope,  # type: ignore[arg-type]  # checked by Sharing
+            free=None if self.free is None else tuple(self.free),
+            sigma=sigma,
+        )
+
+    @staticmethod
+    def of(freedom: Freedom | None) -> "FreedomEntry | None":
+        """The entry of a freedom."""
+        if freedom is None:
+            return None
+        sigma = {name: value if math.isfinite(value) else None for name, value in freedom.sigma.items()}
+        free = None if freedom.free is None else list(freedom.free)
+        return FreedomEntry(scope=freedom.scope, free=free, sigma=sigma)
+
+
+class SharingEntry(Entry):
+    """What of the rig is free, and who shares it."""
+
+    calibration: FreedomEntry | None = None
+    mounts: FreedomEntry | None = None
+    pan_T_tilt: FreedomEntry | None = None
+    radius: FreedomEntry | None = None
+
+    def sharing(self) -> Sharing:
+        """The sharing. Raises InputError for what contradicts itself."""
+        given = {field.name: getattr(self, field.name) for field in fields(Sharing)}
+        return Sharing(**{name: entry.freedom() for name, entry in given.items() if entry is not None})
+
+    @staticmethod
+    def of(sharing: Sharing) -> "SharingEntry":
+        """The entry of a sharing; it names what is not as it would be without."""
+        quantities = [field.name for field in fields(Sharing)]
+        given = {name: FreedomEntry.of(getattr(sharing, name)) for name in quantities}
+        usual = {name: FreedomEntry.of(getattr(Sharing(), name)) for name in quantities}
+        return SharingEntry(**{name: entry for name, entry in given.items() if entry != usual[name]})
+
+
 class TraverseFile(Entry):
     """`traverse.json`."""
 
@@ -251,6 +304,7 @@ class TraverseFile(Entry):
     frames: list[FrameEntry]
     images: list[ImageEntry]
     observations: Label | None
+    sharing: SharingEntry | None = None
 
 
 def camera_entry(eye: Eye) -> CameraEntry:

@@ -72,6 +72,20 @@ class SolvedImageEntry(Entry):
     observations: int
 
 
+class RefinedEntry(Entry):
+    """An entry of the rig that was free; null where there is none: no such owner, or not finite."""
+
+    quantity: Literal["calibration", "mounts", "pan_T_tilt", "radius"]
+    entry: str
+    camera: str | None
+    stop: str | None
+    image: str | None
+    nominal: float | None
+    change: float | None
+    sigma: float | None
+    prior_sigma: float | None
+
+
 class SolutionFile(Entry):
     """`solution.json`."""
 
@@ -91,7 +105,9 @@ class SolutionFile(Entry):
     frames: list[SolvedFrameEntry]
     images: list[SolvedImageEntry]
     cameras: list[CameraEntry]
-    """As the cameras of a rig in `traverse.json`."""
+    """As the cameras of a rig in `traverse.json`, refined where an eye has one correction for all images."""
+    refined: list[RefinedEntry] = Field(default_factory=list)
+    """Entries of the rig that were free; no such key where none was."""
     warnings: list[str]
     cross_validation: CrossValidationEntry | None = None
     """Where it was asked for; else the key is missing."""
@@ -105,8 +121,8 @@ def read_solution_json(path: Path | str) -> SolutionFile:
 
 def solution_json(solution: Solution) -> bytes:
     """A solution as the content of `solution.json`; null in place of what is not finite."""
-    without = {"cross_validation"} if solution.cross_validation is None else None
-    data = solution_file(solution).model_dump(exclude=without)
+    missing = {"refined": not solution.refined, "cross_validation": solution.cross_validation is None}
+    data = solution_file(solution).model_dump(exclude={name for name, gone in missing.items() if gone})
     return f"{json.dumps(data, indent=1, allow_nan=False, ensure_ascii=False)}\n".encode()
 
 
@@ -154,7 +170,21 @@ def solution_file(solution: Solution) -> SolutionFile:
         stops=stops,
         frames=frames,
         images=_images(solution),
-        cameras=[camera_entry(e) for e in traverse.rig.eyes],
+        cameras=[camera_entry(e) for e in solution.rig.eyes],
+        refined=[
+            RefinedEntry(
+                quantity=r.quantity,
+                entry=r.entry,
+                camera=r.camera,
+                stop=r.stop,
+                image=r.image,
+                nominal=r.nominal,
+                change=_number(r.change),
+                sigma=_number(r.sigma),
+                prior_sigma=_number(r.prior_sigma),
+            )
+            for r in solution.refined
+        ],
         # What the reader noticed comes first, once, whether or not the solver passed it on.
         warnings=list(dict.fromkeys([*traverse.warnings, *solution.warnings])),
         cross_validation=None if validation is None else CrossValidationEntry.of(validation, traverse),

@@ -15,6 +15,7 @@ from pancam_graph.io._schema import (
     FrameEntry,
     ImageEntry,
     PoseEntry,
+    SharingEntry,
     StopEntry,
     TraverseFile,
     rig_entry,
@@ -87,7 +88,10 @@ def write_traverse(traverse: Traverse, folder: Path | str, *, overwrite: bool = 
     observations = traverse.observations
     with refused_by_schema(path):
         entries = _entries(traverse)
-    text = json.dumps(entries.model_dump(), indent=1, allow_nan=False, ensure_ascii=False)
+    content = entries.model_dump(exclude={"sharing"})
+    if entries.sharing is not None:
+        content["sharing"] = entries.sharing.model_dump(exclude_defaults=True)
+    text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for source, target in copies:
@@ -116,6 +120,7 @@ def _traverse(entries: TraverseFile, folder: Path) -> Traverse:
         stops=stops,
         frames=tuple(Frame(**f.model_dump()) for f in entries.frames),
         images=tuple(Image(**i.model_dump()) for i in entries.images),
+        sharing=None if entries.sharing is None else entries.sharing.sharing(),
         folder=folder,
     )
 
@@ -148,6 +153,7 @@ def _entries(traverse: Traverse) -> TraverseFile:
         frames=frames,
         images=[ImageEntry(id=i.id, frame=i.frame, camera=i.camera, file=i.file) for i in traverse.images],
         observations=None if traverse.observations is None else _OBSERVATIONS,
+        sharing=None if traverse.sharing is None else SharingEntry.of(traverse.sharing),
     )
 
 

@@ -17,8 +17,8 @@ from pancam_graph.report._numbers import Json, fixed, short
 from pancam_graph.report._scene import make_masts, make_scene
 from pancam_graph.report._script import SCRIPT
 from pancam_graph.report._style import STYLE
-from pancam_graph.report._tables import image_table, stop_table
-from pancam_graph.report._template import NO_VECTORS, PAGE, SCENE_CONTROLS, VECTOR_CONTROLS
+from pancam_graph.report._tables import image_table, rig_table, stop_table
+from pancam_graph.report._template import NO_VECTORS, PAGE, RIG, SCENE_CONTROLS, VECTOR_CONTROLS
 from pancam_graph.report._terrain import make_terrain
 from pancam_graph.solution import Solution
 
@@ -68,6 +68,7 @@ def make_page(solution: Solution) -> str:
         cross_validation=cross_validation_section(solution.cross_validation, solution.traverse),
         images=image_table(solution, table),
         stops=stop_table(solution),
+        rig=RIG.format(table=rig_table(solution)) if solution.refined else "",
         plotly=_packed_plotly(),
         figures=_packed(json.dumps(data, separators=(",", ":"), allow_nan=False)),
         script=SCRIPT,

@@ -12,7 +12,7 @@ from pancam_graph.report._map import translation_covariance_in_world
 from pancam_graph.report._numbers import fixed
 from pancam_graph.solution import Solution
 
-__all__ = ["image_table", "stop_table", "table"]
+__all__ = ["image_table", "rig_table", "stop_table", "table"]
 
 _SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 
@@ -110,3 +110,40 @@ def stop_table(solution: Solution) -> str:
             )
         )
     return table("Stops", columns, rows, texts=1)
+
+
+_UNITS = {"px": ("px", 1.0, 3), "rad": ("°", float(np.rad2deg(1.0)), 4), "m": ("mm", 1e3, 2)}
+"""By the end of an entry's name: the unit to show, how many of it there are in the entry's own, decimals."""
+
+
+def rig_table(solution: Solution) -> str:
+    """One row per entry of the rig that was free: what the input says, by how much it is off, how sure."""
+    columns = (
+        ("quantity", "what of the rig"),
+        ("of", "camera, stop or image that has the number; all: one for the whole traverse"),
+        ("entry", "turns and shifts are in the frame of the camera, or of the tilt axis"),
+        ("unit", "of all numbers in this row"),
+        ("input", "as the input has it"),
+        ("change", "adjusted minus input"),
+        (f"{_SIGMA}", "formal standard deviation"),
+        (f"prior {_SIGMA}", "standard deviation of the prior about the input"),
+    )
+    rows = []
+    for r in solution.refined:
+        name, _, ending = r.entry.rpartition("_")
+        unit, factor, decimals = _UNITS.get(ending, ("", 1.0, 6))
+        owners = (r.image,) if r.image is not None else (r.camera, r.stop)
+        prior = fixed(factor * r.prior_sigma, decimals) if np.isfinite(r.prior_sigma) else "none"
+        rows.append(
+            (
+                r.quantity,
+                ", ".join(owner for owner in owners if owner is not None) or "all",
+                name or r.entry,
+                unit,
+                "differs" if r.nominal is None else fixed(factor * r.nominal, decimals),
+                fixed(factor * r.change, decimals),
+                fixed(factor * r.sigma, decimals),
+                prior,
+            )
+        )
+    return table("Rig", columns, rows, texts=4)

@@ -1,6 +1,6 @@
 """The frame of the page, and the controls of its figures."""
 
-__all__ = ["NO_VECTORS", "PAGE", "SCENE_CONTROLS", "VECTOR_CONTROLS"]
+__all__ = ["NO_VECTORS", "PAGE", "RIG", "SCENE_CONTROLS", "VECTOR_CONTROLS"]
 
 SCENE_CONTROLS = (
     '<div class="controls"><label>View <select id="scene-view"></select></label>'
@@ -16,6 +16,13 @@ NO_VECTORS = (
     "<section>\n<h2>Residuals in single images</h2>\n"
     "<p>No image has observations, so there is nothing to draw.</p>\n</section>"
 )
+RIG = """<section>
+<h2>Rig</h2>
+{table}
+<p class="caption">Numbers of the rig that were estimated with all else. Where sigma is that of the prior, the
+images said nothing of the entry.</p>
+</section>
+"""
 PAGE = """<!DOCTYPE html>
 <html lang="en">
 <head>
@@ -54,7 +61,7 @@ script-src 'unsafe-inline' 'unsafe-eval'; img-src data: blob:; connect-src data:
 <p class="caption">Shift and turn count from the pose that the input gave; roll, pitch and heading are turns
 about the mast's x (forward), y (left) and z (up) axes.</p>
 </section>
-<section class="notes">
+{rig}<section class="notes">
 <h2>How to read this</h2>
 <ul>
 <li>Sigmas and ellipses are <em>formal</em>: they follow from the noise assumed for pixels, pointing and

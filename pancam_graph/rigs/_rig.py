@@ -100,10 +100,18 @@ class Rig:
         """The distortion-free pinhole of each eye."""
         return tuple(e.camera.pinhole for e in self.eyes)
 
-    def mast_T_head(self, pan_rad: FloatArray, tilt_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Head poses in the mast frame for n pointings: rotations (n, 3, 3), translations (n, 3)."""
+    def mast_T_head(
+        self,
+        pan_rad: FloatArray,
+        tilt_rad: FloatArray,
+        pan_T_tilt: tuple[FloatArray, FloatArray] | None = None,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Head poses in the mast frame for n pointings: rotations (n, 3, 3), translations (n, 3).
+
+        `pan_T_tilt` are tilt axes (n, 3, 3), (n, 3) in place of the rig's own.
+        """
         pan_R, zero = pan_tilt_rotation(pan_rad, np.zeros_like(pan_rad)), np.zeros((len(pan_rad), 3))
-        axis_R, axis_t = self.pan_T_tilt.rotation().matrix(), self.pan_T_tilt.translation()
+        axis_R, axis_t = pan_T_tilt or (self.pan_T_tilt.rotation().matrix(), self.pan_T_tilt.translation())
         tilt_R = pan_tilt_rotation(np.zeros_like(tilt_rad), tilt_rad)
         return compose(*compose(pan_R, zero, axis_R, axis_t), tilt_R, zero)
 

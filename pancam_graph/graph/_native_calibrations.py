@@ -1,0 +1,146 @@
+"""Free calibrations as GTSAM's own variables, which its projection factors want: `C`, of type Cal3_S2.
+
+A variable `K` of free entries becomes one `C` for each eye that shares it, with a factor that holds what `K`
+does not move and has its prior.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from scipy.linalg import null_space
+
+from pancam_graph.geometry import FloatArray, IntArray
+from pancam_graph.graph._rig_variables import RigVariable, RigVariables
+
+__all__ = ["NativeCalibrations"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Native:
+    """What stands for one variable `K` of n columns."""
+
+    variable: RigVariable
+    keys: tuple[int, ...]
+    nominal: FloatArray
+    """(5 keys,) fx, fy, skew, cx and cy of each"""
+    along: FloatArray
+    """(n, 5 keys) takes changes of these to K"""
+    across: FloatArray
+    """(5 keys - n, 5 keys) what K does not move"""
+    basis: FloatArray
+    """(5 keys, n) takes K to these changes"""
+
+
+class NativeCalibrations:
+    """The `C` variables of a rig's free calibrations; none where they are fixed."""
+
+    def __init__(self, rig: RigVariables) -> None:
+        self._native: list[_Native] = []
+        variables, eyes = rig.of["calibration"], rig.traverse.image_eye
+        self._key_of_image = np.zeros(len(eyes), dtype=np.uint64)
+        self.any = bool(variables)
+        number = 0
+        for i, v in enumerate(variables):
+            own = rig.place("calibration") == i
+            keys, nominal, basis = [], [], []
+            for eye in np.unique(eyes[own]):
+                images = own & (eyes == eye)
+                keys.append(int(gtsam.symbol("C", number)))
+                number += 1
+                self._key_of_image[images] = keys[-1]
+                basis.append(rig.basis("calibration")[np.argmax(images)])
+                pinhole = rig.traverse.rig.pinholes[int(eye)]
+                nominal.append(gtsam.Cal3_S2(*_numbers(pinhole.calibration_matrix)).vector())
+            stacked = np.vstack(basis)
+            self._native.append(
+                _Native(
+                    variable=v,
+                    keys=tuple(keys),
+                    nominal=np.concatenate(nominal),
+                    along=np.linalg.pinv(stacked),
+                    across=null_space(stacked.T).T,
+                    basis=stacked,
+                )
+            )
+
+    def key(self, image: int) -> int:
+        """Key of an image's calibration."""
+        return int(self._key_of_image[image])
+
+    def in_place(self, factors: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
+        """A template's factors, those of `K` replaced by those of `C`."""
+        if not self.any:
+            return gtsam.NonlinearFactorGraph(factors)
+        known = {n.variable.key for n in self._native}
+        graph = gtsam.NonlinearFactorGraph()
+        for i in range(factors.size()):
+            if known.isdisjoint(factors.at(i).keys()):
+                graph.push_back(factors.at(i))
+        for n in self._native:
+            graph.push_back(_hold(n))
+        return graph
+
+    def values_of(self, cameras: gtsam.Values) -> gtsam.Values:
+        """A template's values, `K` replaced by `C`."""
+        values = gtsam.Values(cameras)
+        for n in self._native:
+            numbers = n.nominal + n.basis @ values.atVector(n.variable.key)
+            values.erase(n.variable.key)
+            for key, own in zip(n.keys, numbers.reshape(-1, 5), strict=True):
+                values.insert(key, gtsam.Cal3_S2(*own))
+        return values
+
+    def free_entries(self, values: gtsam.Values) -> dict[int, FloatArray]:
+        """Each `K` (n,) by its key, from values that hold `C`."""
+        return {
+            n.variable.key: n.along
+            @ (np.concatenate([values.atCal3_S2(key).vector() for key in n.keys]) - n.nominal)
+            for n in self._native
+        }
+
+    def held(self, held: Mapping[int, IntArray]) -> dict[int, IntArray]:
+        """By key, tangent components that factors hold: those given, and those of `C` that `K` does not move.
+
+        A factor on both focal lengths moves two components along one line: neither counts as held.
+        """
+        out = dict(held)
+        for n in self._native:
+            still = ~np.any(n.basis != 0, axis=1)
+            for key, own in zip(n.keys, still.reshape(-1, 5), strict=True):
+                out[key] = np.flatnonzero(own)
+        return out
+
+    def step(self, step: gtsam.VectorValues) -> gtsam.VectorValues:
+        """A step of `C` and whatever else as one of `K` and the same."""
+        out = gtsam.VectorValues(step)
+        for n in self._native:
+            out.insert(n.variable.key, n.along @ np.concatenate([step.at(key) for key in n.keys]))
+        return out
+
+
+def _numbers(calibration: FloatArray) -> tuple[float, float, float, float, float]:
+    k = calibration
+    return float(k[0, 0]), float(k[1, 1]), float(k[0, 1]), float(k[0, 2]), float(k[1, 2])
+
+
+def _hold(native: _Native) -> gtsam.CustomFactor:
+    """The prior of K on what moves along with it, and all else held exactly."""
+    rows = np.vstack([native.along, native.across])
+    sigmas = np.concatenate([native.variable.sigma, np.zeros(len(native.across))])
+    noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+    if len(native.across):
+        noise = gtsam.noiseModel.Constrained.MixedSigmas(np.full(len(sigmas), 1e3), sigmas)
+    columns = [np.asfortranarray(rows[:, 5 * i : 5 * i + 5]) for i in range(len(native.keys))]
+
+    def evaluate(
+        _this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
+    ) -> FloatArray:
+        numbers = np.concatenate([values.atCal3_S2(key).vector() for key in native.keys])
+        if jacobians is not None:
+            for i, column in enumerate(columns):
+                jacobians[i] = column
+        return np.asarray(rows @ (numbers - native.nominal))
+
+    return gtsam.CustomFactor(noise, list(native.keys), evaluate)

@@ -1,0 +1,383 @@
+"""What of a rig is estimated, as variables: one vector of free entries per owner (thesis 4.3, 5.4).
+
+Variables: `K` calibration, `E` mount (`head_T_camera`), `T` tilt axis (`pan_T_tilt`): vectors of corrections
+to the rig's own values, of their free entries only, so that what is held is no variable; `R` radius of a
+circle (double).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import gtsam
+import numpy as np
+
+from pancam_graph.cameras import Camera
+from pancam_graph.elimination import Covariance, Linkage
+from pancam_graph.factors import Corrected, Fixed, Key, PoseSlot, Slot
+from pancam_graph.geometry import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    corrected_poses,
+    correction_twists,
+    pose_arrays,
+)
+from pancam_graph.sharing import ENTRIES, FOCAL, Freedom, Quantity, Sharing, default_sigma
+from pancam_graph.solution import Refined, RigCorrection
+from pancam_graph.traverse import Traverse
+
+__all__ = ["RigVariable", "RigVariables"]
+
+_LETTER: Mapping[Quantity, str] = {"calibration": "K", "mounts": "E", "pan_T_tilt": "T", "radius": "R"}
+_K_ROW, _K_COLUMN = [0, 1, 0, 0, 1], [0, 1, 1, 2, 2]
+"""Where fx, fy, skew, cx and cy stand in K."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RigVariable:
+    """A correction, and who shares it: all, but for what is given here."""
+
+    quantity: Quantity
+    key: int
+    entries: tuple[str, ...]
+    sigma: FloatArray
+    """(entries,) of the prior; infinite: none"""
+    eye: int | None
+    stop: int | None
+    image: int | None
+    first: int
+    """The first image (of pan_T_tilt: stop) that has it"""
+    nominal: tuple[float | None, ...]
+    """(entries,) what the rig says; None where it does not say the same of all who share it"""
+
+
+class RigVariables:
+    """The free entries of a traverse's rig, and what their values make of its cameras.
+
+    Corrections of calibration, mounts and radius are per image, those of pan_T_tilt per stop.
+    """
+
+    def __init__(self, traverse: Traverse, sharing: Sharing) -> None:
+        """`sharing` as `Sharing.for_model` returns it."""
+        t = self.traverse = traverse
+        self.sharing = sharing
+        self._K = np.array([p.calibration_matrix for p in t.rig.pinholes])[t.image_eye]
+        mounts_R, mounts_t = pose_arrays([e.head_T_camera for e in t.rig.eyes])
+        self._mounts = mounts_R[t.image_eye], mounts_t[t.image_eye]
+        self._place: dict[Quantity, IntArray] = {}
+        self._basis: dict[Quantity, FloatArray] = {}
+        self.of: dict[Quantity, tuple[RigVariable, ...]] = {}
+        """Variables of each quantity"""
+        for quantity in _LETTER:
+            freedom: Freedom | None = getattr(sharing, quantity)
+            self.of[quantity] = self._variables(quantity, freedom or Freedom())
+
+    # --- which there are ---
+
+    def _variables(self, quantity: Quantity, freedom: Freedom) -> tuple[RigVariable, ...]:
+        entries, scope, t = freedom.entries(quantity), freedom.scope, self.traverse
+        if not entries:
+            return ()
+        axis = quantity == "pan_T_tilt"
+        eye, stop = (None, np.arange(len(t.stops))) if axis else (t.image_eye, t.image_stop)
+        n_sites = len(stop)
+        owner = np.zeros(n_sites, dtype=np.int64)
+        if scope == "image":
+            owner = np.arange(n_sites)
+        elif scope == "stop":
+            owner = stop if eye is None else stop * len(t.rig.eyes) + eye
+        elif scope == "eye" and eye is not None:
+            owner = eye
+        numbers, firsts, place = np.unique(owner, return_index=True, return_inverse=True)
+        self._place[quantity] = place.astype(np.int64)
+        self._basis[quantity] = self._basis_of(quantity, entries, n_sites)
+        nominal = self._nominal(quantity, entries, n_sites)
+        out = []
+        for i, (number, first) in enumerate(zip(numbers, firsts, strict=True)):
+            own = place == i
+            focal = 1.0 if axis else float(np.mean(self._K[own, 0, 0]))
+            out.append(
+                RigVariable(
+                    quantity=quantity,
+                    key=int(gtsam.symbol(_LETTER[quantity], int(number))),
+                    entries=entries,
+                    sigma=np.array([freedom.sigma.get(e, default_sigma(e, focal)) for e in entries]),
+                    eye=None if eye is None or scope == "all" else int(eye[first]),
+                    stop=int(stop[first]) if scope in {"stop", "image"} else None,
+                    image=int(first) if scope == "image" else None,
+                    first=int(first),
+                    nominal=tuple(
+                        float(one) if np.all(of_entry == one) else None
+                        for of_entry, one in zip(nominal[own].T, nominal[first], strict=True)
+                    ),
+                )
+            )
+        return tuple(out)
+
+    def _basis_of(self, quantity: Quantity, free: tuple[str, ...], n_sites: int) -> FloatArray:
+        """(sites, entries, columns) takes free entries to all entries of the correction."""
+        one = np.array([[float(name == column) for column in free] for name in ENTRIES[quantity]])
+        out: FloatArray = np.broadcast_to(one, (n_sites, *one.shape)).copy()
+        if FOCAL in free:
+            # A factor 1 + f on both focal lengths changes each by f times what the rig says.
+            out[:, :2, free.index(FOCAL)] = self._K[:, [0, 1], [0, 1]]
+        return out
+
+    def _nominal(self, quantity: Quantity, free: tuple[str, ...], n_sites: int) -> FloatArray:
+        """(sites, columns) what the rig says of the free entries; what is 0 without a correction is 0."""
+        out: FloatArray = np.zeros((n_sites, len(free)))
+        for j, entry in enumerate(free):
+            if entry == FOCAL:
+                out[:, j] = 1.0
+            elif quantity == "calibration":
+                i = ENTRIES[quantity].index(entry)
+                out[:, j] = self._K[:, _K_ROW[i], _K_COLUMN[i]]
+            elif quantity == "radius":
+                out[:, j] = self._radius_m[self.traverse.image_eye]
+        return out
+
+    @cached_property
+    def _radius_m(self) -> FloatArray:
+        """(eyes,) the rig's radius of each eye's circle at the mean measured tilt."""
+        tilt = float(np.mean(self.traverse.pan_tilt_rad[:, 1]))
+        return np.array([self.traverse.rig.circle(e, tilt)[0] for e in range(len(self.traverse.rig.eyes))])
+
+    @property
+    def variables(self) -> tuple[RigVariable, ...]:
+        """All of them, by quantity."""
+        return tuple(v for variables in self.of.values() for v in variables)
+
+    def of_stop(self, stop: int | None) -> list[RigVariable]:
+        """Those that a stop has for itself; None: those that stops share."""
+        return [v for v in self.variables if v.stop == stop]
+
+    def group(self, variable: RigVariable) -> int:
+        """The group that a variable is eliminated with: its stop's, or the last."""
+        return len(self.traverse.stops) if variable.stop is None else variable.stop
+
+    def variable(self, quantity: Quantity, site: int) -> RigVariable | None:
+        """The variable of an image (of pan_T_tilt: a stop); None where the quantity is fixed."""
+        return self.of[quantity][int(self._place[quantity][site])] if self.of[quantity] else None
+
+    def place(self, quantity: Quantity) -> IntArray:
+        """(images,), of pan_T_tilt (stops,): place of each one's variable among `of[quantity]`."""
+        return self._place[quantity]
+
+    def basis(self, quantity: Quantity) -> FloatArray:
+        """(images, entries, columns), of pan_T_tilt (stops, ...): free entries to all of the correction."""
+        return self._basis[quantity]
+
+    def name(self, variable: RigVariable, entry: str) -> str:
+        """An entry as a warning calls it."""
+        t = self.traverse
+        where = [] if variable.eye is None else [t.rig.eyes[variable.eye].name]
+        if variable.image is not None:
+            where = [t.images[variable.image].id]
+        elif variable.stop is not None:
+            where.append(f"at {t.stops[variable.stop].id}")
+        return " ".join([variable.quantity, *where, entry])
+
+    # --- values ---
+
+    def _read(self, quantity: Quantity, values: gtsam.Values) -> FloatArray:
+        """Corrections (images, entries), of pan_T_tilt (stops, entries); what is held is 0."""
+        variables = self.of[quantity]
+        if not variables:
+            axis = quantity == "pan_T_tilt"
+            return np.zeros(
+                (len(self.traverse.stops if axis else self.traverse.images), len(ENTRIES[quantity]))
+            )
+        if quantity == "radius":
+            found = np.array([[values.atDouble(v.key) - self.reference_radius_m(v)] for v in variables])
+        else:
+            found = np.array([values.atVector(v.key) for v in variables])
+        return np.asarray(np.einsum("nij,nj->ni", self._basis[quantity], found[self._place[quantity]]))
+
+    def correction(self, values: gtsam.Values) -> RigCorrection | None:
+        """All corrections; None where nothing is free."""
+        if not self.variables:
+            return None
+        return RigCorrection(
+            calibration_px=self._read("calibration", values),
+            mount=self._read("mounts", values),
+            pan_T_tilt=self._read("pan_T_tilt", values),
+            radius_m=self._read("radius", values)[:, 0],
+        )
+
+    def insert(self, values: gtsam.Values, given: RigCorrection | None) -> None:
+        """Add the variables to `values`, as near to a correction as their free entries allow."""
+        for v in self.variables:
+            found = np.zeros(len(v.entries))
+            if given is not None:
+                found = np.linalg.pinv(self._basis[v.quantity][v.first]) @ _of(given, v.quantity)[v.first]
+            if v.quantity == "radius":
+                values.insert(v.key, self.reference_radius_m(v) + float(found[0]))
+            else:
+                values.insert(v.key, found)
+
+    def prior_factors(self, stop: int | None) -> list[gtsam.NonlinearFactor]:
+        """Priors of `of_stop`."""
+        out: list[gtsam.NonlinearFactor] = []
+        for v in self.of_stop(stop):
+            if not np.isfinite(v.sigma).any():
+                continue
+            noise = gtsam.noiseModel.Diagonal.Sigmas(v.sigma)  # an infinite one weighs its row with 0
+            if v.quantity == "radius":
+                out.append(gtsam.PriorFactorDouble(v.key, self.reference_radius_m(v), noise))
+            else:
+                out.append(gtsam.PriorFactorVector(v.key, np.zeros(len(v.sigma)), noise))
+        return out
+
+    # --- what they make of the cameras ---
+
+    def calibration(self, values: gtsam.Values) -> FloatArray:
+        """K (images, 3, 3)."""
+        if not self.of["calibration"]:
+            return self._K
+        out: FloatArray = self._K.copy()
+        out[:, _K_ROW, _K_COLUMN] += self._read("calibration", values)
+        return out
+
+    def cameras(self, values: gtsam.Values) -> list[tuple[Camera, BoolArray]]:
+        """The rig's cameras, distortion included, and which images (images,) each took."""
+        t, out = self.traverse, []
+        K, own = self.calibration(values), self._place.get("calibration", np.zeros(len(t.images), dtype=int))
+        for i, eye in enumerate(t.rig.eyes):
+            for place in np.unique(own[t.image_eye == i]):
+                images = (t.image_eye == i) & (own == place)
+                free = bool(self.of["calibration"])
+                camera = eye.camera.with_calibration(K[np.argmax(images)]) if free else eye.camera
+                out.append((camera, images))
+        return out
+
+    @property
+    def pupil_moves(self) -> bool:
+        """Whether a camera's pixels are those of a pinhole only for points at one range."""
+        return any(eye.camera.pupil_moves for eye in self.traverse.rig.eyes)
+
+    @property
+    def distortion_moves(self) -> bool:
+        """Whether a distorted camera has a free calibration: its pixels of a pinhole move with it."""
+        distorted = (eye.camera != eye.camera.pinhole for eye in self.traverse.rig.eyes)
+        return bool(self.of["calibration"]) and any(distorted)
+
+    def mounts(self, values: gtsam.Values) -> tuple[FloatArray, FloatArray]:
+        """`head_T_camera` (images, 3, 3), (images, 3)."""
+        return (
+            corrected_poses(*self._mounts, self._read("mounts", values))
+            if self.of["mounts"]
+            else self._mounts
+        )
+
+    def mount_twists(self, values: gtsam.Values) -> FloatArray:
+        """(images, 6, columns) body-frame twist of each mount by its variable."""
+        return np.asarray(correction_twists(self._read("mounts", values)) @ self._basis["mounts"])
+
+    def axes(self, values: gtsam.Values) -> tuple[FloatArray, FloatArray] | None:
+        """`pan_T_tilt` (stops, 3, 3), (stops, 3); None where it is fixed."""
+        if not self.of["pan_T_tilt"]:
+            return None
+        nominal = self.traverse.rig.pan_T_tilt
+        correction = self._read("pan_T_tilt", values)
+        return corrected_poses(nominal.rotation().matrix(), nominal.translation(), correction)
+
+    def axis_twists(self, values: gtsam.Values) -> FloatArray:
+        """(stops, 6, columns) body-frame twist of each tilt axis by its variable."""
+        return np.asarray(correction_twists(self._read("pan_T_tilt", values)) @ self._basis["pan_T_tilt"])
+
+    def mount_slot(self, image: int) -> PoseSlot:
+        """Slot of an image's mount."""
+        nominal = self.traverse.rig.eyes[int(self.traverse.image_eye[image])].head_T_camera
+        return _pose_slot(self.variable("mounts", image), nominal)
+
+    def axis_slot(self, stop: int) -> PoseSlot:
+        """Slot of a stop's tilt axis."""
+        return _pose_slot(self.variable("pan_T_tilt", stop), self.traverse.rig.pan_T_tilt)
+
+    def radius_slot(self, image: int) -> tuple[Slot, float]:
+        """Slot of the radius of an image's circle, and what the rig says in its place, metres."""
+        if (v := self.variable("radius", image)) is not None:
+            return Key(v.key), self.reference_radius_m(v)
+        reference = float(self._radius_m[self.traverse.image_eye[image]])
+        return Fixed(reference), reference
+
+    def reference_radius_m(self, variable: RigVariable) -> float:
+        """The rig's radius of a variable's circle, of those that share it the first one's."""
+        return float(self._radius_m[self.traverse.image_eye[variable.first]])
+
+    # --- what is known of them ---
+
+    def sigmas(self, covariance: Covariance, linkage: Linkage) -> list[FloatArray]:
+        """Standard deviations (entries,) of each variable."""
+        out = []
+        for v in self.variables:
+            own, g = linkage.columns_of(v.key), self.group(v)
+            out.append(np.sqrt(np.diag(covariance.block(g, g)[own, own])))
+        return out
+
+    def refined(self, values: gtsam.Values, sigmas: list[FloatArray] | None) -> tuple[Refined, ...]:
+        """What the values say of every free entry; sigmas as `sigmas` gives them, None: unknown."""
+        t = self.traverse
+        out = []
+        for i, v in enumerate(self.variables):
+            if v.quantity == "radius":
+                found = np.array([values.atDouble(v.key) - self.reference_radius_m(v)])
+            else:
+                found = values.atVector(v.key)
+            for j, entry in enumerate(v.entries):
+                out.append(
+                    Refined(
+                        quantity=v.quantity,
+                        entry=entry,
+                        camera=None if v.eye is None else t.rig.eyes[v.eye].name,
+                        stop=None if v.stop is None else t.stops[v.stop].id,
+                        image=None if v.image is None else t.images[v.image].id,
+                        nominal=v.nominal[j],
+                        change=float(found[j]),
+                        sigma=np.nan if sigmas is None else float(sigmas[i][j]),
+                        prior_sigma=float(v.sigma[j]),
+                    )
+                )
+        return tuple(out)
+
+    def start_error(self) -> tuple[FloatArray, FloatArray]:
+        """How wrong each image's camera may be at the start, one sigma: pixels (images,), metres (images,).
+
+        By the priors of calibration, mounts and pan_T_tilt; an entry without one counts as if it had the
+        default one.
+        """
+        t, focal = self.traverse, self._K[:, 0, 0]
+        half = np.array([max(e.camera.width_px, e.camera.height_px) / 2 for e in t.rig.eyes])[t.image_eye]
+        one = np.ones(len(focal))
+        # What a unit of an entry moves pixels by; of a calibration, those at the edge of the image.
+        weight = {"cx_px": one, "cy_px": one, FOCAL: half} | dict.fromkeys(ENTRIES["mounts"][:3], focal)
+        square_px, square_m = np.zeros(len(t.images)), np.zeros(len(t.images))
+        for v in self.variables:
+            if v.quantity == "radius":  # which is no more than its prior says, and by default free
+                continue
+            place = self._place[v.quantity][t.image_stop if v.quantity == "pan_T_tilt" else slice(None)]
+            own = np.array([other is v for other in self.of[v.quantity]])[place]
+            for entry, sigma in zip(v.entries, v.sigma, strict=True):
+                known = sigma if np.isfinite(sigma) else default_sigma(entry, float(np.mean(focal[own])))
+                if entry.endswith("_m"):
+                    square_m[own] += known**2
+                else:
+                    square_px[own] += (known * weight.get(entry, half / focal)[own]) ** 2
+        return np.sqrt(square_px), np.sqrt(square_m)
+
+
+def _of(correction: RigCorrection, quantity: Quantity) -> FloatArray:
+    return {
+        "calibration": correction.calibration_px,
+        "mounts": correction.mount,
+        "pan_T_tilt": correction.pan_T_tilt,
+        "radius": correction.radius_m[:, None],
+    }[quantity]
+
+
+def _pose_slot(variable: RigVariable | None, nominal: gtsam.Pose3) -> PoseSlot:
+    if variable is None:
+        return Fixed(nominal)
+    free = tuple(ENTRIES[variable.quantity].index(e) for e in variable.entries)
+    return Corrected(variable.key, nominal, free)
