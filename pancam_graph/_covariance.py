@@ -70,7 +70,7 @@ def _unseen(problem: Problem, reduced: ReducedSystem, covariance: Covariance) ->
     """Directions of the rig of which images tell less than priors, of the rig or of telemetry.
 
     These are the ones that become looser where all priors do. A turn of all mounts about the tilt axis, for
-    one, is to images a turn of all tilts.
+    one, is to images a turn of all tilts. And those that have no prior and are all but free.
     """
     template, link, free = problem.template, problem.template.linkage, problem.template.rig_variables
     loose = _inverse(template, loosened_root(problem, reduced.system, _LOOSER))
@@ -81,6 +81,8 @@ def _unseen(problem: Problem, reduced: ReducedSystem, covariance: Covariance) ->
         names = [free.name(v, entry) for v in own for entry in v.entries]
         firm, wide = (c.block(g, g)[np.ix_(columns, columns)] for c in (covariance, loose))
         size = np.sqrt(np.diag(firm))
+        usual, prior = (np.concatenate([getattr(v, what) for v in own]) for what in ("usual", "sigma"))
+        out += [names[i] for i in np.flatnonzero(np.isinf(prior) & (size > _LOOSER * usual))]
         firm, wide = firm / np.outer(size, size), wide / np.outer(size, size)
         # A correlation of 1 but for rounding is no reason to fail.
         ratio, functional = eigh(wide, firm + 1e-12 * np.eye(len(size)))

@@ -43,6 +43,8 @@ class RigVariable:
     entries: tuple[str, ...]
     sigma: FloatArray
     """(entries,) of the prior; infinite: none"""
+    usual: FloatArray
+    """(entries,) the default of `sigma`: what real rigs differ by"""
     eye: int | None
     stop: int | None
     image: int | None
@@ -103,6 +105,7 @@ class RigVariables:
                     key=int(gtsam.symbol(_LETTER[quantity], int(number))),
                     entries=entries,
                     sigma=np.array([freedom.sigma.get(e, default_sigma(e, focal)) for e in entries]),
+                    usual=np.array([default_sigma(e, focal) for e in entries]),
                     eye=None if eye is None or scope == "all" else int(eye[first]),
                     stop=int(stop[first]) if scope in {"stop", "image"} else None,
                     image=int(first) if scope == "image" else None,
@@ -358,8 +361,7 @@ class RigVariables:
                 continue
             place = self._place[v.quantity][t.image_stop if v.quantity == "pan_T_tilt" else slice(None)]
             own = np.array([other is v for other in self.of[v.quantity]])[place]
-            for entry, sigma in zip(v.entries, v.sigma, strict=True):
-                known = sigma if np.isfinite(sigma) else default_sigma(entry, float(np.mean(focal[own])))
+            for entry, known in zip(v.entries, np.where(np.isfinite(v.sigma), v.sigma, v.usual), strict=True):
                 if entry.endswith("_m"):
                     square_m[own] += known**2
                 else:
