@@ -11,6 +11,7 @@ import gtsam
 import numpy as np
 
 from pancam_graph._terrain import Terrain
+from pancam_graph._wrong_rig import wrong_rig
 from pancam_graph.cameras import Camera
 from pancam_graph.errors import InputError
 from pancam_graph.geometry import (
@@ -18,7 +19,6 @@ from pancam_graph.geometry import (
     FloatArray,
     IntArray,
     compose,
-    corrected_poses,
     pose_arrays,
     rz,
     wrap_angle,
@@ -257,7 +257,15 @@ def simulate(rig: Rig, options: SimulationOptions | None = None, *, seed: int = 
         terrain=terrain,
     )
     centre = truth if options.prior == "truth" else start
-    claimed = _claimed(rig, options, float(np.mean(angles[:, 1])), rng_rig)
+    claimed = wrong_rig(
+        rig,
+        rng_rig,
+        focal=options.focal_error,
+        mount_rad=options.mount_error_rad,
+        mount_m=options.mount_error_m,
+        radius_m=options.radius_error_m,
+        tilt_rad=float(np.mean(angles[:, 1])),
+    )
     traverse = _traverse(claimed, options, centre.world_T_mast, centre.pan_tilt_rad, observations, seed)
     return Simulation(traverse=traverse, truth=truth, telemetry_start=start)
 
@@ -456,30 +464,6 @@ def _pointing_sigma_rad(rig: Rig, options: SimulationOptions) -> FloatArray:
     """Standard deviation of pan and tilt telemetry (2,); 0 where the rig does not turn."""
     sigma = np.array([rig.pointing_sigma.pan_rad, rig.pointing_sigma.tilt_rad])
     return options.pointing_scale * rig.turns * sigma
-
-
-def _claimed(rig: Rig, options: SimulationOptions, tilt_rad: float, rng: np.random.Generator) -> Rig:
-    """The rig with errors in each eye: of its focal length, its mount, and its circle at a tilt."""
-    head_R, _ = rig.mast_T_head(np.zeros(1), np.array([tilt_rad]))
-    draws = rng.standard_normal((len(rig.eyes), 8))
-    sigmas = np.repeat([options.mount_error_rad, options.mount_error_m], 3)
-    eyes = []
-    for i, (eye, draw) in enumerate(zip(rig.eyes, draws, strict=True)):
-        camera, mount = eye.camera, eye.head_T_camera
-        if options.focal_error:
-            calibration = camera.pinhole.calibration_matrix
-            calibration[:2, :2] *= 1 + options.focal_error * draw[0]
-            camera = camera.with_calibration(calibration)
-        if options.radius_error_m:
-            _, phase_rad, _ = rig.circle(i, tilt_rad)
-            shift = options.radius_error_m * draw[1] * (head_R[0].T @ rz(phase_rad)[:, 0])
-            mount = gtsam.Pose3(mount.rotation(), mount.translation() + shift)
-        if sigmas.any():
-            nominal = mount.rotation().matrix(), mount.translation()
-            rotation, translation = corrected_poses(*nominal, sigmas * draw[2:])
-            mount = gtsam.Pose3(gtsam.Rot3(rotation), translation)
-        eyes.append(replace(eye, camera=camera, head_T_camera=mount))
-    return replace(rig, eyes=tuple(eyes))
 
 
 def _traverse(

@@ -29,8 +29,7 @@ class SoftTemplate(FactorTemplate):
     """Factors and variables for camera poses that a tie holds; its sigma stands for the mast's flex."""
 
     def __init__(self, traverse: Traverse, model: Model, flex: Flex, sharing: Sharing | None = None) -> None:
-        """`sharing` as `Sharing.for_model` returns it; None: what the model itself says."""
-        super().__init__(traverse, model, sharing or Sharing().for_model(model))
+        super().__init__(traverse, model, sharing)
         self.flex = flex
 
     def pan_tilt(self, frame: int) -> Slot:

@@ -25,10 +25,11 @@ Factors = list[gtsam.NonlinearFactor]
 class FactorTemplate(ABC):
     """Factors and variables of a traverse's rig for one model; landmarks are added by others."""
 
-    def __init__(self, traverse: Traverse, model: Model, sharing: Sharing) -> None:
+    def __init__(self, traverse: Traverse, model: Model, sharing: Sharing | None = None) -> None:
+        """`sharing` as `Sharing.for_model` returns it; None: what the model itself says."""
         self.traverse = traverse
         self.model: Model = model
-        self.rig_variables = RigVariables(traverse, sharing)
+        self.rig_variables = RigVariables(traverse, sharing or Sharing().for_model(model))
 
     @property
     @abstractmethod
