@@ -14,15 +14,7 @@ from pancam_graph._terrain import Terrain
 from pancam_graph._wrong_rig import wrong_rig
 from pancam_graph.cameras import Camera
 from pancam_graph.errors import InputError
-from pancam_graph.geometry import (
-    BoolArray,
-    FloatArray,
-    IntArray,
-    compose,
-    pose_arrays,
-    rz,
-    wrap_angle,
-)
+from pancam_graph.geometry import BoolArray, FloatArray, IntArray, compose, pose_arrays, rz, wrap_angle
 from pancam_graph.rigs import Rig
 from pancam_graph.traverse import Frame, Image, Observations, Stop, Traverse
 
