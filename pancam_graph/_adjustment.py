@@ -18,13 +18,20 @@ from pancam_graph._rejection import screen
 from pancam_graph.cameras import carry_to_pinhole
 from pancam_graph.errors import InputError, SolveError
 from pancam_graph.geometry import BoolArray, FloatArray
-from pancam_graph.graph import RIGID, FactorTemplate, HardTemplate, RigVariables, SoftTemplate
-from pancam_graph.initialise import Start, start_from_telemetry
+from pancam_graph.graph import (
+    RIGID,
+    FactorTemplate,
+    HardTemplate,
+    ProjectiveTemplate,
+    RigVariables,
+    SoftTemplate,
+)
+from pancam_graph.initialise import FreeCameras, Start, start_from_telemetry
 from pancam_graph.landmarks import Landmarks, Measurements, rays_of, refine, residuals, triangulate
 from pancam_graph.losses import loss_of
 from pancam_graph.options import SolveOptions
 from pancam_graph.sharing import Sharing
-from pancam_graph.solution import Solution, State
+from pancam_graph.solution import RigCorrection, Solution, State
 from pancam_graph.stopping import StopRule
 from pancam_graph.traverse import Observations, Traverse
 
@@ -65,24 +72,21 @@ class Adjustment:
         self.warnings = [*traverse.warnings, *self.start.warnings]
         self.noise = self.observations.noise
         self.reason = np.full(len(self.observations), "", dtype=object)
-        self.solver = _SOLVERS[options.landmarks](on_iteration)
+        given = self.start.cameras if options.model in {"free", "projective"} else None
+        self.solver = (
+            EliminatedSolver(on_iteration, is_near=True)
+            if given is not None and options.landmarks == "eliminated"
+            else _SOLVERS[options.landmarks](on_iteration)
+        )
         self.sharing = (options.sharing or traverse.sharing or Sharing()).for_model(options.model)
         template = _template(traverse, options, self.sharing)
-        self.problem = self.first = self._first_problem(template).placed()
+        self.problem = self.first = self._first_problem(template, given).placed()
 
     # --- preparation ---
 
-    def _first_problem(self, template: FactorTemplate) -> Problem:
+    def _first_problem(self, template: FactorTemplate, given: FreeCameras | None) -> Problem:
         """Cameras where the start has them, all landmarks triangulated from there."""
-        rotations, centres = self.traverse.camera_poses(self.start.world_T_mast, self.start.pan_tilt_rad)
-        state = State(
-            world_T_mast=self.start.world_T_mast,
-            pan_tilt_rad=self.start.pan_tilt_rad,
-            world_R_camera=rotations,
-            world_t_camera=centres,
-            landmarks_m=np.zeros((0, 3)),
-        )
-        values = template.values(state)
+        values = template.values(_first_state(self.traverse, self.start, given))
         measurements = self._measure(template.rig_variables, values)
         n = measurements.n_landmarks
         return _triangulated(
@@ -346,7 +350,7 @@ class Adjustment:
             stop_covariance=found.stop_covariance,
             angle_sigma_rad=found.angle_sigma_rad,
             landmark_covariance_m2=found.landmark_covariance_m2,
-            refined=p.template.rig_variables.refined(p.values, found.rig_sigmas),
+            refined=p.template.refined(p.values, found.rig_sigmas),
             warnings=(*self.warnings, *self._late_warnings(used), *connection_warnings(t, used)),
         )
 
@@ -424,8 +428,32 @@ class Adjustment:
         return warnings
 
 
+def _first_state(traverse: Traverse, start: Start, given: FreeCameras | None) -> State:
+    """The given cameras, or else those on the masts of the start."""
+    rotations, centres = traverse.camera_poses(start.world_T_mast, start.pan_tilt_rad)
+    rig = None
+    if given is not None:
+        if len(given.centre_m) != len(traverse.images):
+            raise InputError(
+                f"start: cameras: expected {len(traverse.images)}, one for each image, "
+                f"found {len(given.centre_m)}"
+            )
+        rotations, centres = given.world_R_camera, given.centre_m
+        rig = RigCorrection.to_calibrations(traverse, given.calibration)
+    return State(
+        world_T_mast=start.world_T_mast,
+        pan_tilt_rad=start.pan_tilt_rad,
+        world_R_camera=rotations,
+        world_t_camera=centres,
+        landmarks_m=np.zeros((0, 3)),
+        rig=rig,
+    )
+
+
 def _template(traverse: Traverse, options: SolveOptions, sharing: Sharing) -> FactorTemplate:
     """The rig as variables and factors, as the options have it."""
+    if options.model == "projective":
+        return ProjectiveTemplate(traverse, options.firm_flex, normalise=options.normalise)
     if options.firm_tie == "soft":
         return SoftTemplate(traverse, options.model, options.firm_flex, sharing)
     if options.landmarks == "eliminated":

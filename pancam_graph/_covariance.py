@@ -61,7 +61,7 @@ def uncertainty(
         angle_sigma_rad=template.angle_sigma_rad(covariance, state),
         landmark_covariance_m2=spread,
         undetermined=undetermined,
-        rig_sigmas=template.rig_variables.sigmas(covariance, template.linkage),
+        rig_sigmas=template.rig_sigmas(covariance, problem.values),
         unseen=_unseen(problem, reduced, covariance) if unseen and template.rig_variables.variables else (),
     )
 
@@ -122,6 +122,8 @@ def _name(template: FactorTemplate, free: FreeDirectionError) -> str:
             what = ("rotation about x", "rotation about y", "rotation about z", "x", "y", "z")[component]
             entries = t.stops if kind == "M" else t.images
             return f"the {what} of {entries[gtsam.symbolIndex(key)].id}, with what moves along"
+        if kind == "P":
+            return f"an entry of the projection matrix of {t.images[gtsam.symbolIndex(key)].id}"
         for v in template.rig_variables.variables:
             if v.key == key:
                 name = template.rig_variables.name(v, v.entries[component])

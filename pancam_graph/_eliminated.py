@@ -25,9 +25,10 @@ _FOLLOWING = 1e-4
 class EliminatedSolver(Solver):
     """Landmark blocks (factors/landmark_blocks.py): landmarks follow the variables of the graph."""
 
-    def __init__(self, on_iteration: Callable[[Iteration], None] | None) -> None:
+    def __init__(self, on_iteration: Callable[[Iteration], None] | None, *, is_near: bool = False) -> None:
+        """`is_near`: cameras start where they were given, and no rigid mast is fitted first."""
         super().__init__(on_iteration)
-        self._is_near = False
+        self._is_near = is_near
         self._last: _Fit | None = None
 
     def approach(self, problem: Problem, rule: StopRule, loss: Loss, stage: str) -> Problem:

@@ -145,4 +145,5 @@ def system_of(
     landmarks = Landmarks(vector=problem.landmarks.vector[rows], origin_m=problem.landmarks.origin_m[rows])
     template = problem.template
     cliques = [*template.cliques, *cliques]
-    return LandmarkSystem(template.linkage, m, landmarks, loss, cliques=cliques), rows
+    refined = template.refines_landmarks
+    return LandmarkSystem(template.linkage, m, landmarks, loss, cliques=cliques, refined=refined), rows

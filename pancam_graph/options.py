@@ -35,6 +35,9 @@ class SolveOptions(StopRule):
     sharing: Sharing | None = None
     """What of the rig is free, and who shares it; default: what the traverse says, or else nothing but the
     radii of the model "circle"."""
+    normalise: bool = True
+    """Whether model `projective` works on conditioned matrices (thesis 5.2). Without, on those of pixels and
+    metres, to compare: the optimum is the same."""
     outlier_sigma: float = 4.0
     """An observation goes where noise would take it less often than a Gaussian beyond this many sigmas."""
     rescale_noise: bool | None = None
@@ -56,7 +59,16 @@ class SolveOptions(StopRule):
                 raise InputError(f"{name}: expected one of {', '.join(choices)}; found {value!r}")
         if self.tie == "hard" and self.model != "mast":
             raise InputError(
-                f"tie: expected soft for the model {self.model}, found hard: its poses are variables"
+                f"tie: expected soft for the model {self.model}, found hard: its cameras are variables"
+            )
+        if self.model == "projective" and self.landmarks == "explicit":
+            raise InputError(
+                "landmarks: expected eliminated for the model projective, found explicit: GTSAM has no "
+                "projection factor for matrices"
+            )
+        if not self.normalise and self.model != "projective":
+            raise InputError(
+                f"normalise: expected True for the model {self.model}, whose variables need no conditioning"
             )
         if self.sharing is not None:
             self.sharing.for_model(self.model)

@@ -55,6 +55,10 @@ _OTHERWISE: Mapping[tuple[str, str], str] = {
     ("pan_T_tilt", "free"): "whose cameras hang on no axis",
     ("radius", "mast"): "whose circles follow from its mounts",
     ("radius", "free"): "whose cameras run on no circle",
+    ("calibration", "projective"): "whose matrices have calibrations of their own",
+    ("mounts", "projective"): "whose cameras hang on no mount",
+    ("pan_T_tilt", "projective"): "whose cameras hang on no axis",
+    ("radius", "projective"): "whose cameras run on no circle",
 }
 
 _DEFAULT_SIGMA = {

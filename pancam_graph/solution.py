@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 
 from pancam_graph._honest import CrossValidation
+from pancam_graph.cameras import CALIBRATION_ENTRIES, projection_matrix
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray, corrected_poses
 from pancam_graph.rigs import Rig
 from pancam_graph.sharing import Quantity
@@ -29,6 +30,24 @@ class RigCorrection:
     """(stops, 6) the same of the tilt axis."""
     radius_m: FloatArray
     """(images,) added to the radius of the image's circle; model `circle`."""
+
+    @staticmethod
+    def to_calibrations(traverse: Traverse, calibration: FloatArray) -> "RigCorrection":
+        """That from the rig's calibrations to these, K (images, 3, 3); all else is as the rig has it."""
+        n, (row, column) = len(traverse.images), CALIBRATION_ENTRIES
+        return RigCorrection(
+            calibration_px=(calibration - traverse.calibration)[:, row, column],
+            mount=np.zeros((n, 6)),
+            pan_T_tilt=np.zeros((len(traverse.stops), 6)),
+            radius_m=np.zeros(n),
+        )
+
+    def calibration(self, traverse: Traverse) -> FloatArray:
+        """K (images, 3, 3) of each image's camera, upper-triangular, without distortion."""
+        out: FloatArray = traverse.calibration.copy()
+        row, column = CALIBRATION_ENTRIES
+        out[:, row, column] += self.calibration_px
+        return out
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,6 +196,22 @@ class Solution:
         axis = _common(found.pan_T_tilt)
         pan_T_tilt = _corrected(rig.pan_T_tilt, axis) if axis.any() else rig.pan_T_tilt
         return replace(rig, eyes=tuple(eyes), pan_T_tilt=pan_T_tilt)
+
+    @property
+    def calibration(self) -> FloatArray:
+        """(images, 3, 3) K of each image's camera as adjusted, upper-triangular, without distortion."""
+        found = self.final.rig
+        return self.traverse.calibration if found is None else found.calibration(self.traverse)
+
+    @property
+    def projections(self) -> FloatArray:
+        """(images, 3, 4) projection matrix of each image's camera as adjusted, without distortion.
+
+        From homogeneous points of the world to those of pixels; the first three entries of the third row have
+        length 1.
+        """
+        camera_R_world = self.final.world_R_camera.transpose(0, 2, 1)
+        return projection_matrix(self.calibration, camera_R_world, self.final.world_t_camera)
 
     @property
     def correction_rad(self) -> FloatArray:

@@ -196,6 +196,11 @@ class Traverse:
         return self.frame_stop[self.image_frame]
 
     @cached_property
+    def calibration(self) -> FloatArray:
+        """(images, 3, 3) K of each image's camera as the rig has it, upper-triangular, without distortion."""
+        return np.array([p.calibration_matrix for p in self.rig.pinholes])[self.image_eye]
+
+    @cached_property
     def pan_tilt_rad(self) -> FloatArray:
         """(frames, 2) pan and tilt as telemetry gives them."""
         return np.array([[f.pan_rad, f.tilt_rad] for f in self.frames])

@@ -27,10 +27,10 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True, help="folder to write")
     parser.add_argument(
         "--model",
-        choices=("mast", "circle", "free"),
+        choices=("mast", "circle", "free", "projective"),
         default="mast",
         help="mast: rigid pan-tilt mast (default); circle: camera centres on the mast's circles, rotations "
-        "free; free: every camera on its own",
+        "free; free: every camera on its own; projective: every projection matrix on its own",
     )
     parser.add_argument(
         "--landmarks",

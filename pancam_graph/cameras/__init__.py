@@ -6,7 +6,11 @@ from pancam_graph.cameras._cahv import CAHV as CAHV
 from pancam_graph.cameras._cahv import CAHVOR as CAHVOR
 from pancam_graph.cameras._cahv import CAHVORE as CAHVORE
 from pancam_graph.cameras._carry import carry_to_pinhole as carry_to_pinhole
+from pancam_graph.cameras._conditioning import Conditioning as Conditioning
+from pancam_graph.cameras._matrix import CALIBRATION_ENTRIES as CALIBRATION_ENTRIES
 from pancam_graph.cameras._matrix import decompose_projection as decompose_projection
 from pancam_graph.cameras._matrix import projection_matrix as projection_matrix
+from pancam_graph.cameras._matrix import projection_tangents as projection_tangents
+from pancam_graph.cameras._matrix import split_projections as split_projections
 from pancam_graph.cameras._pinhole import Brown as Brown
 from pancam_graph.cameras._pinhole import Pinhole as Pinhole

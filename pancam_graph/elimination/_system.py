@@ -135,9 +135,13 @@ class LandmarkSystem:
         loss: Loss = SQUARED,
         *,
         cliques: Iterable[Iterable[int]] = (),
+        refined: bool = False,
     ) -> None:
-        """Arrange observations and landmarks; `cliques` are groups that other factors join."""
-        self.linkage, self.loss = linkage, loss
+        """Arrange observations and landmarks; `cliques` are groups that other factors join.
+
+        `refined`: after a step all landmarks go to where they fit best, not only strays.
+        """
+        self.linkage, self.loss, self._refined = linkage, loss, refined
         self._measurements = measurements
         n = len(landmarks.vector)
         first, reach = _blocks(linkage, measurements)
@@ -385,7 +389,8 @@ class LandmarkSystem:
         before, after = self.reduced.cost, self._moved_cost
         # What a step hardly touches is as well placed as it was: noise alone is no reason to look again.
         touched = np.abs(after - before) > _TOUCHED * before
-        strays = np.flatnonzero((after > _LOST * counts) | touched & (after > _STRAY * counts))
+        astray = (after > _LOST * counts) | touched & (after > _STRAY * counts)
+        strays = np.flatnonzero(astray | self._refined)
         self.regained = 0.0
         if len(strays) == 0:
             return

@@ -7,6 +7,7 @@ from pancam_graph.graph._options import RIGID as RIGID
 from pancam_graph.graph._options import Flex as Flex
 from pancam_graph.graph._options import Model as Model
 from pancam_graph.graph._options import Tie as Tie
+from pancam_graph.graph._projective import ProjectiveTemplate as ProjectiveTemplate
 from pancam_graph.graph._rig_variables import RigVariables as RigVariables
 from pancam_graph.graph._soft import SoftTemplate as SoftTemplate
 from pancam_graph.graph._template import FactorTemplate as FactorTemplate

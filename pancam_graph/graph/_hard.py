@@ -230,7 +230,7 @@ class HardTemplate(FactorTemplate):
             world_R_camera=views.world_R_camera,
             world_t_camera=views.world_t_camera,
             landmarks_m=landmarks_m,
-            rig=self.rig_variables.correction(values),
+            rig=self.correction(values),
         )
 
     def held_columns(self) -> dict[int, IntArray]:

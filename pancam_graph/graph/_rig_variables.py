@@ -12,7 +12,7 @@ from functools import cached_property
 import gtsam
 import numpy as np
 
-from pancam_graph.cameras import Camera
+from pancam_graph.cameras import CALIBRATION_ENTRIES, Camera
 from pancam_graph.elimination import Covariance, Linkage
 from pancam_graph.factors import Corrected, Fixed, Key, PoseSlot, Slot
 from pancam_graph.geometry import (
@@ -30,8 +30,6 @@ from pancam_graph.traverse import Traverse
 __all__ = ["RigVariable", "RigVariables"]
 
 _LETTER: Mapping[Quantity, str] = {"calibration": "K", "mounts": "E", "pan_T_tilt": "T", "radius": "R"}
-_K_ROW, _K_COLUMN = [0, 1, 0, 0, 1], [0, 1, 1, 2, 2]
-"""Where fx, fy, skew, cx and cy stand in K."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -64,7 +62,7 @@ class RigVariables:
         """`sharing` as `Sharing.for_model` returns it."""
         t = self.traverse = traverse
         self.sharing = sharing
-        self._K = np.array([p.calibration_matrix for p in t.rig.pinholes])[t.image_eye]
+        self._K = t.calibration
         mounts_R, mounts_t = pose_arrays([e.head_T_camera for e in t.rig.eyes])
         self._mounts = mounts_R[t.image_eye], mounts_t[t.image_eye]
         self._place: dict[Quantity, IntArray] = {}
@@ -134,8 +132,8 @@ class RigVariables:
             if entry == FOCAL:
                 out[:, j] = 1.0
             elif quantity == "calibration":
-                i = ENTRIES[quantity].index(entry)
-                out[:, j] = self._K[:, _K_ROW[i], _K_COLUMN[i]]
+                row, column = (at[ENTRIES[quantity].index(entry)] for at in CALIBRATION_ENTRIES)
+                out[:, j] = self._K[:, row, column]
             elif quantity == "radius":
                 out[:, j] = self._radius_m[self.traverse.image_eye]
         return out
@@ -239,7 +237,8 @@ class RigVariables:
         if not self.of["calibration"]:
             return self._K
         out: FloatArray = self._K.copy()
-        out[:, _K_ROW, _K_COLUMN] += self._read("calibration", values)
+        row, column = CALIBRATION_ENTRIES
+        out[:, row, column] += self._read("calibration", values)
         return out
 
     def cameras(self, values: gtsam.Values) -> list[tuple[Camera, BoolArray]]:

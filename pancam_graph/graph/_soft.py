@@ -22,11 +22,15 @@ from pancam_graph.traverse import Traverse
 
 __all__ = ["SoftTemplate"]
 
-_DIMENSION = {"A": 2, "M": 6, "X": 6}
+_DIMENSION = {"A": 2, "M": 6, "P": 12, "X": 6}
 
 
 class SoftTemplate(FactorTemplate):
     """Factors and variables for camera poses that a tie holds; its sigma stands for the mast's flex."""
+
+    _camera_letter = "X"
+    _poses = True
+    """Whether a camera's variable is its own pose"""
 
     def __init__(self, traverse: Traverse, model: Model, flex: Flex, sharing: Sharing | None = None) -> None:
         super().__init__(traverse, model, sharing)
@@ -39,14 +43,14 @@ class SoftTemplate(FactorTemplate):
             return Fixed(self.traverse.pan_tilt_rad[frame])
         return Key(gtsam.symbol("A", frame))
 
-    @staticmethod
-    def camera_key(image: int) -> int:
-        """Key of an image's camera pose."""
-        return int(gtsam.symbol("X", image))
+    @classmethod
+    def camera_key(cls, image: int) -> int:
+        """Key of an image's camera."""
+        return int(gtsam.symbol(cls._camera_letter, image))
 
     @cached_property
     def linkage(self) -> Linkage:
-        """One unit per image, which hangs on its own pose and its calibration; ties join it to all else."""
+        """One unit per image, which hangs on its own camera and calibration; ties join it to all else."""
         t, free = self.traverse, self.rig_variables
         keys: list[int] = []
         group: list[int] = []
@@ -63,7 +67,7 @@ class SoftTemplate(FactorTemplate):
         row, n = {key: i for i, key in enumerate(keys)}, len(t.images)
         dim = _DIMENSION | {chr(gtsam.symbolChr(v.key)): len(v.entries) for v in free.variables}
         variable = np.array([[row[self.camera_key(i)]] for i in range(n)], dtype=np.int64)
-        width = np.full((n, 1), 6)
+        width = np.full((n, 1), _DIMENSION[self._camera_letter])
         if free.of["calibration"]:
             own_K = np.array([row[v.key] for v in free.of["calibration"]])[free.place("calibration")]
             variable = np.column_stack([variable, own_K])
@@ -77,7 +81,7 @@ class SoftTemplate(FactorTemplate):
             segment_variable=variable.ravel(),
             segment_column=np.zeros(variable.size, dtype=np.int64),
             segment_width=width.ravel(),
-            segment_plain=np.tile(np.arange(variable.shape[1]) == 0, n),  # a camera's own pose
+            segment_plain=(np.arange(variable.size) % variable.shape[1] == 0) & self._poses,
         )
 
     def posture(self, values: gtsam.Values) -> Posture:
@@ -147,18 +151,22 @@ class SoftTemplate(FactorTemplate):
 
     def values(self, state: State) -> gtsam.Values:
         """The variables at a state."""
-        t, values = self.traverse, gtsam.Values()
+        values = gtsam.Values()
         for i, pose in enumerate(state.world_T_mast):
             if isinstance(slot := self.mast(i), Key):
                 values.insert(slot.key, pose)
         for i, angles in enumerate(state.pan_tilt_rad):
             if isinstance(slot := self.pan_tilt(i), Key):
                 values.insert(slot.key, angles)
-        for i in range(len(t.images)):
-            pose = gtsam.Pose3(gtsam.Rot3(state.world_R_camera[i]), state.world_t_camera[i])
-            values.insert(self.camera_key(i), pose)
+        self.insert_cameras(values, state)
         self.rig_variables.insert(values, state.rig)
         return values
+
+    def insert_cameras(self, values: gtsam.Values, state: State) -> None:
+        """Add the cameras of a state."""
+        for i in range(len(self.traverse.images)):
+            pose = gtsam.Pose3(gtsam.Rot3(state.world_R_camera[i]), state.world_t_camera[i])
+            values.insert(self.camera_key(i), pose)
 
     def state(self, values: gtsam.Values, landmarks_m: FloatArray) -> State:
         """The state at values of the variables; inverse of `values`.
@@ -166,9 +174,7 @@ class SoftTemplate(FactorTemplate):
         Pan and tilt are the variables themselves where the model is `mast`, and those of the camera poses as
         seen from their mast otherwise: there the poses hold what images say of the pointing.
         """
-        t, masts = self.traverse, self.masts(values)
-        cameras = [values.atPose3(self.camera_key(i)) for i in range(len(t.images))]
-        rotations, centres = pose_arrays(cameras)
+        t, masts, views = self.traverse, self.masts(values), self.views(values)
         angles = np.array(
             [
                 values.atVector(slot.key) if isinstance(slot := self.pan_tilt(i), Key) else slot.value
@@ -176,14 +182,15 @@ class SoftTemplate(FactorTemplate):
             ]
         ).reshape(-1, 2)
         if self.model != "mast":
-            angles = angles + _mean_by_frame(t, self.image_pointing_offset(masts, angles, rotations))
+            offset = self.image_pointing_offset(masts, angles, views.world_R_camera)
+            angles = angles + _mean_by_frame(t, offset)
         return State(
             world_T_mast=masts,
             pan_tilt_rad=angles,
-            world_R_camera=rotations,
-            world_t_camera=centres,
+            world_R_camera=views.world_R_camera,
+            world_t_camera=views.world_t_camera,
             landmarks_m=landmarks_m,
-            rig=self.rig_variables.correction(values),
+            rig=self.correction(values),
         )
 
     def held_columns(self) -> dict[int, IntArray]:
@@ -217,7 +224,7 @@ class SoftTemplate(FactorTemplate):
             camera_R = mast_R.T @ state.world_R_camera[i]
             head_R = camera_R @ t.rig.eyes[int(t.image_eye[i])].head_T_camera.rotation().matrix().T
             d_angles = _d_pan_tilt(head_R) / len(images)
-            add(self.camera_key(int(i)), d_angles @ camera_R)
+            add(self.camera_key(int(i)), d_angles @ camera_R @ self.camera_turn(int(i), state))
             by_mast -= d_angles
         if len(images) and isinstance(slot := self.mast(stop), Key):
             add(slot.key, by_mast)
@@ -232,6 +239,10 @@ class SoftTemplate(FactorTemplate):
         tilt_axis = rz(float(pan[0])) @ self.traverse.rig.pan_T_tilt.rotation().matrix()[:, 1]
         turns = np.column_stack([[0.0, 0.0, 1.0], -tilt_axis])
         return np.asarray(_d_pan_tilt(self.traverse.rig.mast_T_head(pan, tilt)[0][0]) @ turns)
+
+    def camera_turn(self, image: int, state: State) -> FloatArray:
+        """How the first k columns of an image's camera turn it (3, k), in its own frame."""
+        return np.eye(3)
 
     def image_pointing_offset(
         self, masts: tuple[gtsam.Pose3, ...], pan_tilt_rad: FloatArray, world_R_camera: FloatArray

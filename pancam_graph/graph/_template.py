@@ -14,7 +14,7 @@ from pancam_graph.graph._options import Model
 from pancam_graph.graph._rig_variables import RigVariables
 from pancam_graph.landmarks import CameraViews
 from pancam_graph.sharing import Sharing
-from pancam_graph.solution import State
+from pancam_graph.solution import Refined, RigCorrection, State
 from pancam_graph.traverse import Stop, Traverse
 
 __all__ = ["FactorTemplate", "Factors", "diagonal_noise", "read_variable"]
@@ -24,6 +24,9 @@ Factors = list[gtsam.NonlinearFactor]
 
 class FactorTemplate(ABC):
     """Factors and variables of a traverse's rig for one model; landmarks are added by others."""
+
+    refines_landmarks = False
+    """Whether landmarks go to where they fit best after every step, not only to where it leads."""
 
     def __init__(self, traverse: Traverse, model: Model, sharing: Sharing | None = None) -> None:
         """`sharing` as `Sharing.for_model` returns it; None: what the model itself says."""
@@ -100,6 +103,18 @@ class FactorTemplate(ABC):
         """Mast poses of all stops at the values."""
         slots = [self.mast(i) for i in range(len(self.traverse.stops))]
         return tuple(values.atPose3(slot.key) if isinstance(slot, Key) else slot.value for slot in slots)
+
+    def correction(self, values: gtsam.Values) -> RigCorrection | None:
+        """By how much the rig differs from the traverse's at the values; None where it cannot."""
+        return self.rig_variables.correction(values)
+
+    def rig_sigmas(self, covariance: Covariance, values: gtsam.Values) -> list[FloatArray]:
+        """Standard deviations of what is free of the rig, as `refined` takes them."""
+        return self.rig_variables.sigmas(covariance, self.linkage)
+
+    def refined(self, values: gtsam.Values, sigmas: list[FloatArray] | None) -> tuple[Refined, ...]:
+        """What the values say of every free entry of the rig; without sigmas these are NaN."""
+        return self.rig_variables.refined(values, sigmas)
 
     def stop_factors(self, stop: int) -> Factors:
         """The prior of a stop's mast pose."""

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from pancam_graph.cameras import decompose_projection
 from pancam_graph.errors import GeometryError, InputError
 from pancam_graph.geometry import FloatArray, IntArray, pose_arrays, wrap_angle
 from pancam_graph.initialise._circle import fit_circle
-from pancam_graph.rigs import Rig
+from pancam_graph.initialise._extract import FreeCameras, extract_free, head_tilt_rad, mast_pan_rad
 from pancam_graph.traverse import Traverse
 
 __all__ = ["Start", "start_from_cameras", "start_from_odometry", "start_from_telemetry"]
@@ -27,6 +26,9 @@ class Start:
     """Mast pose of each stop."""
     pan_tilt_rad: FloatArray
     """(frames, 2)"""
+    cameras: FreeCameras | None = None
+    """Of all images: where the models `free` and `projective` start, `free` with the rig's calibration. None,
+    and for the other models: where masts and angles put them."""
     warnings: tuple[str, ...] = ()
 
 
@@ -54,7 +56,7 @@ def start_from_odometry(traverse: Traverse, mast_T_next: Sequence[gtsam.Pose3]) 
 
 
 def start_from_cameras(traverse: Traverse, projections: FloatArray) -> Start:
-    """Masts and angles from the projection matrices (images, 3, 4) of all images.
+    """Masts, angles and cameras from the projection matrices (images, 3, 4) of all images.
 
     Each stop's centres, eye by eye and tilt by tilt, give a circle (thesis 4.6): its normal is the pan
     axis, its centre lies on it. The rig says how high above the mast's origin; telemetry says which frames
@@ -64,13 +66,11 @@ def start_from_cameras(traverse: Traverse, projections: FloatArray) -> Start:
 
     Raises CameraError for a matrix that is no camera, InputError for a wrong number of matrices.
     """
-    if projections.shape != (len(traverse.images), 3, 4):
-        raise InputError(
-            f"camera matrices: expected shape {(len(traverse.images), 3, 4)}, found {projections.shape}"
-        )
-    cameras = [decompose_projection(p) for p in projections]
-    world_R_camera = np.array([r.T for _, r, _ in cameras])
-    centres = np.array([c for _, _, c in cameras])
+    shape = np.shape(projections)
+    if shape != (len(traverse.images), 3, 4):
+        raise InputError(f"camera matrices: expected shape {(len(traverse.images), 3, 4)}, found {shape}")
+    cameras = extract_free(projections, [f"images: {image.id}" for image in traverse.images])
+    world_R_camera, centres = cameras.world_R_camera, cameras.centre_m
     masts: list[gtsam.Pose3] = []
     warnings: list[str] = []
     for s, stop in enumerate(traverse.stops):
@@ -93,9 +93,11 @@ def start_from_cameras(traverse: Traverse, projections: FloatArray) -> Start:
             first = int(rows[0])
             eye = int(traverse.image_eye[first])
             mast_R_head = masts_R[traverse.frame_stop[f]].T @ world_R_camera[first] @ mounts_R[eye].T
-            found = np.array([_pan(traverse.rig, mast_R_head[:, 1]), _tilt(traverse.rig, mast_R_head[2])])
+            found = np.array(
+                [mast_pan_rad(traverse.rig, mast_R_head[:, 1]), head_tilt_rad(traverse.rig, mast_R_head[2])]
+            )
             angles[f] = angles[f] + wrap_angle(found - angles[f])
-    return Start(world_T_mast=tuple(masts), pan_tilt_rad=angles, warnings=tuple(warnings))
+    return Start(world_T_mast=tuple(masts), pan_tilt_rad=angles, cameras=cameras, warnings=tuple(warnings))
 
 
 def _mast_by_chain(
@@ -135,7 +137,7 @@ def _mast_by_circles(
                 )
                 continue
             z = fit.rotation[:, 2]
-            tilts = [_tilt(rig, mounts_R[eye] @ world_R_camera[i].T @ z) for i in own]
+            tilts = [head_tilt_rad(rig, mounts_R[eye] @ world_R_camera[i].T @ z) for i in own]
             _, _, height = rig.circle(int(eye), float(np.mean(tilts)))
             normals.append(z)
             origins.append(fit.centre_m - height * z)
@@ -161,15 +163,3 @@ def _same_tilt(rows: IntArray, tilt_rad: FloatArray) -> list[IntArray]:
             first, number = tilt_rad[i], number + 1
         group[i] = number
     return [rows[group == g] for g in range(number + 1)]
-
-
-def _tilt(rig: Rig, head_up: FloatArray) -> float:
-    """Tilt from the mast's z axis (3,) in the head frame, which pan does not turn."""
-    axis_up = rig.pan_T_tilt.rotation().matrix()[2]
-    return float(np.arctan2(head_up[0], head_up[2]) - np.arctan2(axis_up[0], axis_up[2]))
-
-
-def _pan(rig: Rig, mast_left: FloatArray) -> float:
-    """Pan from the head's y axis (3,) in the mast frame, which tilt does not turn."""
-    axis_left = rig.pan_T_tilt.rotation().matrix()[:, 1]
-    return float(np.arctan2(mast_left[1], mast_left[0]) - np.arctan2(axis_left[1], axis_left[0]))

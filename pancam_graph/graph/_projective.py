@@ -1,0 +1,187 @@
+"""Projection matrices as variables: 12 numbers per image, tied to the mast (thesis 4.2 to 4.4).
+
+Variables: `P` the entries of an image's conditioned projection matrix (vector of 12); `M` and `A` as in the
+models with camera poses. The landmark blocks take the matrices as poses and calibrations do: K, R and C and
+how they move with the entries are in closed form, and the factor of P that they leave out no image sees.
+"""
+
+import gtsam
+import numpy as np
+
+from pancam_graph.cameras import (
+    CALIBRATION_ENTRIES,
+    Conditioning,
+    projection_matrix,
+    projection_tangents,
+    split_projections,
+)
+from pancam_graph.elimination import Covariance, Posture
+from pancam_graph.factors import Fixed, Key, projective_factor
+from pancam_graph.geometry import FloatArray, pose_arrays
+from pancam_graph.graph._options import Flex
+from pancam_graph.graph._soft import SoftTemplate
+from pancam_graph.graph._template import Factors, diagonal_noise
+from pancam_graph.landmarks import CameraViews
+from pancam_graph.sharing import ENTRIES
+from pancam_graph.solution import Refined, RigCorrection, State
+from pancam_graph.traverse import Traverse
+
+__all__ = ["ProjectiveTemplate"]
+
+_FACTOR_SIGMA = 0.01
+"""Of the surplus factor of P, relative. It moves nothing else: loose enough to let steps turn a camera, which
+change the factor to second order, firm enough to keep the system regular."""
+_TYPICAL_RANGE_M = 10.0
+"""Unit of the conditioned scene. A mast 1.5 m high sees its ground from 2 m on; any value from 1 to 100 m
+takes as many iterations."""
+
+
+class ProjectiveTemplate(SoftTemplate):
+    """Projection matrices of their own, tied to the mast: by flex their poses, loosely their calibrations.
+
+    The tie is what holds the 15 directions in which a projective reconstruction is free, and the surplus
+    factor of each matrix. Without `normalise` the variables are the entries of P in pixels and metres, about
+    the world's origin: for comparison, the optimum is the same.
+    """
+
+    _camera_letter = "P"
+    _poses = False
+    refines_landmarks = True
+    """A projective transformation of the world changes no pixel, so nothing but the tie keeps steps short;
+    far along it the linear step of a landmark is off by more than noise (Hong et al., Projective bundle
+    adjustment from arbitrary initialization using the variable projection method, 2016)."""
+
+    def __init__(self, traverse: Traverse, flex: Flex, *, normalise: bool = True) -> None:
+        super().__init__(traverse, "projective", flex)
+        n = len(traverse.images)
+        self.conditioning = _conditioning(traverse) if normalise else Conditioning.none(n)
+
+    def _split(self, values: gtsam.Values) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """K, camera_R_world, centre about `origin_m`, and the factor of all images."""
+        entries = [values.atVector(self.camera_key(i)) for i in range(len(self.traverse.images))]
+        return split_projections(self.conditioning.undo(np.array(entries)))
+
+    def views(self, values: gtsam.Values) -> CameraViews:
+        """Cameras of all images at the values."""
+        return self._views(*self._split(values)[:3])
+
+    def _views(self, K: FloatArray, camera_R_world: FloatArray, centre_m: FloatArray) -> CameraViews:
+        return CameraViews(
+            world_R_camera=np.ascontiguousarray(camera_R_world.transpose(0, 2, 1)),
+            world_t_camera=centre_m + self.conditioning.origin_m,
+            calibration=K,
+        )
+
+    def posture(self, values: gtsam.Values) -> Posture:
+        """Cameras at the values; a unit's base is the camera itself, and its calibration moves too."""
+        split = self._split(values)
+        views = self._views(*split[:3])
+        tangents = projection_tangents(*split) @ self.conditioning.d_undo
+        return Posture(
+            views=views,
+            unit_R=views.world_R_camera,
+            unit_t=views.world_t_camera,
+            chain=tangents[:, :11],
+        )
+
+    def image_factors(self, image: int) -> Factors:
+        """The tie of an image's matrix to its mast and to the rig's calibration."""
+        t, flex = self.traverse, self.flex
+        frame, eye = int(t.image_frame[image]), int(t.image_eye[image])
+        pose = np.repeat([flex.rotation_rad, flex.translation_m], 3)
+        numbers = self._calibration_sigma_px(image)
+        return [
+            projective_factor(
+                diagonal_noise(np.concatenate([pose, numbers, [_FACTOR_SIGMA]])),
+                Key(self.camera_key(image)),
+                self.mast(int(t.frame_stop[frame])),
+                self.pan_tilt(frame),
+                Fixed(t.rig.eyes[eye].head_T_camera),
+                Fixed(t.rig.pan_T_tilt),
+                t.calibration[image],
+                self.conditioning.of(image),
+            )
+        ]
+
+    def insert_cameras(self, values: gtsam.Values, state: State) -> None:
+        """The conditioned matrices of a state's cameras, of factor 1."""
+        K, camera_R_world, centre = self._cameras(state)
+        projections = projection_matrix(K, camera_R_world, centre)
+        for i, entries in enumerate(self.conditioning.condition(projections)):
+            values.insert(self.camera_key(i), entries)
+
+    def camera_turn(self, image: int, state: State) -> FloatArray:
+        """How the entries of an image's matrix turn its camera (3, 12), in its own frame."""
+        K, camera_R_world, centre = (part[image : image + 1] for part in self._cameras(state))
+        tangents = projection_tangents(K, camera_R_world, centre, np.ones(1))[0]
+        return np.asarray(tangents[:3] @ self.conditioning.d_undo[image])
+
+    def _cameras(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """K, camera_R_world and centre about `origin_m` of a state's cameras."""
+        t, rig = self.traverse, state.rig
+        return (
+            t.calibration if rig is None else rig.calibration(t),
+            state.world_R_camera.transpose(0, 2, 1),
+            state.world_t_camera - self.conditioning.origin_m,
+        )
+
+    # --- the calibrations that the matrices hold ---
+
+    def correction(self, values: gtsam.Values) -> RigCorrection:
+        """By how much the matrices' calibrations differ from the rig's."""
+        return RigCorrection.to_calibrations(self.traverse, self._split(values)[0])
+
+    def rig_sigmas(self, covariance: Covariance, values: gtsam.Values) -> list[FloatArray]:
+        """Standard deviations (5,) of fx, fy, skew, cx and cy of each image."""
+        t, link, numbers = self.traverse, self.linkage, self.posture(values).chain[:, 6:]
+        out = []
+        for i, jacobian in enumerate(numbers):
+            stop, own = int(t.image_stop[i]), link.columns_of(self.camera_key(i))
+            block = covariance.block(stop, stop)[own, own]
+            out.append(np.sqrt(np.einsum("ij,jk,ik->i", jacobian, block, jacobian)))
+        return out
+
+    def refined(self, values: gtsam.Values, sigmas: list[FloatArray] | None) -> tuple[Refined, ...]:
+        """The five numbers of K of every image; without sigmas these are NaN."""
+        t, change = self.traverse, self.correction(values).calibration_px
+        row, column = CALIBRATION_ENTRIES
+        return tuple(
+            Refined(
+                quantity="calibration",
+                entry=entry,
+                camera=image.camera,
+                stop=t.stops[int(t.image_stop[i])].id,
+                image=image.id,
+                nominal=float(t.calibration[i, row[j], column[j]]),
+                change=float(change[i, j]),
+                sigma=np.nan if sigmas is None else float(sigmas[i][j]),
+                prior_sigma=float(self._calibration_sigma_px(i)[j]),
+            )
+            for i, image in enumerate(t.images)
+            for j, entry in enumerate(ENTRIES["calibration"])
+        )
+
+    def _calibration_sigma_px(self, image: int) -> FloatArray:
+        """(5,) of the tie of fx, fy, skew, cx and cy to the rig's: those along u by fx, along v by fy."""
+        along = self.traverse.calibration[image][[0, 1, 0, 0, 1], [0, 1, 0, 0, 1]]
+        return np.asarray(self.flex.calibration * along)
+
+
+def _conditioning(traverse: Traverse) -> Conditioning:
+    """Pixels about the middle of their image, the scene about where telemetry has the mast.
+
+    Hartley takes mean and spread of the points that an image sees; here it is those of an image that sees
+    points all over, which no outlier moves, and which is there for an image without points too. With them,
+    the mean distance of a pixel from the centre is about sqrt(2).
+    """
+    cameras = [eye.camera for eye in traverse.rig.eyes]
+    size = np.array([[c.width_px, c.height_px] for c in cameras], dtype=float)[traverse.image_eye]
+    _, stops_m = pose_arrays([s.world_T_mast for s in traverse.stops])
+    n = len(traverse.images)
+    return Conditioning(
+        centre_px=(size - 1) / 2,
+        # Pixels spread evenly over w columns have a variance of w^2 / 12.
+        extent_px=np.sqrt(np.sum(size**2, axis=1) / 24),
+        origin_m=stops_m[traverse.image_stop],
+        extent_m=np.full(n, _TYPICAL_RANGE_M),
+    )
