@@ -67,12 +67,15 @@ def test_solves_and_writes_the_contract(run: Run, traverse_folder: Path, tmp_pat
     assert raw["observations"]["used"] + raw["observations"]["rejected"] > 100
 
 
-@pytest.mark.parametrize("model", ["circle", "free"])
+@pytest.mark.parametrize("model", ["circle", "free", "projective"])
 def test_models_and_no_report(run: Run, traverse_folder: Path, tmp_path: Path, model: str) -> None:
     done = run("optimize_traverse.py", "traverse", "--out", "out", "--model", model, "--no-report")
     assert done.returncode == 0, done.stderr
     assert not (tmp_path / "out" / "report.html").exists()
-    assert read_solution_json(tmp_path / "out" / "solution.json").model == model
+    solution = read_solution_json(tmp_path / "out" / "solution.json")
+    assert solution.model == model
+    if model == "projective":  # the calibration that each matrix holds
+        assert [r.image for r in solution.refined] == [i.id for i in solution.images for _ in range(5)]
 
 
 def test_cross_validation_is_written_and_said(run: Run, traverse_folder: Path, tmp_path: Path) -> None:

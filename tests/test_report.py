@@ -478,7 +478,7 @@ def test_pictures_are_drawn_small_where_they_can_be_read(tmp_path: Path) -> None
     assert panels[second.id]["picture"] is None
 
 
-@pytest.mark.parametrize("model", ["free", "circle"])
+@pytest.mark.parametrize("model", ["free", "circle", "projective"])
 def test_other_models(model: str) -> None:
     parsed(make_page(fabricate(model=model, points=60, pans=3)))
 

@@ -11,7 +11,14 @@ from pancam_graph import Frame, Freedom, Image, Sharing, Stop, Traverse
 from pancam_graph.elimination import Covariance
 from pancam_graph.factors import Fixed, Key
 from pancam_graph.geometry import FloatArray
-from pancam_graph.graph import DEFAULT_FLEX, FactorTemplate, HardTemplate, SoftTemplate, read_variable
+from pancam_graph.graph import (
+    DEFAULT_FLEX,
+    FactorTemplate,
+    HardTemplate,
+    ProjectiveTemplate,
+    SoftTemplate,
+    read_variable,
+)
 from pancam_graph.rigs import Rig, exomars_pancam, mer_navcam
 from pancam_graph.sharing import ENTRIES, Quantity, Scope
 from pancam_graph.solution import RigCorrection, State
@@ -126,7 +133,8 @@ def templates(t: Traverse, sharing: Sharing | None = None) -> dict[str, FactorTe
         m: SoftTemplate(t, m, DEFAULT_FLEX[m], given.for_model(m) if m == "mast" else None)  # type: ignore[arg-type,index]  # literals
         for m in ("mast", "circle", "free")
     }
-    return {"hard": HardTemplate(t, given), **soft}
+    projective = ProjectiveTemplate(t, DEFAULT_FLEX["projective"])
+    return {"hard": HardTemplate(t, given), **soft, "projective": projective}
 
 
 @pytest.mark.parametrize(
@@ -137,6 +145,8 @@ def templates(t: Traverse, sharing: Sharing | None = None) -> dict[str, FactorTe
         *(("all free", "hard", sharing) for sharing in SHARINGS),
         *(("all free", "mast", sharing) for sharing in SHARINGS),
         ("a stop held", "circle", "nothing"),
+        ("all free", "projective", "nothing"),
+        ("a stop held with its frames", "projective", "nothing"),
     ],
 )
 def test_chains_move_cameras_as_values_do(name: str, kind: str, sharing: str) -> None:
@@ -188,7 +198,7 @@ def test_hard_cameras_stand_where_the_rig_says(name: str) -> None:
         assert np.array_equal(views.calibration[i], k)
 
 
-@pytest.mark.parametrize("kind", ["hard", "mast", "circle", "free"])
+@pytest.mark.parametrize("kind", ["hard", "mast", "circle", "free", "projective"])
 @pytest.mark.parametrize("name", TRAVERSES)
 def test_values_and_states_are_each_others_inverse(name: str, kind: str) -> None:
     t = TRAVERSES[name]()
@@ -280,7 +290,7 @@ def test_who_shares_a_variable(kind: str) -> None:
             assert group == (n_stops if v.stop is None else v.stop)
 
 
-@pytest.mark.parametrize("kind", ["hard", "mast", "circle", "free"])
+@pytest.mark.parametrize("kind", ["hard", "mast", "circle", "free", "projective"])
 @pytest.mark.parametrize("name", TRAVERSES)
 def test_what_is_held_is_no_variable_or_a_held_column(name: str, kind: str) -> None:
     t = TRAVERSES[name]()
