@@ -32,8 +32,8 @@ _FACTOR_SIGMA = 0.01
 """Of the surplus factor of P, relative. It moves nothing else: loose enough to let steps turn a camera, which
 change the factor to second order, firm enough to keep the system regular."""
 _TYPICAL_RANGE_M = 10.0
-"""Unit of the conditioned scene. A mast 1.5 m high sees its ground from 2 m on; any value from 1 to 100 m
-takes as many iterations."""
+"""Unit of the conditioned scene. A mast 1.5 m high sees its ground from 2 m on; from 1 to 100 m the number of
+iterations is the same, but for starts that are far off."""
 
 
 class ProjectiveTemplate(SoftTemplate):
