@@ -185,6 +185,17 @@ def test_wrong_stopping_is_one_sentence_before_anything_is_read(run: Run, text: 
         assert part in done.stderr
 
 
+def test_matrices_with_explicit_landmarks_are_refused_in_one_line(
+    run: Run, traverse_folder: Path, tmp_path: Path
+) -> None:
+    words = ["--model", "projective", "--landmarks", "explicit"]
+    done = run("optimize_traverse.py", "traverse", "--out", "out", *words)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "landmarks: expected eliminated for the model projective, found explicit" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(
     ("words", "text"),
     [

@@ -317,5 +317,7 @@ def test_refusals() -> None:
         SolveOptions(model="projective", tie="hard")
     with pytest.raises(InputError, match="normalise: expected True for the model free"):
         SolveOptions(model="free", normalise=False)
+    with pytest.raises(InputError, match="projective, whose matrices have calibrations"):
+        SolveOptions(model="projective", sharing=Sharing(calibration=Freedom(scope="eye")))
     with pytest.raises(InputError, match="flex: calibration: expected a number above 0, found 0"):
         Flex(rotation_rad=0.02, translation_m=0.02, calibration=0.0)
