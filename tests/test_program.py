@@ -1,12 +1,15 @@
 """The programs as users run them: exit status, one sentence for bad input, nothing half-written."""
 
+import io
 import json
 import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +25,25 @@ Run = Callable[..., subprocess.CompletedProcess[str]]
 
 
 @pytest.fixture
-def run(scripts_folder: Path, tmp_path: Path) -> Run:
+def run(scripts_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """A program within this process: to start another one costs seconds of imports."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(script: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+        monkeypatch.setattr(sys, "argv", [str(scripts_folder / script), *arguments])
+        out, err = io.StringIO(), io.StringIO()
+        with redirect_stdout(out), redirect_stderr(err), pytest.raises(SystemExit) as ended:
+            runpy.run_path(sys.argv[0], run_name="__main__")
+        assert isinstance(ended.value.code, int)
+        return subprocess.CompletedProcess(sys.argv, ended.value.code, out.getvalue(), err.getvalue())
+
+    return call
+
+
+@pytest.fixture
+def run_apart(scripts_folder: Path, tmp_path: Path) -> Run:
+    """A program in a process of its own, as users start it."""
+
     def call(script: str, *arguments: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
             [sys.executable, str(scripts_folder / script), *arguments],
@@ -50,8 +71,8 @@ def traverse_folder(tmp_path: Path) -> Path:
     return tmp_path / "traverse"
 
 
-def test_solves_and_writes_the_contract(run: Run, traverse_folder: Path, tmp_path: Path) -> None:
-    done = run("optimize_traverse.py", "traverse", "--out", "out")
+def test_solves_and_writes_the_contract(run_apart: Run, traverse_folder: Path, tmp_path: Path) -> None:
+    done = run_apart("optimize_traverse.py", "traverse", "--out", "out")
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     assert done.stdout.count("\n") == 1
@@ -240,11 +261,11 @@ def test_no_observation_twice_is_bad_input(run: Run, tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_simulate_then_optimize(run: Run, tmp_path: Path) -> None:
+def test_simulate_then_optimize(run_apart: Run, tmp_path: Path) -> None:
     options = ("--stops", "1", "--pans", "2", "--sweep-deg", "45", "--seed", "3", "--noise-stretch", "4")
-    assert run("simulate_traverse.py", "made", *options).returncode == 0
-    assert run("optimize_traverse.py", "made", "--out", "out", "--no-report").returncode == 0
+    assert run_apart("simulate_traverse.py", "made", *options).returncode == 0
+    assert run_apart("optimize_traverse.py", "made", "--out", "out", "--no-report").returncode == 0
     assert (tmp_path / "out" / "residuals.csv").read_text().splitlines()[0].endswith("cov_vv_px2")
-    again = run("simulate_traverse.py", "made", *options)
+    again = run_apart("simulate_traverse.py", "made", *options)
     assert again.returncode == 2
     assert "made" in again.stderr
