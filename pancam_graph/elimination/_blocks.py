@@ -1,0 +1,107 @@
+"""Landmarks cut into blocks, and the columns of variables that each block touches."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from pancam_graph.elimination._linkage import Linkage
+from pancam_graph.elimination._panels import Panels
+from pancam_graph.geometry import IntArray
+from pancam_graph.landmarks import Measurements
+
+__all__ = ["Block", "Layout", "blocks_of"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Block:
+    """Landmarks first seen from one stop, and the groups that these touch.
+
+    Its columns are those that some segment touches, group by group. Each segment has an even number: the
+    kernel takes them in pairs, and one that fills up a pair belongs to nothing.
+    """
+
+    groups: tuple[int, ...]
+    """In the order of elimination."""
+    begin: IntArray
+    """(groups + 1,) first column of each in the block"""
+    segment_column: IntArray
+    """(segments,) first column of each segment in the block; negative where it is of another"""
+    row: IntArray
+    """(columns,) of each of the block's columns among those of its group; -1: of nothing"""
+    panel_column: tuple[IntArray, ...]
+    """For each of the groups, where in its panel each of the block's columns is; -1: of nothing"""
+    source: IntArray
+    """(columns,) of each among all columns; -1: of nothing"""
+    n_units: int
+
+    @staticmethod
+    def of(link: Linkage, layout: "Layout", panels: Panels, groups: tuple[int, ...]) -> "Block":
+        """The columns of a block that touches these groups; its units are not counted yet."""
+        begin = np.concatenate([[0], np.cumsum(layout.group_width[list(groups)])]).astype(np.int64)
+        shift = np.full(link.n_groups, np.iinfo(np.int32).min)
+        shift[list(groups)] = begin[:-1]
+        row = np.concatenate([np.zeros(0, dtype=np.int64), *(layout.row[g] for g in groups)])
+        of = np.repeat(np.array(groups, dtype=np.int64), np.diff(begin))
+
+        def among(first: IntArray) -> IntArray:
+            """Columns of the block, given where (groups,) each group begins; -1 where a group is not."""
+            return np.where((row < 0) | (first[of] < 0), -1, first[of] + row)
+
+        return Block(
+            groups=groups,
+            begin=begin,
+            segment_column=shift[link.group[link.segment_variable]] + layout.segment_column,
+            row=row,
+            panel_column=tuple(among(panels.first_columns(g)) for g in groups),
+            source=among(link.group_column),
+            n_units=0,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """Columns that segments touch, group by group, each segment's number filled up to an even one."""
+
+    group_width: IntArray
+    """(groups,) columns of each"""
+    segment_column: IntArray
+    """(segments,) first column of each in its group"""
+    row: tuple[IntArray, ...]
+    """For each group, where each of these columns is among all of the group's; -1: of nothing"""
+
+    @staticmethod
+    def of(linkage: Linkage) -> "Layout":
+        """Segments that touch the same columns share them."""
+        of = linkage.segment_variable
+        group, start = linkage.group[of], linkage.variable_column[of] + linkage.segment_column
+        begin = linkage.group_column
+        _, one, which = np.unique(begin[group] + start, return_index=True, return_inverse=True)
+        width = linkage.segment_width[one]
+        even = width + width % 2
+        place = np.cumsum(even) - even
+        group_width = np.bincount(group[one], even, minlength=linkage.n_groups).astype(np.int64)
+        group_begin = np.concatenate([[0], np.cumsum(group_width)])
+        step = np.arange(int(width.sum())) - np.repeat(np.cumsum(width) - width, width)
+        row = np.full(int(group_begin[-1]), -1)
+        row[np.repeat(place, width) + step] = np.repeat(start[one], width) + step
+        return Layout(
+            group_width=group_width,
+            segment_column=place[which] - group_begin[group],
+            row=tuple(row[a:b] for a, b in pairwise(group_begin)),
+        )
+
+
+def blocks_of(linkage: Linkage, m: Measurements) -> tuple[IntArray, dict[int, tuple[int, ...]]]:
+    """Block of each landmark, named by the first group that sees it, and the groups each block touches."""
+    groups = [linkage.unit_groups[u] for u in linkage.image_unit]
+    # What no variable moves is of a block of its own that touches nothing.
+    nobody = linkage.n_groups
+    image_first = np.array([g[0] if g else nobody for g in groups])
+    first = np.minimum.reduceat(image_first[m.image], m.starts)
+    seen = np.zeros((nobody + 1, len(groups)), dtype=bool)
+    seen[first[m.landmark], m.image] = True
+    return first, {
+        int(b): tuple(sorted(set().union(*(groups[i] for i in np.flatnonzero(seen[b])))))
+        for b in np.unique(first)
+    }
