@@ -93,6 +93,7 @@ class SolutionFile(Entry):
     version: Literal[1] = 1
     model: str
     landmarks: str
+    method: str = "joint"
     converged: bool
     stop_reason: str
     iterations: int
@@ -152,6 +153,7 @@ def solution_file(solution: Solution) -> SolutionFile:
     return SolutionFile(
         model=solution.model,
         landmarks=solution.landmarks,
+        method=solution.method,
         converged=bool(solution.converged),
         stop_reason=solution.stop_reason,
         iterations=int(solution.iterations),
