@@ -7,6 +7,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
+from pancam_graph._alternation import AlternatingSolver
 from pancam_graph._covariance import Uncertainty, uncertainty
 from pancam_graph._diagnose import connection_warnings, listed
 from pancam_graph._eliminated import EliminatedSolver
@@ -29,7 +30,7 @@ from pancam_graph.graph import (
 from pancam_graph.initialise import FreeCameras, Start, start_from_telemetry
 from pancam_graph.landmarks import Landmarks, Measurements, rays_of, refine, residuals, triangulate
 from pancam_graph.losses import loss_of
-from pancam_graph.options import SolveOptions
+from pancam_graph.options import Method, SolveOptions
 from pancam_graph.sharing import Sharing
 from pancam_graph.solution import RigCorrection, Solution, State
 from pancam_graph.stopping import StopRule
@@ -39,7 +40,10 @@ __all__ = ["Adjustment"]
 
 _LOG = logging.getLogger(__name__)
 
-_SOLVERS: dict[str, type[Solver]] = {"eliminated": EliminatedSolver, "explicit": ExplicitSolver}
+_SOLVERS: dict[Method, type[EliminatedSolver]] = {
+    "joint": EliminatedSolver,
+    "alternation": AlternatingSolver,
+}
 _SCREENING_ROUNDS = 12
 _ABOUT = 0.002
 """The first pass of screening ends when no more than this share of the observations changes."""
@@ -73,14 +77,18 @@ class Adjustment:
         self.noise = self.observations.noise
         self.reason = np.full(len(self.observations), "", dtype=object)
         given = self.start.cameras if options.model in {"free", "projective"} else None
-        self.solver = (
-            EliminatedSolver(on_iteration, is_near=True)
-            if given is not None and options.landmarks == "eliminated"
-            else _SOLVERS[options.landmarks](on_iteration)
-        )
+        self.solver = self._new_solver(on_iteration, is_near=given is not None)
         self.sharing = (options.sharing or traverse.sharing or Sharing()).for_model(options.model)
         template = _template(traverse, options, self.sharing)
+        self.solver.require(template)
         self.problem = self.first = self._first_problem(template, given).placed()
+
+    def _new_solver(
+        self, on_iteration: Callable[[Iteration], None] | None, *, is_near: bool = False
+    ) -> Solver:
+        if self.options.landmarks == "explicit":
+            return ExplicitSolver(on_iteration)
+        return _SOLVERS[self.options.method](on_iteration, is_near=is_near)
 
     # --- preparation ---
 
@@ -265,7 +273,7 @@ class Adjustment:
         found, outcome = self.solver.adjust(part, self.options)
         if outcome.converged:
             return found, outcome
-        return _SOLVERS[self.options.landmarks](self.solver.on_iteration).adjust(part, self.options)
+        return self._new_solver(self.solver.on_iteration).adjust(part, self.options)
 
     def _note_behind(self, behind: BoolArray) -> None:
         self.reason[self.problem.measurements.row[behind]] = "behind"
@@ -332,6 +340,7 @@ class Adjustment:
             traverse=t,
             model=self.options.model,
             landmarks=self.options.landmarks,
+            method=self.options.method,
             converged=outcome.converged,
             stop_reason=outcome.reason,
             iterations=len(outcome.costs) - 1,

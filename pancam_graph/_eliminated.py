@@ -52,8 +52,12 @@ class EliminatedSolver(Solver):
             problem, outcome = self._fit_rigid(problem, loss, stage)
             costs = outcome.costs[:-1]
         self._is_near = True
-        problem, outcome = self._minimise(problem, rule, loss, stage)
+        problem, outcome = self._from_near(problem, rule, loss, stage)
         return problem, replace(outcome, costs=costs + outcome.costs)
+
+    def _from_near(self, problem: Problem, rule: StopRule, loss: Loss, stage: str) -> tuple[Problem, Outcome]:
+        """Least cost where a rigid mast is no better place to start from."""
+        return self._minimise(problem, rule, loss, stage)
 
     def _fit_rigid(self, problem: Problem, loss: Loss, stage: str) -> tuple[Problem, Outcome]:
         """The problem with cameras where a rigid mast fits best.
@@ -98,11 +102,22 @@ class EliminatedSolver(Solver):
         )
         if blocks.settle(outcome.values):
             joint = None  # it was that of another point
+        return self._ended(problem, outcome, system, rows, joint), outcome
+
+    def _ended(
+        self,
+        problem: Problem,
+        outcome: Outcome,
+        system: LandmarkSystem,
+        rows: IntArray,
+        joint: Root | None = None,
+    ) -> Problem:
+        """The problem where a fit ended; what it left is kept for `reduced`."""
         vector = problem.landmarks.vector.copy()
         vector[rows] = system.landmarks().vector
         found = problem.at(outcome.values, replace(problem.landmarks, vector=vector))
         self._last = _Fit(problem=found, system=system, rows=rows, joint=joint)
-        return found, outcome
+        return found
 
     def reduced(self, problem: Problem) -> ReducedSystem | None:
         """The problem with landmarks eliminated, from the last fit; None if this did not end there."""

@@ -12,7 +12,7 @@ from pancam_graph.geometry import IntArray
 from pancam_graph.graph import read_variable
 from pancam_graph.stopping import StopRule
 
-__all__ = ["Elimination", "InOrder", "Iteration", "Outcome", "optimise"]
+__all__ = ["Elimination", "InOrder", "Iteration", "Outcome", "is_short", "optimise"]
 
 _LOG = logging.getLogger(__name__)
 _INDETERMINATE = "ndeterminate"
@@ -91,7 +91,7 @@ def optimise(
                 on_iteration(Iteration(stage=stage, number=number, cost=costs[-1]))
             if optimizer.lambda_() >= parameters.getlambdaUpperBound():
                 reason = "no step lowers the cost"
-            elif costs[-1] < costs[-2] and _is_short(before, optimizer.values(), rule.relative_step):
+            elif costs[-1] < costs[-2] and is_short(before, optimizer.values(), rule.relative_step):
                 reason = f"relative step below {rule.relative_step:g}"
             elif rule.relative_decrease and _is_settled(costs, rule.relative_decrease, gain_ahead, optimizer):
                 reason = f"relative decrease below {rule.relative_decrease:g}"
@@ -121,7 +121,7 @@ def _gradient(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, held: Map
     return largest
 
 
-def _is_short(before: gtsam.Values | None, after: gtsam.Values, share: float) -> bool:
+def is_short(before: gtsam.Values | None, after: gtsam.Values, share: float) -> bool:
     """Whether a step is no longer than a share of the parameters before it, if given; see StopRule."""
     if before is None:
         return False

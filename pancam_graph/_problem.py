@@ -113,10 +113,13 @@ def _resolution(problem: Problem) -> float:
 
 
 class Solver(ABC):
-    """A way to treat landmarks."""
+    """A way to minimise."""
 
     def __init__(self, on_iteration: Callable[[Iteration], None] | None) -> None:
         self.on_iteration = on_iteration
+
+    def require(self, template: FactorTemplate) -> None:  # noqa: B027  most ways have nothing to ask for
+        """Raise InputError where a template has not what this way needs."""
 
     @abstractmethod
     def approach(self, problem: Problem, rule: StopRule, loss: Loss, stage: str) -> Problem:

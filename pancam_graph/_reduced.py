@@ -11,7 +11,7 @@ from pancam_graph.elimination import LandmarkSystem, Linkage, Panels, Root
 from pancam_graph.geometry import IntArray
 from pancam_graph.graph import FactorTemplate
 
-__all__ = ["ReducedSystem", "held_columns", "joint_root"]
+__all__ = ["ReducedSystem", "add_factors", "held_columns", "joint_root", "loosened_root"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -40,7 +40,7 @@ def joint_root(
     template: FactorTemplate, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, panels: Panels
 ) -> Root:
     """Square root of what is left of the landmarks, with priors and ties added. Destroys the panels."""
-    _add(panels, template.linkage, factors.linearize(values))
+    add_factors(panels, template.linkage, factors.linearize(values))
     panels.hold(held_columns(template))
     return panels.root()
 
@@ -58,8 +58,8 @@ def loosened_root(problem: Problem, system: LandmarkSystem, factor: float) -> Ro
         of_camera = any(chr(gtsam.symbolChr(key)) == "X" for key in one.keys())  # noqa: SIM118  a gtsam factor
         (ties if of_camera else priors).push_back(one)
     panels = system.linearise(template.posture(problem.values))
-    _add(panels, link, ties.linearize(problem.values))
-    _add(panels, link, priors.linearize(problem.values), weight=factor**-2)
+    add_factors(panels, link, ties.linearize(problem.values))
+    add_factors(panels, link, priors.linearize(problem.values), weight=factor**-2)
     panels.hold(held_columns(template))
     return panels.root()
 
@@ -76,7 +76,9 @@ def held_columns(template: FactorTemplate) -> dict[int, IntArray]:
     return out
 
 
-def _add(panels: Panels, linkage: Linkage, linear: gtsam.GaussianFactorGraph, weight: float = 1.0) -> None:
+def add_factors(
+    panels: Panels, linkage: Linkage, linear: gtsam.GaussianFactorGraph, weight: float = 1.0
+) -> None:
     """Add priors and ties, as GTSAM linearises them."""
     # GTSAM counts from 1, takes keys in ascending order, and appends the right-hand side as a last column.
     keys = sorted(linear.keys())

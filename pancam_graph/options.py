@@ -1,7 +1,7 @@
 """How to solve."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from pancam_graph.errors import InputError
 from pancam_graph.graph import DEFAULT_FLEX, Flex, Model, Tie
@@ -9,7 +9,9 @@ from pancam_graph.losses import LossName, loss_of
 from pancam_graph.sharing import Sharing
 from pancam_graph.stopping import StopRule
 
-__all__ = ["SolveOptions"]
+__all__ = ["Method", "SolveOptions"]
+
+Method = Literal["joint", "alternation"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,6 +26,9 @@ class SolveOptions(StopRule):
     landmarks: Literal["eliminated", "explicit"] = "eliminated"
     """How landmarks are treated: eliminated from every linearisation, or as variables of the graph, which is
     slow and serves for checking."""
+    method: Method = "joint"
+    """How the final least squares is solved: all at once, or what stops share and what they do not in turn
+    (the thesis's own way; it needs eliminated landmarks and something shared that is free)."""
     loss: LossName = "huber"
     """Robust loss while outliers are sought. The final estimate is always least squares over the
     observations that were kept; "none" keeps all of them."""
@@ -53,10 +58,13 @@ class SolveOptions(StopRule):
         for name, value, choices in (
             ("model", self.model, tuple(DEFAULT_FLEX)),
             ("landmarks", self.landmarks, ("eliminated", "explicit")),
+            ("method", self.method, get_args(Method)),
             ("tie", self.tie or "soft", ("hard", "soft")),
         ):
             if value not in choices:
                 raise InputError(f"{name}: expected one of {', '.join(choices)}; found {value!r}")
+        if self.method == "alternation" and self.landmarks == "explicit":
+            raise InputError("method: expected joint with explicit landmarks, found alternation")
         if self.tie == "hard" and self.model != "mast":
             raise InputError(
                 f"tie: expected soft for the model {self.model}, found hard: its cameras are variables"

@@ -156,6 +156,8 @@ class Solution:
     """(landmarks, 3, 3) of `final.landmarks_m`, all else marginalised; formal; where it was asked for."""
     refined: tuple[Refined, ...] = ()
     """Entries of the rig that were free (`Sharing`), in the order of quantity and owner."""
+    method: str = "joint"
+    """How it was solved."""
     cross_validation: CrossValidation | None = None
     """What solutions from halves of the tracks say of the sigmas; where it was asked for."""
     warnings: tuple[str, ...] = ()

@@ -39,6 +39,13 @@ def main() -> int:
         help="eliminated: terrain points follow the cameras (default); explicit: they are variables, slow",
     )
     parser.add_argument(
+        "--method",
+        choices=("joint", "alternation"),
+        default="joint",
+        help="joint: everything at once (default); alternation: what all stops share and everything else in "
+        "turn, slow",
+    )
+    parser.add_argument(
         "--loss",
         choices=("none", "huber", "cauchy"),
         default="huber",
@@ -61,7 +68,7 @@ def main() -> int:
     parser.add_argument("--no-report", action="store_true", help="do not write report.html")
     arguments = parser.parse_args()
     show_log(verbose=arguments.verbose)
-    choices = {name: getattr(arguments, name) for name in ("model", "landmarks", "loss")}
+    choices = {name: getattr(arguments, name) for name in ("model", "landmarks", "method", "loss")}
     sharing = parse_sharing(arguments.sharing)
     options = SolveOptions(**choices, sharing=sharing, **criteria(arguments.stop))
     progress = Progress()

@@ -209,6 +209,44 @@ def test_held_columns_are_independent_of_all_others_and_sure_when_released(name:
         assert covariance.block(g, h) == pytest.approx(system.of(expected, g, h), abs=1e-12)
 
 
+@pytest.mark.parametrize("scaled", [False, True])
+@pytest.mark.parametrize("name", GRAPHS)
+def test_back_substitution_solves_the_system(name: str, scaled: bool) -> None:
+    system = Random(name, scaled=scaled)
+    size = np.sqrt(np.diag(system.S))
+    expected = -np.linalg.solve(system.S / np.outer(size, size), system.s / size)
+    step = system.panels.root().step()
+    assert step * size == pytest.approx(expected, rel=1e-8, abs=1e-9 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("name", ["one", "chain", "chain with what all share", "all"])
+def test_back_substitution_solves_what_leaves_directions_free(name: str) -> None:
+    system = Random(name, rows=3)
+    step = system.panels.root().step()
+    assert system.S @ step == pytest.approx(-system.s, abs=1e-8 * np.abs(system.s).max())
+
+
+def test_held_columns_do_not_move_at_all() -> None:
+    system = Random("chain with what all share")
+    held = {0: np.array([1, 3]), 4: np.arange(3)}
+    fixed = np.concatenate([system.begin[g] + columns for g, columns in held.items()])
+    free = np.setdiff1d(np.arange(len(system.S)), fixed)
+    system.panels.hold(held)
+    step = system.panels.root().step()
+    assert not step[fixed].any()
+    assert step[free] == pytest.approx(-np.linalg.solve(system.S[np.ix_(free, free)], system.s[free]))
+
+
+@pytest.mark.parametrize("name", GRAPHS)
+def test_damping_adds_a_share_of_the_diagonal(name: str) -> None:
+    system = Random(name)
+    assert np.array_equal(system.panels.diagonal(), np.diag(whole(system.panels)[0]))
+    assert np.array_equal(system.panels.right(), whole(system.panels)[1])
+    system.panels.damp(0.5)
+    expected = system.S + 0.5 * np.diag(np.diag(system.S))
+    assert whole(system.panels)[0] == pytest.approx(expected, rel=1e-12)
+
+
 def test_entries_one_by_one_are_the_same_as_a_dense_piece() -> None:
     system = Random("chain with what all share")
     panels = Panels(system.panels.structure)
@@ -318,6 +356,33 @@ def test_free_calibrations_eliminate_as_dense_ones(shared: bool, far: bool, loss
     assert_systems_agree(S, s, expected)
     cost = true_cost(rigged.landmarks, rigged.m, rigged.views, chosen)
     assert system.block_costs().sum() == pytest.approx(cost, rel=1e-12)
+
+
+@pytest.mark.parametrize("loss", ["none", "cauchy"])
+@pytest.mark.parametrize("shared", [False, True])
+def test_what_landmarks_took_from_a_group_can_be_put_back(shared: bool, loss: LossName) -> None:
+    """Then it is the group's own system, landmarks and all others held; what else was added stays."""
+    rigged, chosen = Rigged(shared=shared), loss_of(loss)
+    system = LandmarkSystem(rigged.linkage, rigged.m, rigged.landmarks, chosen)
+    panels = system.linearise(rigged.posture())
+    dense = dense_of(rigged.after, int(rigged.begin[-1]), rigged.m, rigged.landmarks, chosen)
+    for g in range(rigged.linkage.n_groups):
+        columns = slice(*rigged.linkage.group_column[g : g + 2])
+        A, n = dense.A[:, columns], columns.stop - columns.start
+        size = np.linalg.norm(A, axis=0)
+        panels.add([g], np.diag(size**2), 2 * size)
+        S, s = system.put_back(panels, g)
+        assert S / np.outer(size, size) == pytest.approx(A.T @ A / np.outer(size, size) + np.eye(n), abs=1e-8)
+        assert s / size == pytest.approx(A.T @ dense.r / size + 2, abs=1e-8 * np.linalg.norm(dense.r))
+
+
+@pytest.mark.parametrize("loss", ["none", "huber"])
+def test_the_cost_elsewhere_with_landmarks_held(loss: LossName) -> None:
+    rigged, chosen = Rigged(shared=True), loss_of(loss)
+    system = LandmarkSystem(rigged.linkage, rigged.m, rigged.landmarks, chosen)
+    views = rigged.after(rigged.random_step(np.random.default_rng(2), 1e-2))
+    expected = true_cost(rigged.landmarks, rigged.m, views, chosen)
+    assert system.cost_at(rigged.posture(views)) == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize("shared", [False, True])

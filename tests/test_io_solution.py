@@ -71,6 +71,12 @@ def test_solution_json_has_the_keys_of_the_contract(tmp_path: Path) -> None:
     assert data["warnings"] == ["a track is seen once"]
 
 
+def test_a_method_other_than_joint_is_named(tmp_path: Path) -> None:
+    save_solution(io_samples.solution(method="alternation"), tmp_path / "out")
+    assert json.loads((tmp_path / "out" / "solution.json").read_text())["method"] == "alternation"
+    assert read_solution_json(tmp_path / "out" / "solution.json").method == "alternation"
+
+
 def test_solution_json_counts_the_used_observations(tmp_path: Path) -> None:
     solution = io_samples.solution()
     save_solution(solution, tmp_path / "out")

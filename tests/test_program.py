@@ -81,6 +81,7 @@ def test_solves_and_writes_the_contract(run_apart: Run, traverse_folder: Path, t
     solution = read_solution_json(out / "solution.json")
     assert solution.model == "mast"
     assert solution.landmarks == "eliminated"
+    assert solution.method == "joint"
     raw = json.loads((out / "solution.json").read_text())
     n = len(json.loads((traverse_folder / "traverse.json").read_text())["images"])
     assert len(raw["images"]) == n
@@ -97,6 +98,24 @@ def test_models_and_no_report(run: Run, traverse_folder: Path, tmp_path: Path, m
     assert solution.model == model
     if model == "projective":  # the calibration that each matrix holds
         assert [r.image for r in solution.refined] == [i.id for i in solution.images for _ in range(5)]
+
+
+def test_a_method_other_than_joint_is_taken_and_named(
+    run: Run, traverse_folder: Path, tmp_path: Path
+) -> None:
+    turns = ("--method", "alternation", "--no-report", "--stop", "max_iterations=3")
+    done = run("optimize_traverse.py", "traverse", "--out", "out", "--model", "circle", *turns)
+    assert done.returncode == 1, done.stderr
+    solution = read_solution_json(tmp_path / "out" / "solution.json")
+    assert solution.method == "alternation"
+    assert solution.stop_reason == "iteration limit of 3"
+    done = run("optimize_traverse.py", "traverse", "--out", "other", *turns)
+    assert done.returncode == 2
+    assert done.stderr == (
+        "method: expected joint with the model mast as it is, found alternation: "
+        "nothing is free that all stops share\n"
+    )
+    assert not (tmp_path / "other").exists()
 
 
 def test_cross_validation_is_written_and_said(run: Run, traverse_folder: Path, tmp_path: Path) -> None:

@@ -148,6 +148,20 @@ class Panels:
                     panel[:, place[g] + columns] = 0.0
             self.panel[g][columns, columns] = 1.0
 
+    def diagonal(self) -> FloatArray:
+        """Diagonal of S (columns,), group by group."""
+        return np.concatenate([np.zeros(0), *(np.diag(panel) for panel in self.panel)])
+
+    def right(self) -> FloatArray:
+        """Right-hand side s (columns,), group by group."""
+        return np.concatenate([np.zeros(0), *(panel[:, -1] for panel in self.panel)])
+
+    def damp(self, share: float) -> None:
+        """Add a share of the diagonal to it."""
+        for panel in self.panel:
+            own = np.arange(len(panel))
+            panel[own, own] *= 1 + share
+
     def trace_with(self, covariance: "Covariance") -> float:
         """Trace of S times a covariance that has its blocks."""
         total = 0.0
@@ -224,6 +238,24 @@ class Root:
     def gain(self) -> float:
         """By how much the step that solves the system lowers the cost, as far as it is linear: |e|^2 / 2."""
         return 0.5 * sum(float(rows[:, -1] @ rows[:, -1]) for rows in self.rows)
+
+    def step(self) -> FloatArray:
+        """The x (columns,) that solves S x = -s, by back substitution in R x = -e; group by group.
+
+        Where a group's rows leave directions free, the shortest one for what the later groups do.
+        """
+        st = self.structure
+        begin = np.concatenate([[0], np.cumsum(st.dim)])
+        x = np.zeros(int(begin[-1]))
+        for g in reversed(st.order):
+            n, rows = int(st.dim[g]), self.rows[g]
+            rest = np.concatenate([np.zeros(0), *(x[begin[h] : begin[h + 1]] for h in st.after[g][1:])])
+            right = -rows[:, -1] - rows[:, n:-1] @ rest
+            own = rows[:, :n]
+            # Rows come in the order of their pivots, which is not that of the columns.
+            found = np.linalg.solve(own, right) if len(own) == n else np.linalg.lstsq(own, right)[0]
+            x[begin[g] : begin[g + 1]] = found
+        return x
 
     def covariance(self) -> "Covariance":
         """The blocks of the inverse of R'R where R is filled (Takahashi's recursion).

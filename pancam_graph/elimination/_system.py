@@ -245,6 +245,34 @@ class LandmarkSystem:
             in_parallel(summed, n_groups, grain=grain)
         return self._panels
 
+    def put_back(self, panels: Panels, g: int) -> tuple[FloatArray, FloatArray]:
+        """The system (n, n), (n,) in the columns of one group, landmarks and other variables held.
+
+        `panels` are those of the last linearisation, whatever else was added to them. Of each landmark they
+        have lost W'W and W'gamma, W = L^-1 E' and gamma = L^-1 g with L L' = V; both are put back.
+        """
+        n = int(self.linkage.group_dim[g])
+        upper = np.triu(panels.panel[g][:, :n])
+        S, s = upper + np.triu(upper, 1).T, panels.panel[g][:, -1].copy()
+        arms = self.reduced.arms.reshape(-1, 3, 2)
+        for chunk in self.chunks:
+            block = self.blocks[chunk.block]
+            if g not in block.groups:
+                continue
+            i = block.groups.index(g)
+            first, last = self.sights.pair_begin[chunk.begin], self.sights.pair_begin[chunk.end]
+            counts = np.diff(self.sights.pair_begin[chunk.begin : chunk.end + 1])
+            landmark, pair = np.repeat(np.arange(len(counts)), counts), self.sights.pair[first:last]
+            own = (2 * pair >= block.begin[i]) & (2 * pair < block.begin[i + 1])
+            # One column more, of nothing: what fills up a pair goes there.
+            W = np.zeros((len(counts), 3, n + 1))
+            for half in range(2):
+                W[landmark[own], :, block.row[2 * pair[own] + half]] = arms[first:last][own, :, half]
+            W = W.reshape(-1, n + 1)[:, :n]
+            S += W.T @ W
+            s += W.T @ self.reduced.gamma[chunk.begin : chunk.end].ravel()
+        return S, s
+
     @cached_property
     def _waves(self) -> list[list[_Chunk]]:
         """Chunks whose dense systems are in memory at once."""
@@ -301,6 +329,26 @@ class LandmarkSystem:
         self._has_moved = True
         self._replace_strays(posture.views, bearings)
         return self._by_block(self._moved_cost)
+
+    def cost_at(self, posture: Posture) -> float:
+        """True cost where landmarks stay at the point of linearisation and cameras are elsewhere."""
+        bearings, cost, loss = self.bearings(posture), np.empty(len(self.vector)), self.loss
+
+        def work(begin: int, end: int) -> None:
+            which = np.arange(begin, end)
+            kernel.costs(
+                self.sights,
+                bearings,
+                which,
+                self.vector[begin:end],
+                self.origin_m,
+                loss.kind,
+                loss.width,
+                cost[begin:end],
+            )
+
+        in_parallel(work, len(cost), grain=_STRAY_GRAIN)
+        return float(cost.sum())
 
     def _replace_strays(self, views: CameraViews, bearings: kernel.Bearings) -> None:
         """Place anew what a step leaves behind a camera or off; elsewhere the linear step is good.

@@ -106,6 +106,8 @@ class SolutionFile(Entry):
     images: list[SolvedImageEntry]
     cameras: list[CameraEntry]
     """As the cameras of a rig in `traverse.json`, refined where an eye has one correction for all images."""
+    method: str = "joint"
+    """The key is missing where it was joint."""
     refined: list[RefinedEntry] = Field(default_factory=list)
     """Entries of the rig that were free; no such key where none was."""
     warnings: list[str]
@@ -121,7 +123,11 @@ def read_solution_json(path: Path | str) -> SolutionFile:
 
 def solution_json(solution: Solution) -> bytes:
     """A solution as the content of `solution.json`; null in place of what is not finite."""
-    missing = {"refined": not solution.refined, "cross_validation": solution.cross_validation is None}
+    missing = {
+        "method": solution.method == "joint",
+        "refined": not solution.refined,
+        "cross_validation": solution.cross_validation is None,
+    }
     data = solution_file(solution).model_dump(exclude={name for name, gone in missing.items() if gone})
     return f"{json.dumps(data, indent=1, allow_nan=False, ensure_ascii=False)}\n".encode()
 
@@ -187,6 +193,7 @@ def solution_file(solution: Solution) -> SolutionFile:
         ],
         # What the reader noticed comes first, once, whether or not the solver passed it on.
         warnings=list(dict.fromkeys([*traverse.warnings, *solution.warnings])),
+        method=solution.method,
         cross_validation=None if validation is None else CrossValidationEntry.of(validation, traverse),
     )
 
