@@ -159,6 +159,7 @@ def test_outliers_are_sought_jointly_and_the_same_ones_go() -> None:
     assert turns.cost_final == pytest.approx(joint.cost_final, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_halves_of_the_tracks_are_solved_in_turn_too() -> None:
     found = cross_validate(traverse(), ways("radius")[1], solution=solved("radius", "alternation"))
     expected = cross_validate(traverse(), ways("radius")[0], solution=solved("radius", "joint"))
@@ -274,7 +275,7 @@ def test_without_a_criterion_only_the_lack_of_a_better_step_ends_it() -> None:
 
 
 def test_what_is_left_to_gain_where_the_decrease_ends_it_is_no_more_than_it_says() -> None:
-    """Gains of 1 % of what is left would look settled long before."""
+    """Though a round gains a small part of that alone."""
     options = replace(SHARED["mounts"], loss="none", method="alternation", max_iterations=1000)
     turns = solve(traverse(), options)
     assert turns.stop_reason == "relative decrease below 1e-07"
