@@ -1,0 +1,91 @@
+"""Which experiments there are, how large, and which are left out here."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from experiments import opportunity, validation
+from experiments.models import FULL_RIG, ClusterTask, Variant
+from experiments.running import Task
+from experiments.scenarios import NOISES_PX, Scenario
+
+__all__ = ["CLUSTERS", "FAMILIES", "PANORAMAS", "TRAVERSES", "Plan", "plan"]
+
+CLUSTERS = (
+    Scenario(name="one cluster, one eye", eyes="one eye"),
+    Scenario(name="one cluster, both eyes", eyes="both eyes"),
+    Scenario(name="three clusters, one eye", eyes="one eye", stops=3),
+    Scenario(name="three clusters, both eyes", eyes="both eyes", stops=3),
+)
+DENSE = Scenario(name="one cluster, one eye, 150 points per image", eyes="one eye", points_per_image=150)
+"""The same with six times as many tracks: how much of the difference between models is left."""
+PANORAMAS = tuple(
+    Scenario(
+        name=f"two panoramas {spacing_m} m apart, {eyes}",
+        eyes=eyes,
+        stops=2,
+        images=36 if eyes == "both eyes" else 18,
+        spacing_m=spacing_m,
+        points_per_image=60,
+        reach_m=100.0,
+    )
+    for eyes in ("both eyes", "one eye")
+    for spacing_m in (5, 10, 20)
+)
+TRAVERSES = (
+    Scenario(
+        name="traverse of ten stops, both eyes",
+        eyes="both eyes",
+        stops=10,
+        points_per_image=60,
+        reach_m=100.0,
+    ),
+    Scenario(
+        name="traverse of ten stops, one eye", eyes="one eye", stops=10, points_per_image=60, reach_m=100.0
+    ),
+)
+_MIDDLE_PX = (0.5,)
+FAMILIES = ("validation", "clusters", "localisation", "opportunity")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What is run, and what is not and why."""
+
+    tasks: tuple[Task, ...]
+    left_out: tuple[str, ...]
+
+
+def plan(*, seeds: int, quick: bool, families: Sequence[str] = FAMILIES) -> Plan:
+    """The tasks of some families of experiments, each over so many seeds."""
+    tasks: list[Task] = []
+    left_out: list[str] = []
+    if "validation" in families:
+        tasks += [validation.ValidationTask(noise_px=0.5, seed=seed) for seed in range(min(seeds, 10))]
+    if "clusters" in families:
+        noises = (0.1, 0.5, 2.0) if quick else NOISES_PX
+        tasks += _over_seeds(CLUSTERS, noises, seeds, FULL_RIG)
+        tasks += _over_seeds([DENSE], _MIDDLE_PX, seeds, FULL_RIG)
+    if "localisation" in families:
+        tasks += _over_seeds(PANORAMAS, _MIDDLE_PX, seeds, FULL_RIG)
+        tasks += _over_seeds(TRAVERSES, _MIDDLE_PX, seeds, FULL_RIG)
+    if "opportunity" in families:
+        folder = opportunity.opportunity_folder()
+        if folder is None:
+            left_out.append(
+                f"{opportunity.NAME}: its images are not part of the repository and were not found in "
+                "../shared or in the folder that PANCAM_GRAPH_SHARED names"
+            )
+        else:
+            tasks.append(opportunity.OpportunityTask(folder=folder, models=("mast", "circle", "free")))
+    return Plan(tasks=tuple(tasks), left_out=tuple(left_out))
+
+
+def _over_seeds(
+    scenarios: Iterable[Scenario], noises_px: Iterable[float], seeds: int, variants: tuple[Variant, ...]
+) -> list[ClusterTask]:
+    return [
+        ClusterTask(scenario=scenario, noise_px=noise_px, seed=seed, variants=variants)
+        for scenario in scenarios
+        for noise_px in noises_px
+        for seed in range(seeds)
+    ]

@@ -1,0 +1,145 @@
+"""What was expected, and whether the figures bear it out."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+from experiments.registry import CLUSTERS, PANORAMAS
+from experiments.running import Row
+from experiments.validation import NAME as VALIDATION
+
+__all__ = ["Results", "Verdict", "number", "verdicts"]
+
+_ORDER = ("mast", "circle", "free", "projective")
+_LEAST_PX = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """An expectation and what was found, place by place."""
+
+    expectation: str
+    found: tuple[tuple[str, bool], ...]
+    """Figures of one experiment, and whether they are as expected."""
+    explanation: str
+    """Why not, where not."""
+
+    @property
+    def holds(self) -> bool:
+        """Whether it does everywhere; an expectation without figures does not."""
+        return bool(self.found) and all(ok for _, ok in self.found)
+
+
+class Results:
+    """Rows by what they are of. Only those where the rig is known, as one row for each model."""
+
+    def __init__(self, rows: Sequence[Row]) -> None:
+        self.rows = tuple(rows)
+        self._row = {(r.experiment, r.model, r.sharing, r.noise_px, r.metric): r for r in rows}
+        self._first = {}
+        for r in rows:
+            self._first.setdefault((r.experiment, r.model), r.sharing)
+
+    def get(self, experiment: str, model: str, noise_px: float | None, metric: str) -> Row | None:
+        """The row of a model as the experiment has it first: with as little free as it can have."""
+        sharing = self._first.get((experiment, model), "")
+        return self._row.get((experiment, model, sharing, noise_px, metric))
+
+    def noises(self, experiment: str) -> tuple[float, ...]:
+        """Noises of an experiment, ascending."""
+        return tuple(
+            sorted({r.noise_px for r in self.rows if r.experiment == experiment and r.noise_px is not None})
+        )
+
+    def models(self, experiment: str) -> tuple[str, ...]:
+        """Models of an experiment, in the order of how much they know."""
+        present = {r.model for r in self.rows if r.experiment == experiment}
+        return tuple(m for m in _ORDER if m in present)
+
+
+def number(value: float) -> str:
+    """Three digits; what lies among the failed runs is infinite."""
+    return "∞" if math.isinf(value) else f"{value:.3g}"
+
+
+def verdicts(results: Results) -> list[Verdict]:
+    """All expectations of which there are figures."""
+    return [
+        v
+        for v in (_same_optimum(results), _order(results), _landmarks(results), _distance(results))
+        if v.found
+    ]
+
+
+def _same_optimum(results: Results) -> Verdict:
+    found = [
+        (f"{row.experiment}: median {number(row.median)}, worst {number(row.q95)}", row.q95 <= 1e-8)
+        for row in results.rows
+        if row.experiment == VALIDATION and row.metric == "cost_relative"
+    ]
+    return Verdict(
+        expectation="The joint solver and a dense, independent one end at the same cost to 1e-8",
+        found=tuple(found),
+        explanation="",
+    )
+
+
+def _order(results: Results) -> Verdict:
+    found = []
+    for scenario in CLUSTERS:
+        for noise in results.noises(scenario.name):
+            models = results.models(scenario.name)
+            rows = [results.get(scenario.name, m, noise, "centre_mm") for m in models]
+            if noise < _LEAST_PX or len(rows) < 2 or None in rows:
+                continue
+            medians = [r.median for r in rows if r is not None]
+            ok = all(
+                a <= b if model == "projective" else a < b
+                for (a, b), model in zip(pairwise(medians), models[1:], strict=True)
+            )
+            text = ", ".join(f"{m} {number(v)}" for m, v in zip(models, medians, strict=True))
+            found.append((f"{scenario.name}, {noise} px: {text} mm", ok))
+    return Verdict(
+        expectation="Camera centres: mast < circle < free <= projective at half a pixel and more",
+        found=tuple(found),
+        explanation="Within one cluster centres differ by what a model lets them leave the circle. Between "
+        "clusters all models have the same ties, tracks that two clusters see: their error, centimetres, is "
+        "common to all models and may hide the millimetres by which they differ.",
+    )
+
+
+def _landmarks(results: Results) -> Verdict:
+    found = []
+    name = CLUSTERS[0].name
+    for noise in results.noises(name):
+        mast, free = (results.get(name, m, noise, "landmark_m") for m in ("mast", "free"))
+        if mast is None or free is None or noise < _LEAST_PX:
+            continue
+        ratio = free.median / mast.median if math.isfinite(mast.median) else 0.0
+        text = f"{noise} px: mast {number(mast.median)}, free {number(free.median)} m, ratio {number(ratio)}"
+        found.append((text, ratio >= 3))
+    return Verdict(
+        expectation="Landmarks of a one-eye cluster: the mast's RMS error is at most a third of the free's",
+        found=tuple(found),
+        explanation="A landmark's own noise is common to all models: at 20 m two rays 5 cm apart tell its "
+        "distance to 25 % at half a pixel even if cameras are known. Where that is more than what cameras add, "
+        "no model of the mast can take it away. The RMS is then that of the few points that lie at infinity or "
+        "beyond; the tables have medians and near points too.",
+    )
+
+
+def _distance(results: Results) -> Verdict:
+    found = []
+    for scenario in PANORAMAS:
+        row = results.get(scenario.name, "mast", 0.5, "distance_percent")
+        if row is not None:
+            text = f"{scenario.name}: {number(row.median)} % ({number(row.q05)} to {number(row.q95)})"
+            found.append((text, row.median < 0.5))
+    return Verdict(
+        expectation="Distance of two panoramas with the mast model: off by less than 0.5 % at half a pixel",
+        found=tuple(found),
+        explanation="The scale is that of the mast: with one eye 0.14 m from its axis, with both 0.2 m between "
+        "them besides. The farther the stops, the farther the points that both see, and the less of its own "
+        "scale a stop sees in them.",
+    )
