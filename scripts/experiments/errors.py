@@ -6,7 +6,7 @@ millimetres of its centres. Where a stop's place is asked for, nothing may be sc
 cameras are laid on the true ones by a rigid motion.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -89,6 +89,7 @@ def errors_of(solution: Solution, simulation: Simulation) -> dict[str, float]:
         "landmark_near_aligned_on_itself_m": _rms(
             own.points(final.landmarks_m[is_near]) - landmarks[is_near]
         ),
+        "focal_percent": _focal_percent(solution, simulation),
         "reprojection_px": solution.rms_final_px,
         "iterations": float(solution.iterations),
     }
@@ -109,8 +110,22 @@ def errors_of(solution: Solution, simulation: Simulation) -> dict[str, float]:
 
 
 def _true_cameras(simulation: Simulation) -> tuple[FloatArray, FloatArray]:
+    """Rotations and centres of all images, by the true rig; solvers may have been told another."""
     truth = simulation.truth
-    return simulation.traverse.camera_poses(truth.world_T_mast, truth.pan_tilt_rad)
+    of_true_rig = replace(simulation.traverse, rig=truth.rig)
+    return of_true_rig.camera_poses(truth.world_T_mast, truth.pan_tilt_rad)
+
+
+def _focal_percent(solution: Solution, simulation: Simulation) -> float:
+    """RMS over images of the relative error of fx and fy."""
+    t, correction = solution.traverse, solution.final.rig
+    found, true = (
+        np.array([p.calibration_matrix for p in rig.pinholes])[t.image_eye][:, [0, 1], [0, 1]]
+        for rig in (t.rig, simulation.truth.rig)
+    )
+    if correction is not None:
+        found = found + correction.calibration_px[:, :2]
+    return 100 * float(np.sqrt(np.mean((found / true - 1) ** 2)))
 
 
 def _distances_percent(places: FloatArray, true_places: FloatArray) -> float:
@@ -128,4 +143,5 @@ def _angle_rad(rotations: FloatArray) -> FloatArray:
     """Angle of each rotation (n, 3, 3), exact for small ones."""
     r = rotations
     sine = np.stack([r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]], axis=1)
-    return np.arctan2(np.linalg.norm(sine, axis=1) / 2, (np.trace(r, axis1=1, axis2=2) - 1) / 2)
+    angle = np.arctan2(np.linalg.norm(sine, axis=1) / 2, (np.trace(r, axis1=1, axis2=2) - 1) / 2)
+    return np.asarray(angle, dtype=float)

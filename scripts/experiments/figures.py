@@ -115,7 +115,7 @@ def _localisation(plt: ModuleType, results: Results) -> Any:
     ax.invert_yaxis()
     ax.set(
         xscale="log",
-        xlabel="error of the last stop at 0.5 px (% of the way driven), median and 90 % interval",
+        xlabel="error of the last stop at 0.5 px (% of the way), median and 90 % interval",
     )
     ax.grid(alpha=0.3, axis="x")
     ax.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
@@ -167,7 +167,8 @@ def _opportunity(plt: ModuleType, results: Results) -> Any:
                 [v for _, v in known],
                 marker=_MARKER[model],
                 color=_COLOUR[model],
-                markerfacecolor=_COLOUR[model] if filled else "white",
+                markerfacecolor=_COLOUR[model] if filled else "none",
+                markersize=4 if filled else 10,
                 lw=0,
                 label=f"{model}, {kind}",
             )

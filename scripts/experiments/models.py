@@ -7,14 +7,16 @@ from experiments.running import Sample, attempt
 from experiments.scenarios import Scenario
 from pancam_graph import Solution, SolveOptions, solve
 from pancam_graph.errors import SolveError
-from pancam_graph.graph import Flex
+from pancam_graph.graph import Flex, Model
+from pancam_graph.sharing import Freedom, Sharing
 from pancam_graph.simulate import Simulation
 
-__all__ = ["FREE_FLEX", "FULL_RIG", "ClusterTask", "Variant"]
+__all__ = ["FREE_FLEX", "KNOWN_RIG", "RIG_OFF", "ClusterTask", "Variant"]
 
-FREE_FLEX = Flex(rotation_rad=0.02, translation_m=1.0)
-"""Of the models without a mast: rotations as loose as pan, centres so loose that telemetry says nothing of a
-circle of 0.14 m."""
+FREE_FLEX = Flex(rotation_rad=0.02, translation_m=0.3)
+"""Of the models without a mast: rotations as loose as pan, centres so loose that telemetry says little of a
+circle of 0.14 m. With 0.1 m or 1 m aligned errors are the same within a few percent; with 1 m the scale of
+several clusters, which nothing but odometry tells, takes a hundred iterations."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,12 +28,37 @@ class Variant:
     options: SolveOptions = field(hash=False)
 
 
-FULL_RIG = (
-    Variant(model="mast", sharing="fixed", options=SolveOptions(model="mast", loss="none")),
-    Variant(model="circle", sharing="radius per eye", options=SolveOptions(model="circle", loss="none")),
-    Variant(model="free", sharing="fixed", options=SolveOptions(model="free", loss="none", flex=FREE_FLEX)),
-)
-"""With the rig that the simulation had."""
+def _variant(model: Model, sharing: str = "fixed") -> Variant:
+    options = SolveOptions(
+        model=model,
+        loss="none",
+        flex=None if model in {"mast", "circle"} else FREE_FLEX,
+        sharing=_sharing(model, sharing),
+        # Far below a sigma, and the scale of a free model may take its time.
+        relative_decrease=1e-6,
+        max_iterations=200,
+    )
+    return Variant(model=model, sharing=sharing, options=options)
+
+
+def _sharing(model: Model, name: str) -> Sharing | None:
+    """What of the rig is free: shared by the whole traverse, or as little shared as the model can bear."""
+    if name == "fixed":
+        return None
+    shared = name == "shared"
+    of_stop = Freedom(scope="eye" if shared else "stop")
+    return Sharing(
+        calibration=Freedom(scope="eye" if shared else "image", free=("focal",)),
+        mounts=of_stop if model == "mast" else Freedom(),
+        radius=of_stop if model == "circle" else None,
+    )
+
+
+_MODELS: tuple[Model, ...] = ("mast", "circle", "free")
+KNOWN_RIG = tuple(_variant(model) for model in _MODELS)
+"""For the rig that the simulation had. `circle` finds the radius of each eye always."""
+RIG_OFF = tuple(_variant(model, name) for model in _MODELS for name in ("fixed", "shared", "unshared"))
+"""For a rig that is not quite the true one."""
 
 
 @dataclass(frozen=True, kw_only=True)

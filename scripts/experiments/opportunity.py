@@ -16,6 +16,7 @@ from pancam_graph import (
     read_input,
     solve,
 )
+from pancam_graph._honest import Splitting
 from pancam_graph.geometry import FloatArray, pose_arrays
 from pancam_graph.graph import Model
 
@@ -74,8 +75,9 @@ def _measured(traverse: Traverse, options: SolveOptions) -> dict[str, float]:
         "off_circle_radial_mm": 1e3 * float(np.abs(off[:, 0]).max()),
         "off_circle_out_of_plane_mm": 1e3 * float(np.abs(off[:, 1]).max()),
     }
-    for splitting in ("random", "upper_lower"):
-        measured, expected = found.score_px(splitting)  # type: ignore[arg-type]  # its two values
+    splittings: tuple[Splitting, ...] = ("random", "upper_lower")
+    for splitting in splittings:
+        measured, expected = found.score_px(splitting)
         metrics[f"held_out_{splitting}_px"] = measured
         metrics[f"held_out_{splitting}_expected_px"] = expected
     sigmas = found.relative_pointing

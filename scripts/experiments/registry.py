@@ -1,10 +1,10 @@
 """Which experiments there are, how large, and which are left out here."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from experiments import opportunity, validation
-from experiments.models import FULL_RIG, ClusterTask, Variant
+from experiments.models import KNOWN_RIG, RIG_OFF, ClusterTask, Variant
 from experiments.running import Task
 from experiments.scenarios import NOISES_PX, Scenario
 
@@ -18,6 +18,7 @@ CLUSTERS = (
 )
 DENSE = Scenario(name="one cluster, one eye, 150 points per image", eyes="one eye", points_per_image=150)
 """The same with six times as many tracks: how much of the difference between models is left."""
+RIG_OFF_CLUSTERS = tuple(replace(c, name=f"{c.name}, rig not quite known", rig_off=True) for c in CLUSTERS)
 PANORAMAS = tuple(
     Scenario(
         name=f"two panoramas {spacing_m} m apart, {eyes}",
@@ -25,7 +26,7 @@ PANORAMAS = tuple(
         stops=2,
         images=36 if eyes == "both eyes" else 18,
         spacing_m=spacing_m,
-        points_per_image=60,
+        points_per_image=150,
         reach_m=100.0,
     )
     for eyes in ("both eyes", "one eye")
@@ -63,11 +64,13 @@ def plan(*, seeds: int, quick: bool, families: Sequence[str] = FAMILIES) -> Plan
         tasks += [validation.ValidationTask(noise_px=0.5, seed=seed) for seed in range(min(seeds, 10))]
     if "clusters" in families:
         noises = (0.1, 0.5, 2.0) if quick else NOISES_PX
-        tasks += _over_seeds(CLUSTERS, noises, seeds, FULL_RIG)
-        tasks += _over_seeds([DENSE], _MIDDLE_PX, seeds, FULL_RIG)
+        tasks += _over_seeds(CLUSTERS, noises, seeds, KNOWN_RIG)
+        tasks += _over_seeds([DENSE], _MIDDLE_PX, seeds, KNOWN_RIG)
+        tasks += _over_seeds(RIG_OFF_CLUSTERS, _MIDDLE_PX, seeds, RIG_OFF)
     if "localisation" in families:
-        tasks += _over_seeds(PANORAMAS, _MIDDLE_PX, seeds, FULL_RIG)
-        tasks += _over_seeds(TRAVERSES, _MIDDLE_PX, seeds, FULL_RIG)
+        tasks += _over_seeds(PANORAMAS, _MIDDLE_PX, seeds, KNOWN_RIG)
+        # Each takes as long as a hundred clusters.
+        tasks += _over_seeds(TRAVERSES, _MIDDLE_PX, max(2, seeds // 5), KNOWN_RIG)
     if "opportunity" in families:
         folder = opportunity.opportunity_folder()
         if folder is None:

@@ -16,6 +16,8 @@ Eyes = Literal["one eye", "both eyes"]
 
 LOOSE_PAN_RAD = 0.02
 """Sigma that solvers are told of pan: fifteen times that of its errors, so that images decide."""
+_FOCAL_ERROR, _MOUNT_ERROR_RAD, _MOUNT_ERROR_M = 3e-3, 5e-3, 2e-3
+"""Sigmas of errors of a rig that is not quite known: those of the package's priors."""
 _STEP_RAD = np.deg2rad(20.0)
 """From frame to frame. The field is 45 degrees: most points are seen by two frames, a strip by three, which
 alone joins the depths of one pair of frames to those of the next. The centres are 5 cm apart."""
@@ -44,7 +46,8 @@ class Scenario:
     """Where a neighbour 5 cm away sees a parallax of 3 pixels."""
     odometry: float = 0.06
     """Sigma of each component of a stop's place, as a share of the spacing."""
-    max_turn_rad: float = float(np.deg2rad(40.0))
+    rig_off: bool = False
+    """Whether solvers are told a rig that is not quite the true one (focal lengths and mounts)."""
 
     def simulate(self, noise_px: float, seed: int) -> Simulation:
         """The simulation; another noise leaves all but the noise alone.
@@ -64,10 +67,12 @@ class Scenario:
                 points_per_image=self.points_per_image,
                 detection=0.8,
                 reach_m=self.reach_m,
-                max_turn_rad=self.max_turn_rad,
                 noise_px=noise_px,
                 sigma_stop_m=self.odometry * self.spacing_m,
                 sigma_stop_rad=0.03,
+                focal_error=_FOCAL_ERROR * self.rig_off,
+                mount_error_rad=_MOUNT_ERROR_RAD * self.rig_off,
+                mount_error_m=_MOUNT_ERROR_M * self.rig_off,
             ),
             seed=seed,
         )

@@ -43,17 +43,20 @@ the thesis's own figures have not survived, so there is nothing to compare with,
 - **Same for all models:** observations (no outliers, loss none), their sigmas, start, telemetry of the
   rig. Encoders are wrong by 1.3 mrad, odometry by 6 % of the spacing in each component and 0.03 rad.
 - **Priors, so that telemetry does not do the images' work:** pan has a sigma of 20 mrad with all models,
-  tilt that of its encoder (the model `circle` takes the circle's height from it). Cameras of `free` are
-  tied to the mast by 20 mrad and 1 m, which says nothing of a circle of 0.14 m. Stops have the sigma of
-  their odometry; the first is held. `circle` finds the radius of each eye with a prior of 1 mm; `mast`
-  and `circle` know the rig.
-- **Errors:** a similarity (Umeyama) is estimated from the camera centres to the true ones, and applied
-  to centres and landmarks. Rotations are aligned by their own mean. "Distances, aligned" are those
-  between the clusters (means of their centres) after the similarity, "distances" before it: the scale is
-  the solution's own. "Last stop" is its error after the first stop's cameras were laid on the true ones
-  without scaling, in % of the way driven. Landmarks are near within 5 m of a mast.
-- **Failed:** the solve raised an error, did not converge, or lost an observation's landmark. A failed
-  run is infinitely wrong in every metric and stays in the median and the interval (∞; null in
+  tilt that of its encoder (the model `circle` takes the circle's height from it). Cameras of `free` are tied
+  to the mast by 20 mrad and 0.3 m, twice the radius of the circle. Stops have the sigma of their odometry;
+  the first is held. So the scale of `free` cameras is that of odometry, for no image tells it.
+- **Sharing:** with the rig that the simulation had, nothing is free but the radii of `circle`. Where the rig
+  is "not quite known", solvers are told focal lengths with errors of 0.3 % and mounts with errors of 5 mrad
+  and 2 mm. "Fixed" believes that; "shared" frees one focal length, mount (`mast`) and radius (`circle`) per
+  eye; "unshared" a focal length for each image, a mount and a radius for each stop. Priors are the package's.
+- **Errors:** a similarity (Umeyama) is estimated from the camera centres to the true ones, and applied to
+  centres and landmarks. Rotations are aligned by their own mean. "Distances, aligned" are those between the
+  clusters (means of their centres) after the similarity, "distances" before it: the scale is the solution's
+  own. "Last stop" is its error after the first stop's cameras were laid on the true ones without scaling, in
+  % of the way driven. Landmarks are near within 5 m of a mast.
+- **Failed:** the solve raised an error, did not converge within 200 steps, or lost an observation's landmark.
+  A failed run is infinitely wrong in every metric and stays in the median and the interval (∞; null in
   results.json). Points beyond infinity are no failure; they count where they lie, which makes RMS errors
   huge.
 - Quantiles are by rank: median (5 % to 95 %).

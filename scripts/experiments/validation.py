@@ -29,7 +29,7 @@ def _turn(w: _Array) -> _Array:
     angle = float(np.sqrt(w @ w))
     k = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
     if angle < 1e-8:
-        return np.eye(3) + k + k @ k / 2
+        return np.asarray(np.eye(3) + k + k @ k / 2)
     return np.asarray(np.eye(3) + np.sin(angle) / angle * k + (1 - np.cos(angle)) / angle**2 * k @ k)
 
 
