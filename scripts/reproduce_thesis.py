@@ -21,7 +21,7 @@ def main() -> int:
     parser = Parser(__doc__ or "")
     add = parser.add_argument
     add("--out", metavar="OUT", type=Path, required=True, help="folder to write; must be new or empty")
-    add("--quick", action="store_true", help="5 seeds and three noises, for a look")
+    add("--quick", action="store_true", help="5 seeds and two noises, for a look")
     add("--seeds", type=int, help="runs of each simulated experiment (50; with --quick 5)")
     add("--only", nargs="+", choices=FAMILIES, default=FAMILIES, metavar="FAMILY", help=", ".join(FAMILIES))
     add("--processes", type=int, default=2, help="(%(default)s)")

@@ -118,14 +118,10 @@ def _true_cameras(simulation: Simulation) -> tuple[FloatArray, FloatArray]:
 
 def _focal_percent(solution: Solution, simulation: Simulation) -> float:
     """RMS over images of the relative error of fx and fy."""
-    t, correction = solution.traverse, solution.final.rig
-    found, true = (
-        np.array([p.calibration_matrix for p in rig.pinholes])[t.image_eye][:, [0, 1], [0, 1]]
-        for rig in (t.rig, simulation.truth.rig)
-    )
-    if correction is not None:
-        found = found + correction.calibration_px[:, :2]
-    return 100 * float(np.sqrt(np.mean((found / true - 1) ** 2)))
+    true = replace(simulation.traverse, rig=simulation.truth.rig).calibration
+    found = solution.calibration
+    ratio = found[:, [0, 1], [0, 1]] / true[:, [0, 1], [0, 1]]
+    return 100 * float(np.sqrt(np.mean((ratio - 1) ** 2)))
 
 
 def _distances_percent(places: FloatArray, true_places: FloatArray) -> float:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments.conditioning import ORIGINS_M, name_of
 from experiments.opportunity import NAME as OPPORTUNITY
 from experiments.registry import CLUSTERS, PANORAMAS, TRAVERSES
 from experiments.running import Row
@@ -43,6 +44,7 @@ def draw(results: Results, folder: Path) -> list[str]:
         ("centres", _centres),
         ("landmarks", _landmarks),
         ("localisation", _localisation),
+        ("conditioning", _conditioning),
         ("opportunity", _opportunity),
     ):
         figure = make(plt, results)
@@ -141,6 +143,43 @@ def _interval(ax: Any, row: Row, y: float, model: str, *, label: bool) -> None:
         lw=0,
         label=model if label else None,
     )
+
+
+def _conditioning(plt: ModuleType, results: Results) -> Any:
+    """Iterations by the distance of the origin, with and without conditioning."""
+    shown = [m for m in ORIGINS_M if results.get(name_of(m), "projective", 0.5, "iterations") is not None]
+    if not shown:
+        return None
+    figure, ax = plt.subplots(figsize=(5.6, 3.2), layout="constrained")
+    for i, (model, label, colour) in enumerate(
+        (("projective", "conditioned", "#0b6e4f"), ("projective, as it is", "as it is", "#a63d57"))
+    ):
+        for k, origin_m in enumerate(shown):
+            row = results.get(name_of(origin_m), model, 0.5, "iterations")
+            if row is None:
+                continue
+            x = k + 0.16 * (i - 0.5)
+            finite = [v for v in (row.q05, row.median, row.q95) if math.isfinite(v)]
+            if finite:
+                ax.plot([x, x], [finite[0], finite[-1]], color=colour, lw=1.5)
+                ax.plot([x], [finite[len(finite) // 2]], marker="os"[i], color=colour)
+            if row.failed:
+                ax.annotate(
+                    f"{row.failed} of {row.seeds}\nfail",
+                    (x, 0.97),
+                    xycoords=("data", "axes fraction"),
+                    ha="center",
+                    va="top",
+                    color=colour,
+                    fontsize=8,
+                )
+        ax.plot([], [], marker="os"[i], color=colour, lw=1.5, label=label)
+    ax.set_xticks(range(len(shown)), [f"{m:g}" for m in shown])
+    ax.set(xlabel="distance of the world's origin (m)", ylabel="iterations, median and 90 %", ylim=(0, None))
+    ax.margins(y=0.3)
+    ax.grid(alpha=0.3, axis="y")
+    ax.legend(frameon=False, loc="center left")
+    return figure
 
 
 def _opportunity(plt: ModuleType, results: Results) -> Any:

@@ -11,7 +11,7 @@ from pancam_graph.graph import Flex, Model
 from pancam_graph.sharing import Freedom, Sharing
 from pancam_graph.simulate import Simulation
 
-__all__ = ["FREE_FLEX", "KNOWN_RIG", "RIG_OFF", "ClusterTask", "Variant"]
+__all__ = ["FREE_FLEX", "KNOWN_RIG", "RIG_OFF", "ClusterTask", "Variant", "variant"]
 
 FREE_FLEX = Flex(rotation_rad=0.02, translation_m=0.3)
 """Of the models without a mast: rotations as loose as pan, centres so loose that telemetry says little of a
@@ -28,7 +28,8 @@ class Variant:
     options: SolveOptions = field(hash=False)
 
 
-def _variant(model: Model, sharing: str = "fixed") -> Variant:
+def variant(model: Model, sharing: str) -> Variant:
+    """A model as the experiments solve it."""
     options = SolveOptions(
         model=model,
         loss="none",
@@ -43,7 +44,7 @@ def _variant(model: Model, sharing: str = "fixed") -> Variant:
 
 def _sharing(model: Model, name: str) -> Sharing | None:
     """What of the rig is free: shared by the whole traverse, or as little shared as the model can bear."""
-    if name == "fixed":
+    if name == "fixed" or model == "projective":
         return None
     shared = name == "shared"
     of_stop = Freedom(scope="eye" if shared else "stop")
@@ -54,10 +55,15 @@ def _sharing(model: Model, name: str) -> Sharing | None:
     )
 
 
-_MODELS: tuple[Model, ...] = ("mast", "circle", "free")
-KNOWN_RIG = tuple(_variant(model) for model in _MODELS)
-"""For the rig that the simulation had. `circle` finds the radius of each eye always."""
-RIG_OFF = tuple(_variant(model, name) for model in _MODELS for name in ("fixed", "shared", "unshared"))
+_WITH_RIG: tuple[Model, ...] = ("mast", "circle", "free")
+_PROJECTIVE = variant("projective", "unshared")
+KNOWN_RIG = (*(variant(model, "fixed") for model in _WITH_RIG), _PROJECTIVE)
+"""For the rig that the simulation had. `circle` finds the radius of each eye always, `projective` a
+calibration of each image."""
+RIG_OFF = (
+    *(variant(model, name) for model in _WITH_RIG for name in ("fixed", "shared", "unshared")),
+    _PROJECTIVE,
+)
 """For a rig that is not quite the true one."""
 
 

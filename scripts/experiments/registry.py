@@ -3,10 +3,11 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-from experiments import opportunity, validation
+from experiments import alternation, opportunity, validation
+from experiments.conditioning import ConditioningTask
 from experiments.models import KNOWN_RIG, RIG_OFF, ClusterTask, Variant
 from experiments.running import Task
-from experiments.scenarios import NOISES_PX, Scenario
+from experiments.scenarios import NOISES_PX, Eyes, Scenario
 
 __all__ = ["CLUSTERS", "FAMILIES", "PANORAMAS", "TRAVERSES", "Plan", "plan"]
 
@@ -19,6 +20,12 @@ CLUSTERS = (
 DENSE = Scenario(name="one cluster, one eye, 150 points per image", eyes="one eye", points_per_image=150)
 """The same with six times as many tracks: how much of the difference between models is left."""
 RIG_OFF_CLUSTERS = tuple(replace(c, name=f"{c.name}, rig not quite known", rig_off=True) for c in CLUSTERS)
+_PANORAMAS: tuple[tuple[Eyes, int], ...] = (
+    ("both eyes", 5),
+    ("both eyes", 10),
+    ("both eyes", 20),
+    ("one eye", 10),
+)
 PANORAMAS = tuple(
     Scenario(
         name=f"two panoramas {spacing_m} m apart, {eyes}",
@@ -29,8 +36,7 @@ PANORAMAS = tuple(
         points_per_image=150,
         reach_m=100.0,
     )
-    for eyes in ("both eyes", "one eye")
-    for spacing_m in (5, 10, 20)
+    for eyes, spacing_m in _PANORAMAS
 )
 TRAVERSES = (
     Scenario(
@@ -45,7 +51,7 @@ TRAVERSES = (
     ),
 )
 _MIDDLE_PX = (0.5,)
-FAMILIES = ("validation", "clusters", "localisation", "opportunity")
+FAMILIES = ("validation", "clusters", "alternation", "conditioning", "localisation", "opportunity")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,17 +66,32 @@ def plan(*, seeds: int, quick: bool, families: Sequence[str] = FAMILIES) -> Plan
     """The tasks of some families of experiments, each over so many seeds."""
     tasks: list[Task] = []
     left_out: list[str] = []
+    few = min(seeds, max(2, seeds // 5))
+    """Of what takes as long as a hundred clusters, or tells the same with every seed."""
     if "validation" in families:
         tasks += [validation.ValidationTask(noise_px=0.5, seed=seed) for seed in range(min(seeds, 10))]
     if "clusters" in families:
-        noises = (0.1, 0.5, 2.0) if quick else NOISES_PX
-        tasks += _over_seeds(CLUSTERS, noises, seeds, KNOWN_RIG)
+        for scenario in CLUSTERS:
+            # Three clusters take ten times as long as one.
+            noises = (0.5, 2.0) if quick else NOISES_PX if scenario.stops == 1 else (0.1, 0.5, 2.0)
+            tasks += _over_seeds([scenario], noises, seeds, KNOWN_RIG)
         tasks += _over_seeds([DENSE], _MIDDLE_PX, seeds, KNOWN_RIG)
         tasks += _over_seeds(RIG_OFF_CLUSTERS, _MIDDLE_PX, seeds, RIG_OFF)
+    if "alternation" in families:
+        if alternation.can_alternate():
+            three = RIG_OFF_CLUSTERS[-1]
+            tasks += [
+                alternation.AlternationTask(scenario=three, noise_px=0.5, seed=seed) for seed in range(few)
+            ]
+        else:
+            left_out.append(
+                f"{alternation.NAME}: the installed package has no other solver than the joint one"
+            )
+    if "conditioning" in families:
+        tasks += [ConditioningTask(scenario=CLUSTERS[1], noise_px=0.5, seed=seed) for seed in range(few)]
     if "localisation" in families:
         tasks += _over_seeds(PANORAMAS, _MIDDLE_PX, seeds, KNOWN_RIG)
-        # Each takes as long as a hundred clusters.
-        tasks += _over_seeds(TRAVERSES, _MIDDLE_PX, max(2, seeds // 5), KNOWN_RIG)
+        tasks += _over_seeds(TRAVERSES, _MIDDLE_PX, few, KNOWN_RIG)
     if "opportunity" in families:
         folder = opportunity.opportunity_folder()
         if folder is None:
@@ -79,7 +100,9 @@ def plan(*, seeds: int, quick: bool, families: Sequence[str] = FAMILIES) -> Plan
                 "../shared or in the folder that PANCAM_GRAPH_SHARED names"
             )
         else:
-            tasks.append(opportunity.OpportunityTask(folder=folder, models=("mast", "circle", "free")))
+            tasks.append(
+                opportunity.OpportunityTask(folder=folder, models=("mast", "circle", "free", "projective"))
+            )
     return Plan(tasks=tuple(tasks), left_out=tuple(left_out))
 
 

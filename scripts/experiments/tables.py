@@ -24,6 +24,7 @@ _METRICS = {
     "distance_percent": "distances (%)",
     "localisation_percent": "last stop (% of the way)",
     "reprojection_px": "residual (px)",
+    "cost_excess_relative": "cost above the optimum, relative",
     "iterations": "iterations",
 }
 """Columns of the tables. All metrics are in results.json."""
@@ -46,10 +47,12 @@ the thesis's own figures have not survived, so there is nothing to compare with,
   tilt that of its encoder (the model `circle` takes the circle's height from it). Cameras of `free` are tied
   to the mast by 20 mrad and 0.3 m, twice the radius of the circle. Stops have the sigma of their odometry;
   the first is held. So the scale of `free` cameras is that of odometry, for no image tells it.
-- **Sharing:** with the rig that the simulation had, nothing is free but the radii of `circle`. Where the rig
-  is "not quite known", solvers are told focal lengths with errors of 0.3 % and mounts with errors of 5 mrad
-  and 2 mm. "Fixed" believes that; "shared" frees one focal length, mount (`mast`) and radius (`circle`) per
-  eye; "unshared" a focal length for each image, a mount and a radius for each stop. Priors are the package's.
+  `projective` is tied like `free`, each of the five numbers of its calibrations by 5 % of the focal length.
+- **Sharing:** with the rig that the simulation had, nothing is free but the radii of `circle` and the
+  calibrations of `projective`, one for each image. Where the rig is "not quite known", solvers are told
+  focal lengths with errors of 0.3 % and mounts with errors of 5 mrad and 2 mm. "Fixed" believes that;
+  "shared" frees one focal length, mount (`mast`) and radius (`circle`) per eye; "unshared" a focal length
+  for each image, a mount and a radius for each stop. Priors are the package's.
 - **Errors:** a similarity (Umeyama) is estimated from the camera centres to the true ones, and applied to
   centres and landmarks. Rotations are aligned by their own mean. "Distances, aligned" are those between the
   clusters (means of their centres) after the similarity, "distances" before it: the scale is the solution's
