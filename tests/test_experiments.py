@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import runpy
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,7 +15,10 @@ import pytest
 
 pytest.importorskip("experiments", reason="the experiments are part of the repository, not of the package")
 
+from experiments.alternation import AlternationTask, can_alternate
+from experiments.conditioning import ConditioningTask, name_of
 from experiments.errors import errors_of, mean_rotation, umeyama
+from experiments.figures import require_matplotlib
 from experiments.models import KNOWN_RIG, RIG_OFF, ClusterTask
 from experiments.output import require_new, write_results
 from experiments.registry import CLUSTERS, FAMILIES, plan
@@ -181,7 +185,7 @@ def test_our_optimum_is_that_of_an_independent_solver() -> None:
 
 def test_a_rig_that_is_off_is_found_where_it_is_free() -> None:
     task = ClusterTask(
-        scenario=replace(TINY, images=18, points_per_image=60, rig_off=True),
+        scenario=replace(TINY, images=10, points_per_image=40, rig_off=True),
         noise_px=0.1,
         seed=2,
         variants=RIG_OFF,
@@ -194,9 +198,33 @@ def test_a_rig_that_is_off_is_found_where_it_is_free() -> None:
         assert shared["reprojection_px"] < fixed["reprojection_px"]
 
 
+@pytest.mark.slow
 def test_two_processes_give_what_one_does() -> None:
     tasks = [ClusterTask(scenario=TINY, noise_px=0.5, seed=seed, variants=KNOWN_RIG[:1]) for seed in range(3)]
     assert run_tasks(tasks, processes=2) == run_tasks(tasks, processes=1)
+
+
+def test_conditioning_makes_the_origin_indifferent(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("experiments.conditioning.ORIGINS_M", (0.0, 1000.0))
+    found = {(s.experiment, s.model): s for s in ConditioningTask(scenario=TINY, noise_px=0.5, seed=0).run()}
+    here, away = (found[name_of(m), "projective"].metrics for m in (0.0, 1000.0))
+    assert here["iterations"] == away["iterations"]
+    assert here["cost"] == pytest.approx(away["cost"], rel=1e-6)
+    assert found[name_of(1000.0), "projective, as it is"].failure.startswith("not converged")
+
+
+def test_alternation_where_the_package_has_it() -> None:
+    if not can_alternate():
+        assert "no other solver" in plan(seeds=1, quick=True, families=["alternation"]).left_out[0]
+        return
+    found = {
+        s.model: s for s in AlternationTask(scenario=replace(TINY, rig_off=True), noise_px=0.5, seed=0).run()
+    }
+    for model in ("mast", "circle", "free"):
+        assert not found[f"{model}, joint"].failure
+        assert found[f"{model}, joint"].metrics["cost_excess_relative"] < 1e-4
+        # Slow it may be, but what it calls its end is never below the optimum.
+        assert found[f"{model}, alternation"].metrics.get("cost_excess_relative", 0.0) > -1e-6
 
 
 def test_without_the_images_it_says_what_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -286,24 +314,33 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
     [
         (["--seeds", "0"], "--seeds: expected 1 or more, found 0"),
         (["--processes", "0"], "--processes: expected 1 or more, found 0"),
-        (["--only", "nonsense"], "--only"),
+        (["--only", "nonsense"], "argument --only: invalid choice: 'nonsense'"),
+        (["--only", "validation"], "expected a new or empty folder, found something there"),
     ],
 )
 def test_bad_input_is_one_sentence_and_status_2(
-    scripts_folder: Path, tmp_path: Path, words: list[str], complaint: str
+    scripts_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    words: list[str],
+    complaint: str,
 ) -> None:
-    program = [
-        sys.executable,
-        str(scripts_folder / "reproduce_thesis.py"),
-        "--out",
-        str(tmp_path / "out"),
-        *words,
-    ]
-    ran = subprocess.run(program, capture_output=True, text=True, check=False)
-    assert ran.returncode == 2
-    assert complaint in ran.stderr
-    assert ran.stderr.count("\n") == 1
-    assert not (tmp_path / "out").exists()
+    (tmp_path / "mine").write_text("mine", encoding="utf-8")
+    monkeypatch.setattr(sys, "argv", ["reproduce_thesis.py", "--out", str(tmp_path), *words])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(scripts_folder / "reproduce_thesis.py"), run_name="__main__")
+    assert ended.value.code == 2
+    said = capsys.readouterr().err
+    assert complaint in said
+    assert said.count("\n") == 1
+    assert [f.name for f in tmp_path.iterdir()] == ["mine"]
+
+
+def test_without_matplotlib_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(InputError, match=r"expected matplotlib, found none; install it with pip install -e"):
+        require_matplotlib()
 
 
 @pytest.mark.slow

@@ -32,7 +32,7 @@ class Verdict:
 
 
 class Results:
-    """Rows by what they are of. Only those where the rig is known, as one row for each model."""
+    """Rows by what they are of."""
 
     def __init__(self, rows: Sequence[Row]) -> None:
         self.rows = tuple(rows)
