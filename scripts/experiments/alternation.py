@@ -4,15 +4,17 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from experiments.models import variant
-from experiments.running import Sample, attempt
+from experiments.running import Sample
 from experiments.scenarios import Scenario
-from pancam_graph import Solution, SolveOptions, Traverse, solve
-from pancam_graph.errors import SolveError
+from pancam_graph import SolveOptions, Traverse, solve
+from pancam_graph.errors import PancamGraphError
 from pancam_graph.graph import Model
 
-__all__ = ["NAME", "AlternationTask", "can_alternate"]
+__all__ = ["NAME", "STEPS", "AlternationTask", "can_alternate"]
 
 NAME = "joint against alternation"
+STEPS = (3, 10, 30, 100)
+"""After so many steps costs are compared. More are not taken; not to have converged by then is no failure."""
 _MODELS: tuple[Model, ...] = ("mast", "circle", "free")
 
 
@@ -32,35 +34,34 @@ class AlternationTask:
     def run(self) -> list[Sample]:
         """Solve with each model and both methods."""
         traverse = self.scenario.simulate(self.noise_px, self.seed).traverse
-        samples = []
-        for model in _MODELS:
-            options = variant(model, "shared").options
-            # To the end: what is compared is how many steps lead there.
-            joint = solve(traverse, replace(options, relative_decrease=1e-9))
-            for method in ("joint", "alternation"):
-                metrics, failure = attempt(
-                    lambda m=method, j=joint, o=options: _measured(traverse, o, m, j)  # type: ignore[misc]  # bound now
-                )
-                samples.append(
-                    Sample(
-                        experiment=NAME,
-                        model=f"{model}, {method}",
-                        sharing="shared",
-                        noise_px=self.noise_px,
-                        seed=self.seed,
-                        metrics=metrics,
-                        failure=failure,
-                    )
-                )
-        return samples
+        return [sample for model in _MODELS for sample in self._samples(traverse, model)]
+
+    def _samples(self, traverse: Traverse, model: Model) -> list[Sample]:
+        options = replace(variant(model, "shared").options, relative_decrease=1e-9, max_iterations=max(STEPS))
+        histories: dict[str, tuple[float, ...]] = {}
+        failures = {}
+        for method in ("joint", "alternation"):
+            by_method: dict[str, Any] = {"method": method}
+            try:
+                histories[method] = solve(traverse, replace(options, **by_method)).cost_history
+            except PancamGraphError as error:
+                failures[method] = str(error)
+        best = min((h[-1] for h in histories.values()), default=1.0)
+        return [
+            Sample(
+                experiment=NAME,
+                model=f"{model}, {method}",
+                sharing="shared",
+                noise_px=self.noise_px,
+                seed=self.seed,
+                metrics=_metrics(histories[method], best) if method in histories else {},
+                failure=failures.get(method, ""),
+            )
+            for method in ("joint", "alternation")
+        ]
 
 
-def _measured(traverse: Traverse, options: SolveOptions, method: str, best: Solution) -> dict[str, float]:
-    by_method: dict[str, Any] = {"method": method}
-    solution = solve(traverse, replace(options, **by_method))
-    if not solution.converged:
-        raise SolveError(f"not converged: {solution.stop_reason}")
-    return {
-        "iterations": float(solution.iterations),
-        "cost_excess_relative": solution.cost_final / best.cost_final - 1,
-    }
+def _metrics(history: tuple[float, ...], best: float) -> dict[str, float]:
+    """How far above the best cost of both a solver is after so many steps; where it ends, it stays."""
+    found = {f"excess_after_{n}_steps": history[min(n, len(history) - 1)] / best - 1 for n in STEPS}
+    return {**found, "iterations": float(len(history) - 1)}

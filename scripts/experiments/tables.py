@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from experiments.alternation import STEPS
 from experiments.opportunity import NAME as OPPORTUNITY
 from experiments.running import Row, Sample
 from experiments.verdicts import Results, Verdict, number
@@ -24,7 +25,7 @@ _METRICS = {
     "distance_percent": "distances (%)",
     "localisation_percent": "last stop (% of the way)",
     "reprojection_px": "residual (px)",
-    "cost_excess_relative": "cost above the optimum, relative",
+    **{f"excess_after_{n}_steps": f"cost above the best after {n} steps, relative" for n in STEPS},
     "iterations": "iterations",
 }
 """Columns of the tables. All metrics are in results.json."""
