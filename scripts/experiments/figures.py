@@ -66,7 +66,10 @@ def _landmarks(plt: ModuleType, results: Results) -> Any:
 
 
 def _against_noise(plt: ModuleType, results: Results, metric: str, label: str) -> Any:
-    """A panel for each cluster experiment, both axes logarithmic, with bands of 90 %."""
+    """A panel for each cluster experiment, both axes logarithmic, with bands of 90 %.
+
+    Where most runs of a model failed its line is broken, and a cross stands at the top.
+    """
     shown = [s.name for s in CLUSTERS if len(results.noises(s.name)) > 1]
     if not shown:
         return None
@@ -76,20 +79,25 @@ def _against_noise(plt: ModuleType, results: Results, metric: str, label: str) -
     for ax, name in zip(axes[0], shown, strict=True):
         for model in results.models(name):
             rows = [results.get(name, model, noise, metric) for noise in results.noises(name)]
-            known = [r for r in rows if r is not None and math.isfinite(r.median)]
-            x = [r.noise_px for r in known]
-            style = {"color": _COLOUR[model], "marker": _MARKER[model], "markersize": 4}
-            ax.plot(x, [r.median for r in known], label=model, **style)
-            top = np.array([r.q95 for r in known])
-            highest = 10 * max((r.median for r in known), default=1.0)
-            ax.fill_between(
-                x,
-                [r.q05 for r in known],
-                np.where(np.isfinite(top), top, highest),
-                color=_COLOUR[model],
-                alpha=0.15,
-                lw=0,
+            shown_rows = [r for r in rows if r is not None]
+            x = np.array([r.noise_px for r in shown_rows])
+            low, median, high = (
+                np.array([getattr(r, q) for r in shown_rows]) for q in ("q05", "median", "q95")
             )
+            failed = ~np.isfinite(median)
+            median = np.where(failed, np.nan, median)  # where most runs failed the line is broken
+            style = {"color": _COLOUR[model], "marker": _MARKER[model], "markersize": 4}
+            ax.plot(x, median, label=model, **style)
+            ax.plot(
+                x[failed],
+                np.full(failed.sum(), 0.97),
+                "x",
+                color=_COLOUR[model],
+                transform=ax.get_xaxis_transform(),
+            )
+            high = np.where(np.isfinite(high), high, 10 * median)
+            low = np.where(failed, np.nan, low)
+            ax.fill_between(x, low, high, color=_COLOUR[model], alpha=0.15, lw=0)
         ax.set(xscale="log", yscale="log", title=name, xlabel="noise of an observation (px)")
         ticks = results.noises(name)
         ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
@@ -176,9 +184,10 @@ def _conditioning(plt: ModuleType, results: Results) -> Any:
         ax.plot([], [], marker="os"[i], color=colour, lw=1.5, label=label)
     ax.set_xticks(range(len(shown)), [f"{m:g}" for m in shown])
     ax.set(xlabel="distance of the world's origin (m)", ylabel="iterations, median and 90 %", ylim=(0, None))
+    ax.set_xlim(-0.5, len(shown) - 0.5)
     ax.margins(y=0.3)
     ax.grid(alpha=0.3, axis="y")
-    ax.legend(frameon=False, loc="center left")
+    ax.legend(frameon=False, loc="lower left")
     return figure
 
 
