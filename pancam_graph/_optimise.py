@@ -141,13 +141,19 @@ def _is_settled(
     gain_ahead: Callable[[gtsam.Values], float | None] | None,
     optimizer: gtsam.NonlinearOptimizer,
 ) -> bool:
-    """Whether the iterations to come would lower the cost by no more than a share of it."""
+    """Whether the iterations to come would lower the cost by no more than a share of it.
+
+    Gains that shrink may do so because a landmark is stuck, which a later step sets free. So where the gain
+    of the next step can be told, it must be small too. It is no work lost: covariances want that system.
+    """
     least = share * costs[-1]
     gain, shrinking = _still_to_gain(costs)
-    if gain_ahead is not None and gain > least and not (shrinking and gain > _FAR * least):
-        ahead = gain_ahead(optimizer.values())
-        gain = gain if ahead is None else ahead
-    return gain <= least
+    if gain_ahead is None or costs[-2] - costs[-1] <= least:
+        return gain <= least
+    if shrinking and gain > _FAR * least:
+        return False
+    ahead = gain_ahead(optimizer.values())
+    return ahead is not None and ahead <= least
 
 
 def _still_to_gain(costs: list[float]) -> tuple[float, bool]:

@@ -10,7 +10,7 @@ import pytest
 
 from pancam_graph import SimulationOptions, SolveOptions, StopRule, Traverse, simulate
 from pancam_graph._adjustment import Adjustment
-from pancam_graph._optimise import _gradient
+from pancam_graph._optimise import _gradient, _is_settled
 from pancam_graph._problem import Problem
 from pancam_graph.errors import InputError
 from pancam_graph.geometry import FloatArray, IntArray
@@ -253,3 +253,17 @@ def test_refused_criteria(texts: list[str], words: tuple[str, ...]) -> None:
         criteria(texts)
     for word in ("stop: ", "expected", "found", *words):
         assert word in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("ahead", "settled"),
+    [(154.0, False), (1e-5, True), (None, False)],
+)
+def test_gains_that_shrink_are_no_end_while_the_next_step_promises_more(
+    ahead: float | None, settled: bool
+) -> None:
+    """As where a landmark is stuck: three costs of a real solve that went on to 3456.8."""
+    costs = [12030.527, 3611.238, 3611.039]
+    optimizer = gtsam.LevenbergMarquardtOptimizer(gtsam.NonlinearFactorGraph(), gtsam.Values())
+    assert _is_settled(costs, 1e-7, lambda _: ahead, optimizer) == settled
+    assert _is_settled(costs, 1e-7, None, optimizer)
