@@ -183,11 +183,11 @@ def _conditioning(plt: ModuleType, results: Results) -> Any:
                 )
         ax.plot([], [], marker="os"[i], color=colour, lw=1.5, label=label)
     ax.set_xticks(range(len(shown)), [f"{m:g}" for m in shown])
-    ax.set(xlabel="distance of the world's origin (m)", ylabel="iterations, median and 90 %", ylim=(0, None))
+    ax.set(xlabel="distance of the world's origin (m)", ylabel="iterations, median and 90 %")
     ax.set_xlim(-0.5, len(shown) - 0.5)
-    ax.margins(y=0.3)
+    ax.set_ylim(0, 1.3 * ax.get_ylim()[1])  # room for what failed
     ax.grid(alpha=0.3, axis="y")
-    ax.legend(frameon=False, loc="lower left")
+    ax.legend(frameon=False, loc="center left")
     return figure
 
 
