@@ -30,8 +30,8 @@ class StopRule:
     max_iterations: int = 100
     """So many steps and no more; reaching it means not converged."""
     relative_decrease: float = 1e-7
-    """Further steps would lower f by no more than this share: so the last one did, or so the linearised system
-    says of the next. Explicit landmarks: if the gains to come shrink as the last one did."""
+    """Further steps would lower f by no more than this share: the last one did, or the linearised system says
+    so of the next. Explicit landmarks: if the gains to come shrink as the last one did."""
     relative_step: float = 0.0
     """The last step was no longer than this share of x before it: |dx| <= relative_step |x|.
 
