@@ -3,7 +3,8 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-from experiments import alternation, opportunity, validation
+from experiments import opportunity, validation
+from experiments.alternation import AlternationTask
 from experiments.conditioning import ConditioningTask
 from experiments.models import KNOWN_RIG, RIG_OFF, ClusterTask, Variant
 from experiments.running import Task
@@ -78,15 +79,9 @@ def plan(*, seeds: int, quick: bool, families: Sequence[str] = FAMILIES) -> Plan
         tasks += _over_seeds([DENSE], _MIDDLE_PX, seeds, KNOWN_RIG)
         tasks += _over_seeds(RIG_OFF_CLUSTERS, _MIDDLE_PX, seeds, RIG_OFF)
     if "alternation" in families:
-        if alternation.can_alternate():
-            three = RIG_OFF_CLUSTERS[-1]
-            tasks += [
-                alternation.AlternationTask(scenario=three, noise_px=0.5, seed=seed) for seed in range(few)
-            ]
-        else:
-            left_out.append(
-                f"{alternation.NAME}: the installed package has no other solver than the joint one"
-            )
+        tasks += [
+            AlternationTask(scenario=RIG_OFF_CLUSTERS[-1], noise_px=0.5, seed=seed) for seed in range(few)
+        ]
     if "conditioning" in families:
         tasks += [ConditioningTask(scenario=CLUSTERS[1], noise_px=0.5, seed=seed) for seed in range(few)]
     if "localisation" in families:
