@@ -490,7 +490,7 @@ def _triangulated(problem: Problem) -> Problem:
 def _state(problem: Problem) -> State:
     """What a solution says of a problem; points that take no part are NaN."""
     points = np.where(problem.present[:, None], problem.points_m(), np.nan)
-    return problem.template.state(problem.values, points)
+    return problem.template.state(problem.values, points, problem.views)
 
 
 def _diverging(problem: Problem) -> BoolArray:

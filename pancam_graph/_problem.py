@@ -58,7 +58,7 @@ class Problem:
     def points_m(self) -> FloatArray:
         """World points (landmarks, 3), none further than where parallax tells nothing."""
         vector = self.landmarks.vector
-        distance = np.linalg.norm(vector[:, :3], axis=1)
+        distance = np.sqrt(np.einsum("ij,ij->i", vector[:, :3], vector[:, :3]))
         # Most are nearer than any limit.
         beyond = distance * _FURTHEST_PARALLAX_SIGMAS > vector[:, 3] * _LEAST_BASELINE_M * _resolution(self)
         furthest = np.full(len(vector), np.inf)

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from scipy.sparse import coo_array, csc_array
 
 from pancam_graph._problem import Problem, system_of
 from pancam_graph.elimination import LandmarkSystem, Linkage, Panels, Root
@@ -80,21 +79,18 @@ def add_factors(
     panels: Panels, linkage: Linkage, linear: gtsam.GaussianFactorGraph, weight: float = 1.0
 ) -> None:
     """Add priors and ties, as GTSAM linearises them."""
-    # GTSAM counts from 1, takes keys in ascending order, and appends the right-hand side as a last column.
-    keys = sorted(linear.keys())
-    if not keys:
-        return
-    row, column, entry = linear.sparseJacobian_()
-    dims = [int(linkage.dim[linkage.row[key]]) for key in keys]
-    shape = (int(row.max(initial=0)), sum(dims) + 1)
-    jacobian = csc_array((entry, (row.astype(int) - 1, column.astype(int) - 1)), shape=shape)
-    own = [linkage.columns_of(key) for key in keys]
-    group = np.repeat([int(linkage.group[linkage.row[key]]) for key in keys], dims)
-    within = np.concatenate([np.arange(s.start, s.stop) for s in own])
-    normal = weight * coo_array(jacobian.T @ jacobian)
-    i, j = normal.coords
-    left = (i < shape[1] - 1) & (j < shape[1] - 1)
-    panels.add_entries(group[i[left]], within[i[left]], group[j[left]], within[j[left]], normal.data[left])
-    right = (i < shape[1] - 1) & (j == shape[1] - 1)
-    # GTSAM's right-hand side is minus the residual.
-    panels.add_right(group[i[right]], within[i[right]], -normal.data[right])
+    for i in range(linear.size()):
+        factor = linear.at(i)
+        if factor is None:
+            continue
+        keys = factor.keys()
+        # The right-hand side comes as a last column, and is minus the residual.
+        normal = weight * factor.augmentedInformation()
+        group = [int(linkage.group[linkage.row[key]]) for key in keys]
+        columns = [linkage.columns_of(key) for key in keys]
+        end = np.cumsum([c.stop - c.start for c in columns])
+        own = [slice(e - (c.stop - c.start), e) for c, e in zip(columns, end, strict=True)]
+        for a in range(len(keys)):
+            panels.add_right(group[a], columns[a], -normal[own[a], -1])
+            for b in range(a, len(keys)):
+                panels.add_block(group[a], columns[a], group[b], columns[b], normal[own[a], own[b]])

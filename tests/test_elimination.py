@@ -1,6 +1,6 @@
 """Elimination against dense linear algebra: order, square root, covariances; chains with calibrations."""
 
-from itertools import combinations, pairwise
+from itertools import combinations, combinations_with_replacement, pairwise
 
 import gtsam
 import numba
@@ -247,15 +247,27 @@ def test_damping_adds_a_share_of_the_diagonal(name: str) -> None:
     assert whole(system.panels)[0] == pytest.approx(expected, rel=1e-12)
 
 
-def test_entries_one_by_one_are_the_same_as_a_dense_piece() -> None:
+@pytest.mark.parametrize("swapped", [False, True])
+def test_a_system_of_blocks_is_the_same_as_a_dense_piece(swapped: bool) -> None:
     system = Random("chain with what all share")
     panels = Panels(system.panels.structure)
-    i, j = np.nonzero(system.S)
-    group = np.repeat(np.arange(len(system.dim)), system.dim)
-    half = 0.5 * system.S[i, j]  # entries that come twice add up
-    for _ in range(2):
-        panels.add_entries(group[i], i - system.begin[group[i]], group[j], j - system.begin[group[j]], half)
+    pieces = [(g, rows) for g, n in enumerate(system.dim.tolist()) for rows in (slice(0, 1), slice(1, n))]
+    for (g, rows), (h, columns) in combinations_with_replacement(pieces, 2):
+        first, second = (
+            np.arange(system.begin[g], system.begin[g + 1]),
+            np.arange(system.begin[h], system.begin[h + 1]),
+        )
+        block = system.S[np.ix_(first[rows], second[columns])]
+        if not block.any():
+            continue
+        if swapped:
+            panels.add_block(h, columns, g, rows, block.T)
+        else:
+            panels.add_block(g, rows, h, columns, block)
+    for g, rows in pieces:
+        panels.add_right(g, rows, system.s[system.begin[g] : system.begin[g + 1]][rows])
     assert whole(panels)[0] == pytest.approx(system.S, rel=1e-12)
+    assert whole(panels)[1] == pytest.approx(system.s, rel=1e-12)
     panels.clear()
     assert not any(panel.any() for panel in panels.panel)
 

@@ -117,21 +117,18 @@ class Panels:
             panel[:, first : first + width] += S[rows, begin[j] : begin[k]]
             j = k
 
-    def add_entries(
-        self, g: IntArray, row: IntArray, h: IntArray, column: IntArray, entry: FloatArray
-    ) -> None:
-        """Add entries of S one by one: at `row` of group g and `column` of group h, both halves given."""
-        for a in np.unique(g):
-            place = self._place[int(a)]
-            for b in np.unique(h[g == a]):
-                if int(b) in place:
-                    here = (g == a) & (h == b)
-                    np.add.at(self.panel[a], (row[here], place[int(b)] + column[here]), entry[here])
+    def add_block(self, g: int, rows: slice, h: int, columns: slice, block: FloatArray) -> None:
+        """Add a dense block of S, at rows of group g and columns of group h, and its transpose."""
+        if h not in self._place[g]:
+            g, rows, h, columns, block = h, columns, g, rows, block.T
+        first = self._place[g][h]
+        self.panel[g][rows, first + columns.start : first + columns.stop] += block
+        if g == h and rows != columns:
+            self.panel[g][columns, rows] += block.T
 
-    def add_right(self, g: IntArray, row: IntArray, entry: FloatArray) -> None:
-        """Add entries of s one by one: at `row` of group g."""
-        for a in np.unique(g):
-            np.add.at(self.panel[a][:, -1], row[g == a], entry[g == a])
+    def add_right(self, g: int, rows: slice, right: FloatArray) -> None:
+        """Add to s, at rows of group g."""
+        self.panel[g][rows, -1] += right
 
     def copy(self) -> "Panels":
         """The same system in memory of its own."""

@@ -31,6 +31,8 @@ __all__ = ["HardTemplate"]
 
 _ANGLES, _MAST, _AXIS, _MOUNT, _CALIBRATION = range(5)
 """Kinds of segments, in the order that a unit has them."""
+_TILT = np.array([[0.0], [-1.0], [0.0], [0.0], [0.0], [0.0]])
+"""Twist of the tilt axis's own frame: about minus its y."""
 
 
 class HardTemplate(FactorTemplate):
@@ -138,7 +140,7 @@ class HardTemplate(FactorTemplate):
         widest = max([6, *(len(v.entries) for v in free.variables)])
         rows = 11 if free.of["calibration"] else 6
         chain = np.zeros((len(seg.present), 5, rows, widest))
-        chain[:, _ANGLES, :6, :2] = _angle_twists(t, angles, axes)[frame]
+        chain[:, _ANGLES, :6, :2] = self._angle_twists(angles, axes)[frame]
         chain[:, _MAST, :6, :6] = np.eye(6)
         if axes is not None:
             pan_R = pan_tilt_rotation(angles[frame, 0], np.zeros(len(frame)))
@@ -159,6 +161,24 @@ class HardTemplate(FactorTemplate):
             unit_t=masts[1][stop],
             chain=chain[seg.present],
         )
+
+    def _angle_twists(self, angles: FloatArray, axes: tuple[FloatArray, FloatArray] | None) -> FloatArray:
+        """Twists of the mast frame (frames, 6, 2), rotation first, that move the head as its pan and tilt do.
+
+        Pan turns about the mast's z. Tilt turns about minus the tilt axis y; where that is on the pan stage
+        tell `axes`, by stop, if they differ from the rig's.
+        """
+        axis = self._tilt_axis if axes is None else _tilt_axis(*axes)[self.traverse.frame_stop]
+        pan_R = pan_tilt_rotation(angles[:, 0], 0.0)
+        twists = np.zeros((len(angles), 6, 2))
+        twists[:, 2, 0] = 1.0
+        twists[:, :, 1] = (pan_R[:, None] @ axis).reshape(-1, 6)
+        return twists
+
+    @cached_property
+    def _tilt_axis(self) -> FloatArray:
+        pan_T_tilt = self.traverse.rig.pan_T_tilt
+        return _tilt_axis(pan_T_tilt.rotation().matrix(), pan_T_tilt.translation())
 
     def views(self, values: gtsam.Values) -> CameraViews:
         """Cameras of all images at the values."""
@@ -221,9 +241,9 @@ class HardTemplate(FactorTemplate):
         self.rig_variables.insert(values, state.rig)
         return values
 
-    def state(self, values: gtsam.Values, landmarks_m: FloatArray) -> State:
+    def state(self, values: gtsam.Values, landmarks_m: FloatArray, views: CameraViews | None = None) -> State:
         """The state at values of the variables; inverse of `values`."""
-        views = self.views(values)
+        views = views or self.views(values)
         return State(
             world_T_mast=self.masts(values),
             pan_tilt_rad=self._angles(values),
@@ -273,26 +293,7 @@ class _Segments:
     """(units,) where units are images, else empty"""
 
 
-def _angle_twists(
-    traverse: Traverse, pan_tilt_rad: FloatArray, axes: tuple[FloatArray, FloatArray] | None
-) -> FloatArray:
-    """Twists of the mast frame (frames, 6, 2), rotation first, that move the head as its pan and tilt do.
-
-    Pan turns about the mast's z. Tilt turns about minus the tilt axis y, which stands at pan_T_tilt on the
-    pan stage; at the mast's origin such a turn w about a point p moves by p x w. `axes` are the stops' where
-    they differ from the rig's.
-    """
-    pan = pan_tilt_rad[:, 0]
-    pan_R = pan_tilt_rotation(pan, np.zeros_like(pan))
-    if axes is None:
-        axis_T = traverse.rig.pan_T_tilt
-        y, at = axis_T.rotation().matrix()[:, 1], axis_T.translation()
-        turn, place = -(pan_R @ y), pan_R @ at
-    else:
-        y, at = axes[0][traverse.frame_stop, :, 1], axes[1][traverse.frame_stop]
-        turn, place = -(pan_R @ y[:, :, None])[:, :, 0], (pan_R @ at[:, :, None])[:, :, 0]
-    twists = np.zeros((len(pan), 6, 2))
-    twists[:, 2, 0] = 1.0
-    twists[:, :3, 1] = turn
-    twists[:, 3:, 1] = np.cross(place, turn)
-    return twists
+def _tilt_axis(pan_R_tilt: FloatArray, pan_t_tilt: FloatArray) -> FloatArray:
+    """Twists (..., 2, 3, 1) of the pan stage, rotation and translation, of which tilt has so many radians."""
+    twist = twists_in_parent(pan_R_tilt, pan_t_tilt, _TILT)
+    return twist.reshape(*twist.shape[:-2], 2, 3, 1)

@@ -168,13 +168,13 @@ class SoftTemplate(FactorTemplate):
             pose = gtsam.Pose3(gtsam.Rot3(state.world_R_camera[i]), state.world_t_camera[i])
             values.insert(self.camera_key(i), pose)
 
-    def state(self, values: gtsam.Values, landmarks_m: FloatArray) -> State:
+    def state(self, values: gtsam.Values, landmarks_m: FloatArray, views: CameraViews | None = None) -> State:
         """The state at values of the variables; inverse of `values`.
 
         Pan and tilt are the variables themselves where the model is `mast`, and those of the camera poses as
         seen from their mast otherwise: there the poses hold what images say of the pointing.
         """
-        t, masts, views = self.traverse, self.masts(values), self.views(values)
+        t, masts, views = self.traverse, self.masts(values), views or self.views(values)
         angles = np.array(
             [
                 values.atVector(slot.key) if isinstance(slot := self.pan_tilt(i), Key) else slot.value

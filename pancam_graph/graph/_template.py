@@ -62,8 +62,8 @@ class FactorTemplate(ABC):
         """The variables at a state."""
 
     @abstractmethod
-    def state(self, values: gtsam.Values, landmarks_m: FloatArray) -> State:
-        """The state at values of the variables; inverse of `values`."""
+    def state(self, values: gtsam.Values, landmarks_m: FloatArray, views: CameraViews | None = None) -> State:
+        """The state at values of the variables; inverse of `values`. `views`: cameras there, if known."""
 
     @abstractmethod
     def held_columns(self) -> dict[int, IntArray]:
