@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 
 from pancam_graph._honest import CrossValidation
-from pancam_graph.cameras import CALIBRATION_ENTRIES, projection_matrix
+from pancam_graph.cameras import CALIBRATION_ENTRIES, Camera, projection_matrix
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray, corrected_poses
 from pancam_graph.rigs import Rig
 from pancam_graph.sharing import Quantity
@@ -204,6 +204,32 @@ class Solution:
         """(images, 3, 3) K of each image's camera as adjusted, upper-triangular, without distortion."""
         found = self.final.rig
         return self.traverse.calibration if found is None else found.calibration(self.traverse)
+
+    @cached_property
+    def landmark_row(self) -> IntArray:
+        """(observations,) row in the landmarks of what each observation saw; -1 where there is none."""
+        observations, n = self.traverse.observations, len(self.landmark_track)
+        if observations is None or n == 0:
+            return np.full(len(self.used), -1)
+        order = np.argsort(self.landmark_track)
+        place = np.searchsorted(self.landmark_track, observations.track, sorter=order)
+        row = order[np.minimum(place, n - 1)]
+        return np.where(self.landmark_track[row] == observations.track, row, -1)
+
+    @cached_property
+    def image_cameras(self) -> tuple[Camera, ...]:
+        """Each image's camera as adjusted, distortion included, in its own frame.
+
+        One object for all images of which eye and calibration are the same; the rig's own where nothing moved.
+        """
+        t, K, made = self.traverse, self.calibration, dict[tuple[int, bytes], Camera]()
+        moved = np.any(t.calibration != K, axis=(1, 2))
+        for i, eye in enumerate(t.image_eye.tolist()):
+            key = (eye, K[i].tobytes())
+            if key not in made:
+                camera = t.rig.eyes[eye].camera
+                made[key] = camera.with_calibration(K[i]) if moved[i] else camera
+        return tuple(made[eye, k.tobytes()] for eye, k in zip(t.image_eye.tolist(), K, strict=True))
 
     @property
     def projections(self) -> FloatArray:

@@ -1,5 +1,6 @@
 """Camera models: pinhole, Brown, CAHV, CAHVOR, CAHVORE, and projection matrices."""
 
+from pancam_graph.cameras._as_cahv import as_cahv as as_cahv
 from pancam_graph.cameras._base import Camera as Camera
 from pancam_graph.cameras._base import Rays as Rays
 from pancam_graph.cameras._cahv import CAHV as CAHV
@@ -14,3 +15,6 @@ from pancam_graph.cameras._matrix import projection_tangents as projection_tange
 from pancam_graph.cameras._matrix import split_projections as split_projections
 from pancam_graph.cameras._pinhole import Brown as Brown
 from pancam_graph.cameras._pinhole import Pinhole as Pinhole
+from pancam_graph.cameras._straighten import straight_pixels as straight_pixels
+from pancam_graph.cameras._straighten import straightened as straightened
+from pancam_graph.cameras._straighten import straightening_map as straightening_map
