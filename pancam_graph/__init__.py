@@ -18,6 +18,8 @@ from pancam_graph.images import find_observations as find_observations
 from pancam_graph.io import read_input as read_input
 from pancam_graph.io import read_pds as read_pds
 from pancam_graph.io import read_traverse as read_traverse
+from pancam_graph.io import write_cameras as write_cameras
+from pancam_graph.io import write_colmap as write_colmap
 from pancam_graph.io import write_traverse as write_traverse
 from pancam_graph.report import write_report as write_report
 from pancam_graph.sharing import Freedom as Freedom

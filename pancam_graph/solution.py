@@ -1,8 +1,10 @@
 """What an adjustment returns."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 import gtsam
 import numpy as np
@@ -220,7 +222,7 @@ class Solution:
     def image_cameras(self) -> tuple[Camera, ...]:
         """Each image's camera as adjusted, distortion included, in its own frame.
 
-        One object for all images of which eye and calibration are the same; the rig's own where nothing moved.
+        One object for all images of the same eye and calibration; the rig's own where nothing moved.
         """
         t, K, made = self.traverse, self.calibration, dict[tuple[int, bytes], Camera]()
         moved = np.any(t.calibration != K, axis=(1, 2))
@@ -254,8 +256,13 @@ class Solution:
         """The same solution with a cross-validation of it."""
         return replace(self, cross_validation=found)
 
-    def save(self, out: Path | str, *, report: bool = True) -> "Solution":
+    def save(
+        self, out: Path | str, *, report: bool = True, exports: Sequence[Literal["colmap", "cahvor"]] = ()
+    ) -> "Solution":
         """Write solution.json, points.ply, residuals.csv and report.html into the folder `out`.
+
+        `exports` go into folders in it: `colmap` is a COLMAP workspace with undistorted images, `cahvor` the
+        refined cameras as text.
 
         Everything is written beside and renamed when complete; an older folder of results is replaced
         only then. Returns this solution with the report's time filled in. Raises InputError where `out` is
@@ -263,7 +270,7 @@ class Solution:
         """
         from pancam_graph.io import save_solution  # noqa: PLC0415  io imports this module
 
-        return save_solution(self, Path(out), report=report)
+        return save_solution(self, Path(out), report=report, exports=exports)
 
 
 def _common(corrections: FloatArray) -> FloatArray:

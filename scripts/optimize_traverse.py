@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from pancam_graph import SolveOptions, cross_validate, find_observations, read_input, solve
-from pancam_graph.io import check_out
+from pancam_graph.io import EXPORTS, check_exports, check_out
 from pancam_graph.kernel import must_compile
 from pancam_graph.program import SHARING_HELP, Parser, Progress, print_summary, run, show_log
 from pancam_graph.sharing import parse_sharing
@@ -65,6 +65,14 @@ def main() -> int:
         action="store_true",
         help="solve halves of the terrain points too, and show honest sigmas beside the formal ones",
     )
+    parser.add_argument(
+        "--export",
+        action="append",
+        choices=EXPORTS,
+        default=[],
+        help="write a folder more into OUT (may be given for each); colmap: undistorted images and a model "
+        "with rigs and frames, for dense reconstruction; cahvor: the refined cameras as text files",
+    )
     parser.add_argument("--no-report", action="store_true", help="do not write report.html")
     arguments = parser.parse_args()
     show_log(verbose=arguments.verbose)
@@ -77,6 +85,7 @@ def main() -> int:
     with progress.shown(f"reading {arguments.traverse}"):
         check_out(arguments.out)
         traverse = read_input(arguments.traverse)
+        check_exports(traverse, arguments.export)
         options = replace(options, sharing=parse_sharing(arguments.sharing, traverse.sharing))
         if traverse.observations is None:
             traverse = find_observations(traverse, progress=progress.counted)
@@ -88,7 +97,7 @@ def main() -> int:
             found = cross_validate(traverse, options, solution=solution, progress=progress.counted)
             solution = solution.with_cross_validation(found)
         progress.say("writing the results")
-        solution = solution.save(arguments.out, report=not arguments.no_report)
+        solution = solution.save(arguments.out, report=not arguments.no_report, exports=arguments.export)
     print_summary(solution, str(arguments.out))
     return 0 if solution.converged else 1
 

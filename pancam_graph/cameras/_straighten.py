@@ -43,9 +43,7 @@ def straightened(camera: Camera, range_m: float) -> Pinhole:
     plain = replace(pinhole, skew_px=0.0)
     seen, _, valid = straight_pixels(camera, plain, uv, np.full(len(uv), range_m))
     if not valid.any():
-        raise CameraError(
-            "camera: expected a pixel with a line of sight that a pinhole can show, found none"
-        )
+        raise CameraError("camera: expected a pixel with a line of sight that a pinhole can show, found none")
     size = np.array([w, h])
     low = np.floor(seen[valid].min(axis=0) + _ROUNDING_PX).clip(-_MOST_GROWTH * size, None)
     high = np.ceil(seen[valid].max(axis=0) - _ROUNDING_PX).clip(None, (1 + _MOST_GROWTH) * size - 1)
@@ -99,7 +97,7 @@ def _grid(columns: IntArray, rows: IntArray) -> FloatArray:
 def _looked_up(
     camera: Camera, straight: Pinhole, columns: IntArray, rows: IntArray, range_m: float
 ) -> FloatArray:
-    """Pixels (rows, columns, 2) of the camera's image where the pinhole sees points at a range; NaN for none."""
+    """Pixels (rows, columns, 2) of the camera's image where the pinhole sees points at a range; NaN: none."""
     out = np.empty((len(rows), len(columns), 2))
     step = max(1, _CHUNK_PX // len(columns))
     for begin in range(0, len(rows), step):

@@ -1,5 +1,10 @@
 """Readers and writers, one file format a module."""
 
+from pancam_graph.io.cahvor import read_cahvor as read_cahvor
+from pancam_graph.io.camera_models import write_cameras as write_cameras
+from pancam_graph.io.colmap import write_colmap as write_colmap
+from pancam_graph.io.exports import EXPORTS as EXPORTS
+from pancam_graph.io.exports import check_exports as check_exports
 from pancam_graph.io.image_files import read_image as read_image
 from pancam_graph.io.inputs import read_input as read_input
 from pancam_graph.io.pds import read_pds as read_pds

@@ -24,7 +24,7 @@ class Brightness:
     """What white is, and how bright the landmarks are."""
 
     white: float
-    """Sample of images of 16 bits that becomes 255: the brightest, over images, of their 99.9th percentiles."""
+    """Sample of images of 16 bits that becomes 255: the median, over images, of their 99.9th percentiles."""
     grey: NDArray[np.uint8] | None
     """(landmarks,) 0 to 255; 0 where no readable image sees one. None: no image can be read."""
 
@@ -59,7 +59,7 @@ def brightness_of(solution: Solution) -> Brightness:
     traverse, observations = solution.traverse, solution.traverse.observations
     n = len(solution.landmark_track)
     total, count = np.zeros((2, n)), np.zeros((2, n))  # images of 8 bits, of 16 bits
-    whites, seen = [0.0], False
+    whites, seen = list[float](), False
     row = solution.landmark_row
     used = solution.used & (row >= 0)
     for i in range(len(traverse.images)):
@@ -75,7 +75,8 @@ def brightness_of(solution: Solution) -> Brightness:
                 row[own], weights=_sampled(image, observations.uv_px[own]), minlength=n
             )
             count[deep] += np.bincount(row[own], minlength=n)
-    shape = Brightness(white=max(whites) or 1.0, grey=None)
+    # The median: a part of the rover that shines in one image must not darken all others.
+    shape = Brightness(white=float(np.median(whites or [0.0])) or 1.0, grey=None)
     if not seen:
         return shape
     bits_8, bits_16 = total

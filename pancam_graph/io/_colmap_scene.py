@@ -15,6 +15,8 @@ _FAR_M = 1e4
 """Range of what images without observations show: the pupil's shift is then below a thousandth of a pixel."""
 _SAME_TURN, _SAME_SHIFT = 1e-9, 1e-9
 _MIN_DEPTH = 1e-6
+_DIFFERENCE_PX, _DIFFERENCE_SHARE = 1e-3, 0.02
+"""What a residual may differ by from the solution's: for rounding, for the curvature of distortion."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -57,7 +59,7 @@ class Placed:
     landmark: IntArray
     """(m,) row of the landmark."""
     uv_px: FloatArray
-    """(m, 2) pixel of the straightened image, centre of the first at (0, 0), carried at the landmark's range."""
+    """(m, 2) pixel on the straightened image, carried there at its landmark's range."""
     residual_px: FloatArray
     """(m, 2) where the straightened pinhole sees the landmark, less `uv_px`."""
     enlargement: FloatArray
@@ -117,16 +119,17 @@ def _usable(solution: Solution) -> tuple[IntArray, IntArray]:
 def place_observations(solution: Solution, straight: list[Straight | None]) -> Placed:
     """The used observations on the straightened images.
 
-    Left out are those outside a model's domain, of landmarks that are not in front of their camera, and of
-    landmarks that fewer than two images are then left of.
+    Left out are those outside a model's domain, of landmarks that are not in front of their camera, of
+    landmarks that fit best beyond infinity (the solution says where they may be at the least; there they have
+    other residuals), and of landmarks that fewer than two images are then left of.
     """
     row, image = _usable(solution)
     range_m, _ = _ranges(solution)
     landmark = solution.landmark_row[row]
     final, observations = solution.final, solution.traverse.observations
     n = len(row)
-    uv, residual, shift = np.empty((n, 2)), np.empty((n, 2)), np.zeros(n)
-    enlargement, valid = np.empty((n, 2, 2)), np.zeros(n, dtype=bool)
+    uv, residual, shift = np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n)
+    enlargement, valid = np.zeros((n, 2, 2)), np.zeros(n, dtype=bool)
     limits = np.searchsorted(image, np.arange(len(straight) + 1))
     for i, s in enumerate(straight):
         own = slice(limits[i], limits[i + 1])
@@ -141,6 +144,10 @@ def place_observations(solution: Solution, straight: list[Straight | None]) -> P
         projected, in_front = s.pinhole.project(points)
         residual[own] = projected - uv[own]
         valid[own] &= in_front & (points[:, 2] > _MIN_DEPTH)
+    found = np.einsum("nij,nj->ni", enlargement, solution.residual_final_px[row])
+    bound = _DIFFERENCE_PX + _DIFFERENCE_SHARE * np.linalg.norm(found, axis=1)
+    other = valid & (np.linalg.norm(residual - found, axis=1) > bound)
+    valid &= ~np.isin(landmark, landmark[other])
     views = np.bincount(landmark[valid], minlength=len(solution.landmark_track))
     keep = valid & (views[landmark] > 1)
     return Placed(

@@ -37,13 +37,17 @@ def cahvor_text(model: CAHV, comments: Iterable[str] = ()) -> str:
     lines = [f"# {comment}" for comment in comments]
     lines += ["", f"Model = {_kind(model)}", "", f"Dimensions = {model.width_px} {model.height_px}", ""]
     lines += [f"{name} = {_row(getattr(model, name))}" for name in letters]
-    size = 3 * len(letters)
-    lines += ["", "S =", *[_row(np.zeros(size))] * size, ""]
+    lines += ["", "S =", *_zeros(3 * len(letters)), ""]
     across = np.cross(model.A, model.V), np.cross(model.A, model.H)
     theta = float(np.arctan2(np.cross(model.V, model.H) @ model.A, across[0] @ across[1]))
     internal = {"Hs": model.fx_px, "Hc": model.cx_px, "Vs": model.fy_px, "Vc": model.cy_px}
     lines += [f"{name}    = {value!r}" for name, value in internal.items()]
-    lines += [f"Theta = {theta!r} ({np.rad2deg(theta):.6f} deg)", "", "S internal =", *[_row(np.zeros(5))] * 5]
+    lines += [
+        f"Theta = {theta!r} ({np.rad2deg(theta):.6f} deg)",
+        "",
+        "S internal =",
+        *[_row(np.zeros(5))] * 5,
+    ]
     return "\n".join([*lines, ""])
 
 
@@ -68,15 +72,26 @@ def read_cahvor(path: Path | str) -> CAHV:
             f"found {short(model)}"
         )
     kind = match[1]
-    width_px, height_px = _numbers(path, entries, "Dimensions", 2)
-    size = {"width_px": int(width_px), "height_px": int(height_px)}
-    vectors = {name: _numbers(path, entries, name, 3) for name in kind}
+    width_px, height_px = (int(n) for n in _numbers(path, entries, "Dimensions", 2))
+    c, a, h, v = (_numbers(path, entries, name, 3) for name in "CAHV")
     try:
         if kind == "CAHV":
-            return CAHV(**size, **vectors)
+            return CAHV(width_px=width_px, height_px=height_px, C=c, A=a, H=h, V=v)
+        o, r = (_numbers(path, entries, name, 3) for name in "OR")
         if kind == "CAHVOR":
-            return CAHVOR(**size, **vectors)
-        return CAHVORE(**size, **vectors, linearity=_linearity(path, match[2], match[3], model))
+            return CAHVOR(width_px=width_px, height_px=height_px, C=c, A=a, H=h, V=v, O=o, R=r)
+        return CAHVORE(
+            width_px=width_px,
+            height_px=height_px,
+            C=c,
+            A=a,
+            H=h,
+            V=v,
+            O=o,
+            R=r,
+            E=_numbers(path, entries, "E", 3),
+            linearity=_linearity(path, match[2], match[3], model),
+        )
     except CameraError as error:
         raise InputError(f"{path}: {error}") from error
 
@@ -100,6 +115,10 @@ def _linearity(path: Path, kind: str, number: str | None, model: str) -> float:
 
 def _row(values: FloatArray) -> str:
     return " ".join(f"{value!r:>23}" for value in values.tolist())
+
+
+def _zeros(n: int) -> list[str]:
+    return [" ".join(["0.0"] * n)] * n
 
 
 def _entry(path: Path, entries: dict[str, str], name: str) -> str:

@@ -1,7 +1,7 @@
 """A COLMAP workspace: undistorted images, and a text model with rigs and frames (COLMAP 3.12 or later).
 
-The text format is that of COLMAP's documentation, "Output Format". COLMAP has the centre of the first pixel at
-(0.5, 0.5), and poses that take points of the world to the camera.
+The text format is that of COLMAP's documentation, "Output Format". COLMAP has the centre of the first pixel
+at (0.5, 0.5), and poses that take points of the world to the camera.
 """
 
 from collections.abc import Iterable
@@ -53,12 +53,13 @@ def write_colmap(solution: Solution, folder: Path | str) -> None:
     `images/CAMERA/FRAME.png` are the images, resampled to it where the camera is more than that, in 8 bits.
     `stereo/` is what `colmap patch_match_stereo` starts from, and `export.json` says what was done.
 
-    Observations are those used, each carried along its line of sight to the pinhole, so that COLMAP's residuals
-    are those of the solution, enlarged as the image is. Images whose file is missing have a pose and
-    observations all the same. Whole or not at all: an older export is replaced at the end.
+    Observations are those used, each carried along its line of sight to the pinhole, so that COLMAP's
+    residuals are those of the solution, enlarged as the image is. Points that fit best beyond infinity have
+    no place in such a model and are left out. Images whose file is missing have a pose and observations all
+    the same. Whole or not at all: an older export is replaced at the end.
 
-    Raises InputError for a camera of which a pinhole shows nothing, for a folder with anything else in it, and
-    where writing fails.
+    Raises InputError for a camera of which a pinhole shows nothing, for a folder with anything else in it,
+    and where writing fails.
     """
     with whole_export(Path(folder)) as partial:
         fill_colmap(solution, partial, brightness_of(solution))
@@ -90,8 +91,13 @@ def _numbers(
     solution: Solution, rigs: list[RigGroup], heads: dict[int, tuple[int, FloatArray, FloatArray]]
 ) -> _Numbers:
     traverse = solution.traverse
-    camera = {key: n for n, key in enumerate(((r, e) for r, g in enumerate(rigs) for e in sorted(g.cameras)), 1)}
-    eyes, frames = file_names([e.name for e in traverse.rig.eyes]), file_names([f.id for f in traverse.frames])
+    camera = {
+        key: n for n, key in enumerate(((r, e) for r, g in enumerate(rigs) for e in sorted(g.cameras)), 1)
+    }
+    eyes, frames = (
+        file_names([e.name for e in traverse.rig.eyes]),
+        file_names([f.id for f in traverse.frames]),
+    )
     of_image, name = {}, {}
     for i, (f, e) in enumerate(zip(traverse.image_frame.tolist(), traverse.image_eye.tolist(), strict=True)):
         if f in heads and (heads[f][0], e) in camera and np.isfinite(solution.final.world_t_camera[i]).all():
@@ -209,26 +215,32 @@ def _write_images(
             previous, lookup = s, straightening_map(s.camera, s.pinhole, s.range_m)
         path = folder / numbers.name[i]
         path.parent.mkdir(exist_ok=True)
-        samples = image if lookup is None else resampled(image, lookup)
+        samples = image if lookup is None else _resampled(image, lookup)
         png = cv2.imencode(".png", brightness.to_8_bits(samples, image.dtype))[1]
         path.write_bytes(png.tobytes())
         written.append(i)
     return sorted(written)
 
 
-def resampled(image: NDArray[Any], lookup: FloatArray) -> NDArray[np.float32]:
+def _resampled(image: NDArray[Any], lookup: FloatArray) -> NDArray[np.float32]:
     """Samples of an image at pixels (height, width, 2): Lanczos over 8 x 8 pixels; 0 outside the image.
 
     OpenCV rounds the pixels to a 32nd.
     """
     height, width = image.shape
-    within = np.all((lookup > -_FIRST_PIXEL) & (lookup < [width - _FIRST_PIXEL, height - _FIRST_PIXEL]), axis=-1)
+    within = np.all(
+        (lookup > -_FIRST_PIXEL) & (lookup < [width - _FIRST_PIXEL, height - _FIRST_PIXEL]), axis=-1
+    )
     where = np.where(within[..., None], lookup, 0.0).astype(np.float32)
     # Reflected at its edges, and black only then: else the edge would ring.
     samples = cv2.remap(
-        image.astype(np.float32), where, None, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REFLECT_101
+        image.astype(np.float32),
+        where[..., 0],
+        where[..., 1],
+        cv2.INTER_LANCZOS4,
+        borderMode=cv2.BORDER_REFLECT_101,
     )
-    return np.where(within, samples, np.float32(0))
+    return np.where(within, np.asarray(samples, dtype=np.float32), np.float32(0))
 
 
 def _write_stereo(folder: Path, names: list[str]) -> None:
@@ -274,6 +286,7 @@ def _about(
     return {
         "observations": len(placed.row),
         "points": len(of_point),
+        "points_left_out": int(np.isfinite(solution.final.landmarks_m).all(axis=1).sum()) - len(of_point),
         "mean_reprojection_error_px": float(np.mean(of_point)) if len(of_point) else None,
         "rms_px": rms_px(placed.residual_px),
         "rms_raw_px": rms_px(solution.residual_final_px[placed.row]),

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pancam_graph.geometry import FloatArray, IntArray
+from pancam_graph.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.solution import Solution
 
 __all__ = ["points_ply"]
@@ -62,9 +62,9 @@ def points_ply(solution: Solution, grey: NDArray[np.uint8] | None = None) -> byt
 
 def _worst_sigma_m(covariance_m2: FloatArray) -> FloatArray:
     """Square root (n,) of the largest eigenvalue of covariances (n, 3, 3); NaN where they are not finite."""
-    known = np.isfinite(covariance_m2).all(axis=(1, 2))
+    known: BoolArray = np.asarray(np.isfinite(covariance_m2).all(axis=(1, 2)))
     largest = np.linalg.eigvalsh(np.where(known[:, None, None], covariance_m2, 0.0))[:, -1]
-    return np.where(known, np.sqrt(np.maximum(largest, 0.0)), np.nan)
+    return np.asarray(np.where(known, np.sqrt(np.maximum(largest, 0.0)), np.nan))
 
 
 def _per_landmark(solution: Solution) -> tuple[IntArray, FloatArray]:

@@ -1,13 +1,17 @@
-"""The folder of results: solution.json, points.ply, residuals.csv, report.html; whole or not at all."""
+"""The folder of results: solution.json, points.ply, residuals.csv, report.html, exports; whole or none."""
 
 import os
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from pancam_graph.errors import InputError
 from pancam_graph.io._atomic import whole_folder
+from pancam_graph.io._brightness import brightness_of
+from pancam_graph.io._exported import require_export
 from pancam_graph.io._json import read_json, refused_by_schema
 from pancam_graph.io._schema import SOLUTION_FORMAT, VERSION
+from pancam_graph.io.exports import EXPORTS, Export, check_exports, fill_exports
 from pancam_graph.io.ply import points_ply
 from pancam_graph.io.residuals_csv import residuals_csv
 from pancam_graph.io.solution_json import solution_json
@@ -52,19 +56,25 @@ def check_out(out: Path | str) -> None:
         raise InputError(f"{expected}, found no permission to write in {parent}")
 
 
-def save_solution(solution: Solution, out: Path | str, *, report: bool = True) -> Solution:
-    """Write the results of a solution into the folder `out`; see `RESULT_FILES`.
+def save_solution(
+    solution: Solution, out: Path | str, *, report: bool = True, exports: Sequence[Export] = ()
+) -> Solution:
+    """Write the results of a solution into the folder `out`; see `RESULT_FILES` and `exports.EXPORTS`.
 
     Everything is written into a folder beside and renamed when complete: an older folder of results stays
     whole until then, and is there as before if anything fails. Returns the solution with the time that
-    writing took as its `seconds.report`. Raises InputError as `check_out` does, and where writing fails.
+    writing took as its `seconds.report`. Raises InputError as `check_out` and `check_exports` do, and where
+    writing fails.
     """
     out = Path(out)
     check_out(out)
+    exports = check_exports(solution.traverse, exports)
     started = time.perf_counter()
     try:
         with whole_folder(out) as folder, refused_by_schema(out):
-            (folder / "points.ply").write_bytes(points_ply(solution))
+            brightness = brightness_of(solution)
+            (folder / "points.ply").write_bytes(points_ply(solution, brightness.grey))
+            fill_exports(solution, exports, folder, brightness)
             (folder / "residuals.csv").write_bytes(residuals_csv(solution))
             if report:
                 from pancam_graph.report import write_report  # noqa: PLC0415  Plotly is only for reports
@@ -81,7 +91,10 @@ def save_solution(solution: Solution, out: Path | str, *, report: bool = True) -
 def _require_results(folder: Path, expected: str) -> None:
     """Raise InputError unless a folder is empty or holds nothing but results."""
     found = sorted(p.name for p in folder.iterdir())
-    strangers = [n for n in found if n not in RESULT_FILES or not (folder / n).is_file()]
+    exports = [n for n in found if n in EXPORTS and (folder / n).is_dir()]
+    strangers = [
+        n for n in found if n not in exports and (n not in RESULT_FILES or not (folder / n).is_file())
+    ]
     if strangers:
         more = f" and {len(strangers) - 1} more" if len(strangers) > 1 else ""
         raise InputError(f"{expected}, found other things in it: {strangers[0]}{more}")
@@ -92,3 +105,5 @@ def _require_results(folder: Path, expected: str) -> None:
             read_json(folder / "solution.json", SOLUTION_FORMAT, VERSION)
         except InputError as error:
             raise InputError(f"{expected}, found a solution.json that is none of ours: {error}") from error
+    for name in exports:
+        require_export(folder / name, expected)
