@@ -14,6 +14,7 @@ from pancam_graph.geometry import BoolArray, FloatArray, IntArray
 __all__ = ["straight_pixels", "straightened", "straightening_map"]
 
 _ROUNDING_PX = 1e-6
+_AGAIN_PX = 1e-3
 _GRID_PX = 8
 _CHUNK_PX = 1 << 18
 _MOST_GROWTH = 0.5
@@ -101,8 +102,11 @@ def _looked_up(
     out = np.empty((len(rows), len(columns), 2))
     step = max(1, _CHUNK_PX // len(columns))
     for begin in range(0, len(rows), step):
-        uv = _grid(columns, rows[begin : begin + step])
-        direction = straight.unproject(uv.reshape(-1, 2)).direction
-        found, valid = camera.project(range_m * direction)
-        out[begin : begin + step] = np.where(valid[:, None], found, np.nan).reshape(uv.shape)
+        grid = _grid(columns, rows[begin : begin + step])
+        uv = grid.reshape(-1, 2)
+        found, valid = camera.project(range_m * straight.unproject(uv).direction)
+        # Past where a lens folds back, a direction has an image too, but of a pixel that looks elsewhere.
+        again, _, known = straight_pixels(camera, straight, found, np.full(len(uv), range_m))
+        valid &= known & (np.linalg.norm(again - uv, axis=1) < _AGAIN_PX)
+        out[begin : begin + step] = np.where(valid[:, None], found, np.nan).reshape(grid.shape)
     return out

@@ -15,7 +15,7 @@ from pancam_graph.traverse import Traverse
 
 __all__ = ["Brightness", "brightness_of", "image_path", "readable_image"]
 
-_WHITE_PERCENT = 99.9
+_WHITE_PERCENT = 99.5
 _WHITE_8_BIT = 255.0
 
 
@@ -24,7 +24,7 @@ class Brightness:
     """What white is, and how bright the landmarks are."""
 
     white: float
-    """Sample of images of 16 bits that becomes 255: the median, over images, of their 99.9th percentiles."""
+    """Sample of images of 16 bits that becomes 255: the median, over images, of their 99.5th percentiles."""
     grey: NDArray[np.uint8] | None
     """(landmarks,) 0 to 255; 0 where no readable image sees one. None: no image can be read."""
 

@@ -46,7 +46,7 @@ def cahvor_text(model: CAHV, comments: Iterable[str] = ()) -> str:
         f"Theta = {theta!r} ({np.rad2deg(theta):.6f} deg)",
         "",
         "S internal =",
-        *[_row(np.zeros(5))] * 5,
+        *_zeros(5),
     ]
     return "\n".join([*lines, ""])
 
