@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import gtsam
 import io_samples
 import numpy as np
@@ -14,6 +15,7 @@ import pytest
 import pancam_graph.report
 from pancam_graph.errors import InputError
 from pancam_graph.io import check_out, read_solution_json, save_solution
+from pancam_graph.io._brightness import brightness_of
 from pancam_graph.solution import Refined, RigCorrection, Solution
 
 
@@ -31,7 +33,7 @@ def small_report(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def read_ply(path: Path) -> tuple[list[str], np.ndarray[Any, Any]]:
     header, body = path.read_bytes().split(b"end_header\n", 1)
-    types = {"double": "<f8", "float": "<f4", "int": "<i4"}
+    types = {"double": "<f8", "float": "<f4", "int": "<i4", "uchar": "u1"}
     lines = header.decode("ascii").splitlines()
     properties = [line.split()[1:] for line in lines if line.startswith("property")]
     return lines, np.frombuffer(body, dtype=[(name, types[kind]) for kind, name in properties])
@@ -186,6 +188,33 @@ def test_points_ply_with_large_track_numbers_and_without_points(tmp_path: Path) 
         io_samples.solution(final=nothing, landmark_track=np.zeros(0, dtype=np.int64)), tmp_path / "out"
     )
     assert len(read_ply(tmp_path / "out" / "points.ply")[1]) == 0
+
+
+def test_points_ply_with_sigmas_and_grey_values(tmp_path: Path) -> None:
+    """The worst direction's sigma; the mean grey of used observations, 16 bits scaled so that white is 255."""
+    made = io_samples.solution()
+    sheared = np.array([[5.0, 4.0, 0.0], [4.0, 5.0, 0.0], [0.0, 0.0, 2.0]])  # eigenvalues 9, 2, 1
+    covariance = np.stack([0.01 * sheared, np.full((3, 3), np.nan), np.full((3, 3), np.nan)])
+    images = list(made.traverse.images)
+    width, height = io_samples.SIZE["width_px"], io_samples.SIZE["height_px"]
+    for row, level in ((1, 1000), (2, 300), (4, 900)):
+        images[row] = replace(images[row], file=f"{row}.png")
+        cv2.imwrite(str(tmp_path / f"{row}.png"), np.full((height, width), level, dtype=np.uint16))
+    images[3] = replace(images[3], file="lost.png")
+    pictured = replace(made.traverse, images=tuple(images), folder=tmp_path)
+    save_solution(replace(made, traverse=pictured, landmark_covariance_m2=covariance), tmp_path / "out")
+    header, points = read_ply(tmp_path / "out" / "points.ply")
+    assert points.dtype.names[6:] == ("sigma_m", "red", "green", "blue")
+    assert points["sigma_m"][0] == pytest.approx(0.3)
+    assert np.isnan(points["sigma_m"][1])
+    # White is the median, 900. Track 7 is an outlier in the first of the three: a mean of 600; of track 0, 733.
+    assert made.reason[5] == "outlier"
+    for colour in ("red", "green", "blue"):
+        assert points[colour].tolist() == [170, 208]
+    brightness = brightness_of(replace(made, traverse=pictured))
+    assert brightness.white == 900.0
+    assert brightness.to_8_bits(np.array([450.0]), np.dtype(np.uint16)).tolist() == [128]
+    assert brightness.to_8_bits(np.array([77.0]), np.dtype(np.uint8)).tolist() == [77]
 
 
 def test_residuals_csv(tmp_path: Path) -> None:

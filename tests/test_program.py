@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from pancam_graph import SimulationOptions, simulate, solve, write_traverse
+from pancam_graph.cameras import Brown
 from pancam_graph.io import read_solution_json
 from pancam_graph.rigs import mer_navcam
 
@@ -278,6 +279,50 @@ def test_no_observation_twice_is_bad_input(run: Run, tmp_path: Path) -> None:
     assert done.returncode == 2
     assert "two or more images" in done.stderr
     assert not (tmp_path / "out").exists()
+
+
+def test_exports_are_written_beside_and_dense_work_is_kept(
+    run: Run, traverse_folder: Path, tmp_path: Path
+) -> None:
+    words = ("--export", "colmap", "--export", "cahvor", "--no-report")
+    done = run("optimize_traverse.py", "traverse", "--out", "out", *words)
+    assert done.returncode == 0, done.stderr
+    n = len(json.loads((traverse_folder / "traverse.json").read_text())["images"])
+    assert len(list((tmp_path / "out" / "cahvor").glob("*.cahvor"))) == n
+    assert {p.name for p in (tmp_path / "out" / "colmap").iterdir()} == {
+        "sparse",
+        "images",
+        "stereo",
+        "export.json",
+    }
+    assert run("optimize_traverse.py", "traverse", "--out", "out", *words).returncode == 0
+    (tmp_path / "out" / "colmap" / "fused.ply").write_text("hours of work")
+    done = run("optimize_traverse.py", "traverse", "--out", "out", *words)
+    assert done.returncode == 2
+    assert done.stderr == (
+        "out: expected a new folder or one of older results, found what others made in it: colmap/fused.ply\n"
+    )
+    assert (tmp_path / "out" / "colmap" / "fused.ply").read_text() == "hours of work"
+
+
+def test_a_lens_that_an_export_cannot_say_is_bad_input_before_the_solve(run: Run, tmp_path: Path) -> None:
+    t = simulate(mer_navcam(), SMALL, seed=0).traverse
+    k = {name: getattr(t.rig.eyes[0].camera, name) for name in ("fx_px", "fy_px", "cx_px", "cy_px")}
+    size = {"width_px": t.rig.eyes[0].camera.width_px, "height_px": t.rig.eyes[0].camera.height_px}
+    lens = Brown(**size, **k, distortion=(0.0, 0.0, 1e-4, 0.0, 0.0))
+    eyes = (replace(t.rig.eyes[0], camera=lens), *t.rig.eyes[1:])
+    write_traverse(replace(t, rig=replace(t.rig, name="own", eyes=eyes)), tmp_path / "traverse")
+    done = run("optimize_traverse.py", "traverse", "--out", "out", "--export", "cahvor")
+    assert done.returncode == 2
+    name = t.rig.eyes[0].name
+    assert done.stderr == (
+        f"cahvor: camera {name}: distortion: expected k1 and k2 alone, all that CAHVOR can say, "
+        "found p1 0.0001, p2 0, k3 0\n"
+    )
+    assert not (tmp_path / "out").exists()
+    done = run("optimize_traverse.py", "traverse", "--out", "out", "--export", "nerf")
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
 
 
 def test_simulate_then_optimize(run_apart: Run, tmp_path: Path) -> None:
