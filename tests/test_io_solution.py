@@ -191,7 +191,7 @@ def test_points_ply_with_large_track_numbers_and_without_points(tmp_path: Path) 
 
 
 def test_points_ply_with_sigmas_and_grey_values(tmp_path: Path) -> None:
-    """The worst direction's sigma; the mean grey of used observations, 16 bits scaled so that white is 255."""
+    """The worst direction's sigma; the mean grey of used observations; 16 bits scaled to white."""
     made = io_samples.solution()
     sheared = np.array([[5.0, 4.0, 0.0], [4.0, 5.0, 0.0], [0.0, 0.0, 2.0]])  # eigenvalues 9, 2, 1
     covariance = np.stack([0.01 * sheared, np.full((3, 3), np.nan), np.full((3, 3), np.nan)])
@@ -203,11 +203,11 @@ def test_points_ply_with_sigmas_and_grey_values(tmp_path: Path) -> None:
     images[3] = replace(images[3], file="lost.png")
     pictured = replace(made.traverse, images=tuple(images), folder=tmp_path)
     save_solution(replace(made, traverse=pictured, landmark_covariance_m2=covariance), tmp_path / "out")
-    header, points = read_ply(tmp_path / "out" / "points.ply")
+    _, points = read_ply(tmp_path / "out" / "points.ply")
     assert points.dtype.names[6:] == ("sigma_m", "red", "green", "blue")
     assert points["sigma_m"][0] == pytest.approx(0.3)
     assert np.isnan(points["sigma_m"][1])
-    # White is the median, 900. Track 7 is an outlier in the first of the three: a mean of 600; of track 0, 733.
+    # White is the median, 900. Track 7 is an outlier in the first: its mean is 600, that of track 0 733.
     assert made.reason[5] == "outlier"
     for colour in ("red", "green", "blue"):
         assert points[colour].tolist() == [170, 208]
