@@ -1,0 +1,10 @@
+"""Traverses with known truth: observed points, or rendered images."""
+
+from pancam_graph.simulate._drive import TelemetryStart as TelemetryStart
+from pancam_graph.simulate._drive import Truth as Truth
+from pancam_graph.simulate._options import RenderOptions as RenderOptions
+from pancam_graph.simulate._options import SimulationOptions as SimulationOptions
+from pancam_graph.simulate._points import Simulation as Simulation
+from pancam_graph.simulate._points import simulate as simulate
+from pancam_graph.simulate._render import Rendering as Rendering
+from pancam_graph.simulate._render import render as render

@@ -1,0 +1,162 @@
+"""Panoramas as image files would have them, with truth: a mast rig driven over a textured world."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pancam_graph.errors import InputError
+from pancam_graph.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.rigs import Rig
+from pancam_graph.simulate import _raycast
+from pancam_graph.simulate._drive import (
+    TelemetryStart,
+    Truth,
+    claimed_rig,
+    make_traverse,
+    panorama,
+    path,
+    stand,
+    telemetry,
+)
+from pancam_graph.simulate._options import RenderOptions
+from pancam_graph.simulate._raycast import Deck, Scene
+from pancam_graph.simulate._scene import make_deck, make_scene, slopes
+from pancam_graph.simulate._sensor import HALO_PX, GreyImage, expose
+from pancam_graph.threads import in_parallel
+from pancam_graph.traverse import Traverse
+
+__all__ = ["Rendering", "render"]
+
+_OVERLAP = 0.2  # of neighbouring frames, as a share of the widest eye's field
+_BELOW_HORIZON = 0.4  # where the row looks, as a share of the field down
+_BAND_PX = 128  # rows that one thread renders at a time
+_KEPT_PX = 8_000_000  # lines of sight that are kept from image to image
+_EDGE_RAYS = 3  # along each side of a pixel that lies on an edge
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Rendering:
+    """A traverse of images as a solver gets it, what it should find, and the images, rendered when asked."""
+
+    traverse: Traverse
+    """At the disturbed telemetry, without observations; its image files are named but not written."""
+    truth: Truth
+    """Without landmarks: ask `points` for those of any pixels."""
+    telemetry_start: TelemetryStart
+    options: RenderOptions
+    seed: int
+    _scene: Scene
+    _rays: dict[int, tuple[FloatArray, FloatArray, BoolArray]] = field(default_factory=dict)
+
+    def image(self, row: int) -> GreyImage:
+        """Image of that row of the traverse, (height, width), 8 bits or 12 in 16.
+
+        The same image at each call, whatever was rendered before and on however many threads.
+        """
+        eye = int(self.traverse.image_eye[row])
+        camera = self.truth.rig.eyes[eye].camera
+        rotation, centre = self._camera(row)
+        light = np.empty((camera.height_px + 2 * HALO_PX, camera.width_px + 2 * HALO_PX))
+
+        def band(begin: int, end: int) -> None:
+            # Each band is rendered with what the optics smear into it, and stands for itself.
+            rows = np.arange(begin - HALO_PX, end + HALO_PX)
+            origin, direction, valid = self._band_rays(eye, rows)
+            shape = valid.shape
+            part, distance = np.empty(shape), np.empty(shape)
+            edge = np.empty(shape, dtype=np.int64)
+            view = (self._scene, self._deck(row), rotation, centre, origin, direction)
+            _raycast.render(*view, valid, part, distance, edge)
+            _raycast.smooth(*view, part, distance, edge, _EDGE_RAYS)
+            inner = slice(HALO_PX if begin else 0, len(part) - (HALO_PX if end < camera.height_px else 0))
+            light[begin + inner.start : begin + inner.stop] = part[inner]
+
+        in_parallel(band, camera.height_px, grain=_BAND_PX)
+        # A stream of its own for each image: its noise does not depend on what was rendered before.
+        return expose(light, self.options, np.random.default_rng([self.seed, row, 1]))
+
+    def points(self, row: int, uv_px: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """What pixels (n, 2) of an image see: points in the world (n, 3), and which see any (n,).
+
+        A point in the sky, or of a pixel outside the camera's domain, is not meaningful.
+        """
+        rotation, centre = self._camera(row)
+        rays = self.truth.rig.eyes[int(self.traverse.image_eye[row])].camera.unproject(uv_px)
+        origin, direction = centre + rays.origin_m @ rotation.T, rays.direction @ rotation.T
+        distance = np.empty(len(uv_px))
+        _raycast.hits(self._scene, self._deck(row), origin, direction, distance)
+        hit = np.isfinite(distance) & rays.valid
+        return origin + np.where(hit, distance, 0.0)[:, None] * direction, hit
+
+    def _camera(self, row: int) -> tuple[FloatArray, FloatArray]:
+        """world_R_camera and the camera's place, in truth."""
+        true = replace(self.traverse, rig=self.truth.rig)
+        rotation, centre = true.camera_poses(self.truth.world_T_mast, self.truth.pan_tilt_rad)
+        return np.ascontiguousarray(rotation[row]), np.ascontiguousarray(centre[row])
+
+    def _deck(self, row: int) -> Deck:
+        stop = int(self.traverse.frame_stop[self.traverse.image_frame[row]])
+        pose = self.truth.world_T_mast[stop]
+        return make_deck(self.truth.rig.mast_height_m, pose, seen=self.options.deck)
+
+    def _band_rays(self, eye: int, rows: IntArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Lines of sight of whole rows, a margin on both sides included, in the camera frame."""
+        camera = self.truth.rig.eyes[eye].camera
+        if sum(e.camera.width_px * e.camera.height_px for e in self.truth.rig.eyes) > _KEPT_PX:
+            return self._sight(eye, rows)
+        if eye not in self._rays:
+            self._rays[eye] = self._sight(eye, np.arange(-HALO_PX, camera.height_px + HALO_PX))
+        origin, direction, valid = self._rays[eye]
+        part = slice(int(rows[0]) + HALO_PX, int(rows[-1]) + HALO_PX + 1)
+        if len(origin) > 1:
+            origin = origin.reshape(*valid.shape, 3)[part].reshape(-1, 3)
+        return origin, direction[part], valid[part]
+
+    def _sight(self, eye: int, rows: IntArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        camera = self.truth.rig.eyes[eye].camera
+        columns = np.arange(-HALO_PX, camera.width_px + HALO_PX)
+        v, u = np.meshgrid(rows.astype(float), columns.astype(float), indexing="ij")
+        rays = camera.unproject(np.stack([u, v], axis=-1).reshape(-1, 2))
+        origin = rays.origin_m if camera.pupil_moves else rays.origin_m[:1]
+        return np.ascontiguousarray(origin), rays.direction.reshape(*u.shape, 3), rays.valid.reshape(u.shape)
+
+
+def render(rig: Rig, options: RenderOptions | None = None, *, seed: int = 0) -> Rendering:
+    """Drive `rig` over a random world and take panoramas. The same arguments give the same bytes.
+
+    World, drive, errors of telemetry and of the rig that the traverse claims, and sensor noise are drawn
+    independently of each other. Every pixel is traced along the ray of the camera's own model, and all that
+    is seen lies on the surface that `Rendering.points` returns. Raises InputError for a negative seed.
+    """
+    options = options if options is not None else RenderOptions()
+    if seed < 0:
+        raise InputError(f"simulation: seed: expected 0 or more, found {seed}")
+    streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)]
+    rng_world, rng_drive, rng_telemetry, rng_rig = streams
+    xy, heading = path(options, rng_drive)
+    scene = make_scene(options, xy, rng_world)
+    ground, slope = slopes(scene, xy)
+    world_T_mast = stand(rig, xy, heading, ground, slope)
+    angles = panorama(rig, options, overlap=_OVERLAP, rows=lambda down: (-_BELOW_HORIZON * down,))
+    pan_tilt = np.tile(angles, (options.stops, 1))
+    start = telemetry(rig, options, world_T_mast, pan_tilt, rng_telemetry)
+    traverse = make_traverse(
+        claimed_rig(rig, options, angles, rng_rig),
+        options,
+        start.world_T_mast,
+        start.pan_tilt_rad,
+        None,
+        seed,
+        file="images/{image}.png",
+    )
+    truth = Truth(
+        rig=rig,
+        world_T_mast=world_T_mast,
+        pan_tilt_rad=pan_tilt,
+        landmarks_m=np.zeros((0, 3)),
+        uv_px=np.zeros((0, 2)),
+        outlier=np.zeros(0, dtype=bool),
+    )
+    return Rendering(
+        traverse=traverse, truth=truth, telemetry_start=start, options=options, seed=seed, _scene=scene
+    )
