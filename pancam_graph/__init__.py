@@ -20,11 +20,15 @@ from pancam_graph.io import read_pds as read_pds
 from pancam_graph.io import read_traverse as read_traverse
 from pancam_graph.io import write_cameras as write_cameras
 from pancam_graph.io import write_colmap as write_colmap
+from pancam_graph.io import write_rendering as write_rendering
 from pancam_graph.io import write_traverse as write_traverse
 from pancam_graph.report import write_report as write_report
 from pancam_graph.sharing import Freedom as Freedom
 from pancam_graph.sharing import Sharing as Sharing
+from pancam_graph.simulate import Rendering as Rendering
+from pancam_graph.simulate import RenderOptions as RenderOptions
 from pancam_graph.simulate import SimulationOptions as SimulationOptions
+from pancam_graph.simulate import render as render
 from pancam_graph.simulate import simulate as simulate
 from pancam_graph.solution import Solution as Solution
 from pancam_graph.solve import SolveOptions as SolveOptions

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from pancam_graph.errors import InputError
-from pancam_graph.io import write_traverse
+from pancam_graph.io import write_traverse, write_truth
 from pancam_graph.program import Parser, run, show_log
 from pancam_graph.rigs import TEMPLATES, rig_template
 from pancam_graph.simulate import SimulationOptions, simulate
@@ -53,8 +53,7 @@ def main() -> int:
     options = SimulationOptions(**{**a, "tilts_rad": a["tilts_rad"] and tuple(a["tilts_rad"])})
     s = simulate(rig_template(rig), options, seed=seed)
     write_traverse(s.traverse, out)
-    arrays = {k: getattr(s.truth, k) for k in ("pan_tilt_rad", "landmarks_m", "uv_px", "outlier")}
-    np.savez(out / "truth.npz", world_T_mast=[m.matrix() for m in s.truth.world_T_mast], **arrays)
+    write_truth(s.truth, out)
     counts = f"{len(s.traverse.stops)} stops, {len(s.traverse.images)} images"
     print(f"{out}: {counts}, {len(s.truth.landmarks_m)} tracks, {len(s.truth.uv_px)} observations")
     return 0

@@ -39,9 +39,13 @@ class Scene(NamedTuple):
     frame_m: FloatArray
     """(levels, mips, 3): x and y of its first node, and its step."""
     slope: FloatArray
-    """(levels,) bound of the slope there and on coarser levels."""
+    """(levels,) bound of the slope there."""
     top_m: float
     """Height of the highest ground."""
+    rough_m: float
+    """By how much the finest grid departs from the next one, up and down together."""
+    tall_m: float
+    """By how much rocks rise over the ground."""
     rocks: FloatArray
     """(rocks, 17): centre, world to unit ball (9, by rows), top, form, albedo, radius seen from above, key."""
     forms: FloatArray
@@ -154,32 +158,30 @@ def noises(
 
 
 @compiled
-def _level(scene: Scene, x: float, y: float) -> int:
+def _level(shape: IntArray, frame_m: FloatArray, x: float, y: float) -> int:
     """The finest grid that has ground around a place; as many as there are outside all."""
-    for level in range(len(scene.slope)):
-        step = scene.frame_m[level, 0, 2]
-        a = (x - scene.frame_m[level, 0, 0]) / step
-        b = (y - scene.frame_m[level, 0, 1]) / step
-        if a >= 1 and b >= 1 and a < scene.shape[level, 0, 1] - 2 and b < scene.shape[level, 0, 2] - 2:
+    for level in range(len(shape)):
+        a = (x - frame_m[level, 0, 0]) / frame_m[level, 0, 2]
+        b = (y - frame_m[level, 0, 1]) / frame_m[level, 0, 2]
+        if a >= 1 and b >= 1 and a < shape[level, 0, 1] - 2 and b < shape[level, 0, 2] - 2:
             return level
-    return len(scene.slope)
+    return len(shape)
 
 
 @compiled
-def _height(scene: Scene, level: int, x: float, y: float) -> float:
+def _height(height_m: Grids, shape: IntArray, frame_m: FloatArray, level: int, x: float, y: float) -> float:
     """The surface: bilinear between the nodes of the finest grid."""
-    if level == len(scene.slope):
+    if level == len(shape):
         return -1e9
-    step = scene.frame_m[level, 0, 2]
-    a = (x - scene.frame_m[level, 0, 0]) / step
-    b = (y - scene.frame_m[level, 0, 1]) / step
+    a = (x - frame_m[level, 0, 0]) / frame_m[level, 0, 2]
+    b = (y - frame_m[level, 0, 1]) / frame_m[level, 0, 2]
     i, j = int(a), int(b)
     u, v = a - i, b - j
-    wide = scene.shape[level, 0, 1]
-    at = scene.shape[level, 0, 0] + j * wide + i
-    low = float(scene.height_m[at]) * (1 - u) + float(scene.height_m[at + 1]) * u
-    high = float(scene.height_m[at + wide]) * (1 - u) + float(scene.height_m[at + wide + 1]) * u
-    return low * (1 - v) + high * v
+    wide = shape[level, 0, 1]
+    at = shape[level, 0, 0] + j * wide + i
+    low = height_m[at] + u * (height_m[at + 1] - height_m[at])
+    high = height_m[at + wide] + u * (height_m[at + wide + 1] - height_m[at + wide])
+    return low + v * (high - low)
 
 
 @compiled
@@ -187,7 +189,9 @@ def heights(scene: Scene, xy_m: FloatArray) -> FloatArray:
     """Height of the ground (n,) at x and y (n, 2)."""
     out = np.empty(len(xy_m))
     for i in range(len(xy_m)):
-        out[i] = _height(scene, _level(scene, xy_m[i, 0], xy_m[i, 1]), xy_m[i, 0], xy_m[i, 1])
+        x, y = xy_m[i, 0], xy_m[i, 1]
+        level = _level(scene.shape, scene.frame_m, x, y)
+        out[i] = _height(scene.height_m, scene.shape, scene.frame_m, level, x, y)
     return out
 
 
@@ -220,41 +224,67 @@ def _sample(scene: Scene, level: int, mip: int, x: float, y: float) -> tuple[flo
 @compiled
 def _march(
     scene: Scene, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float
-) -> float:
-    """Distance along a ray to the ground; infinite in the sky."""
+) -> tuple[float, float]:
+    """Distance along a ray to the ground (infinite in the sky), and up to where no rock can be met."""
+    height, shape, frame, slope = scene.height_m, scene.shape, scene.frame_m, scene.slope
+    top, tall, rough = scene.top_m, scene.tall_m, scene.rough_m
     across = math.hypot(dx, dy)
-    far = len(scene.slope)
-    before, t, was = 0.0, _NEAREST_M, 1.0
+    before, was, t, over = 0.0, 1.0, _NEAREST_M, 1.0
+    free_of_rocks, contiguous = 0.0, True
+    level, last = 0, len(slope) - 1
+    first_x, first_y, step = frame[0, 0, 0], frame[0, 0, 1], frame[0, 0, 2]
+    start, wide, deep = shape[0, 0, 0], shape[0, 0, 1], shape[0, 0, 2]
+    closing = slope[0] * across - dz
+    gently = slope[min(1, last)] * across - dz
+    found = False
     for _ in range(_MAX_STEPS):
-        z = oz + t * dz
-        if dz >= 0 and z > scene.top_m:
-            return math.inf
-        level = _level(scene, ox + t * dx, oy + t * dy)
-        if level == far:
-            return math.inf
-        over = z - _height(scene, level, ox + t * dx, oy + t * dy)
+        x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+        if dz >= 0 and z > top:
+            return math.inf, free_of_rocks
+        a, b = (x - first_x) / step, (y - first_y) / step
+        while not (a >= 1 and b >= 1 and a < wide - 2 and b < deep - 2):
+            if level == last:
+                return math.inf, free_of_rocks
+            level += 1
+            first_x, first_y, step = frame[level, 0, 0], frame[level, 0, 1], frame[level, 0, 2]
+            start, wide, deep = shape[level, 0, 0], shape[level, 0, 1], shape[level, 0, 2]
+            closing = slope[level] * across - dz
+            gently = closing
+            rough = 0.0
+            a, b = (x - first_x) / step, (y - first_y) / step
+        i, j = int(a), int(b)
+        u, v = a - i, b - j
+        at = start + j * wide + i
+        low = height[at] + u * (height[at + 1] - height[at])
+        high = height[at + wide] + u * (height[at + wide + 1] - height[at + wide])
+        over = z - (low + v * (high - low))
         if over <= 0:
+            found = True
             break
         before, was = t, over
-        closing = scene.slope[level] * across - dz
-        free = over / closing if closing > 1e-6 else 1e3
+        # Well above ground only the slope without the finest relief counts.
+        free = max(over / max(closing, 1e-6), (over - rough) / max(gently, 1e-6))
+        if contiguous:
+            contiguous = over > tall
+            if contiguous:
+                free_of_rocks = t + (over - tall) / max(closing, 1e-6)
         # The next level may be steeper than this one; and what is finer than a pixel may be passed by.
-        t += max(min(free, 0.5 * t + 1.0), 0.0015 * t)
-    else:
-        return math.inf
+        t += max(min(free, 0.5 * t + 1.0), t * (0.0015 + 2e-5 * t))
+    if not found:
+        return math.inf, free_of_rocks
     # Regula falsi (Illinois) between above and below.
     low, high, above, below = before, t, was, over
     for _ in range(40):
         t = low + (high - low) * above / (above - below)
         x, y = ox + t * dx, oy + t * dy
-        over = oz + t * dz - _height(scene, _level(scene, x, y), x, y)
-        if abs(over) < 1e-9 * (1 + t) or high - low < 1e-9 * (1 + t):
+        over = oz + t * dz - _height(height, shape, frame, _level(shape, frame, x, y), x, y)
+        if abs(over) < 1e-8 * (1 + t) or high - low < 1e-9 * (1 + t):
             break
         if over > 0:
             low, above, below = t, over, 0.5 * below
         else:
             high, below, above = t, over, 0.5 * above
-    return t
+    return t, free_of_rocks
 
 
 # --- rocks ---
@@ -262,32 +292,27 @@ def _march(
 
 @compiled
 def _cut(
-    scene: Scene, rock: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float
+    rocks: FloatArray, forms: FloatArray, n: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float
 ) -> tuple[float, int]:
-    """Where a ray enters a rock (infinite: nowhere), and through which plane (-1: through the ball)."""
-    m = scene.rocks[rock]
-    px, py, pz = ox - m[0], oy - m[1], oz - m[2]
-    ax, ay, az = (
-        m[3] * px + m[4] * py + m[5] * pz,
-        m[6] * px + m[7] * py + m[8] * pz,
-        m[9] * px + m[10] * py + m[11] * pz,
-    )
-    bx, by, bz = (
-        m[3] * dx + m[4] * dy + m[5] * dz,
-        m[6] * dx + m[7] * dy + m[8] * dz,
-        m[9] * dx + m[10] * dy + m[11] * dz,
-    )
+    """Where a ray enters rock n (infinite: nowhere), and through which plane (-1: through the ball)."""
+    px, py, pz = ox - rocks[n, 0], oy - rocks[n, 1], oz - rocks[n, 2]
+    ax = rocks[n, 3] * px + rocks[n, 4] * py + rocks[n, 5] * pz
+    ay = rocks[n, 6] * px + rocks[n, 7] * py + rocks[n, 8] * pz
+    az = rocks[n, 9] * px + rocks[n, 10] * py + rocks[n, 11] * pz
+    bx = rocks[n, 3] * dx + rocks[n, 4] * dy + rocks[n, 5] * dz
+    by = rocks[n, 6] * dx + rocks[n, 7] * dy + rocks[n, 8] * dz
+    bz = rocks[n, 9] * dx + rocks[n, 10] * dy + rocks[n, 11] * dz
     bb, ab, aa = bx * bx + by * by + bz * bz, ax * bx + ay * by + az * bz, ax * ax + ay * ay + az * az
     inside = ab * ab - bb * (aa - 1)
     if inside <= 0:
         return math.inf, -1
     root = math.sqrt(inside)
     enter, leave, face = (-ab - root) / bb, (-ab + root) / bb, -1
-    form = int(m[13])
-    for k in range(scene.forms.shape[1]):
-        nx, ny, nz = scene.forms[form, k, 0], scene.forms[form, k, 1], scene.forms[form, k, 2]
+    form = int(rocks[n, 13])
+    for k in range(forms.shape[1]):
+        nx, ny, nz = forms[form, k, 0], forms[form, k, 1], forms[form, k, 2]
         towards = nx * bx + ny * by + nz * bz
-        out = nx * ax + ny * ay + nz * az - scene.forms[form, k, 3]
+        out = nx * ax + ny * ay + nz * az - forms[form, k, 3]
         if towards < 0:
             t = -out / towards
             if t > enter:
@@ -303,17 +328,30 @@ def _cut(
 
 @compiled
 def _hit_rocks(
-    scene: Scene, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, end: float, any_of: bool
+    scene: Scene,
+    ox: float,
+    oy: float,
+    oz: float,
+    dx: float,
+    dy: float,
+    dz: float,
+    begin: float,
+    end: float,
+    any_of: bool,
 ) -> tuple[float, int, int]:
-    """The first rock before `end` (or any one): distance, rock (-1: none), plane. Walks the cells below."""
+    """The first rock (or any one) between two distances: distance, rock (-1: none), plane.
+
+    Walks the cells below the ray. The distance is `end` where there is none.
+    """
+    rocks, forms, cells = scene.rocks, scene.forms, scene.cells
+    cell_rocks, cell_top = scene.cell_rocks, scene.cell_top_m
     best, rock, face = end, -1, -1
     wide, deep = scene.cell_shape
-    x0, y0, cell = scene.cell_frame_m
-    begin = 0.0
+    x0, y0, cell = scene.cell_frame_m[0], scene.cell_frame_m[1], scene.cell_frame_m[2]
     if dz < 0:
-        begin = max(0.0, (scene.rock_top_m - oz) / dz)
-    elif oz + dz * end > scene.rock_top_m:
-        end = min(end, (scene.rock_top_m - oz) / dz) if dz > 0 else end
+        begin = max(begin, (scene.rock_top_m - oz) / dz)
+    elif dz > 0:
+        end = min(end, (scene.rock_top_m - oz) / dz)
     dx = dx if abs(dx) > 1e-12 else 1e-12
     dy = dy if abs(dy) > 1e-12 else 1e-12
     a, b = (x0 - ox) / dx, (x0 + wide * cell - ox) / dx
@@ -327,27 +365,27 @@ def _hit_rocks(
     to_i, to_j = (1 if dx > 0 else -1), (1 if dy > 0 else -1)
     next_i = (x0 + (i + (dx > 0)) * cell - ox) / dx
     next_j = (y0 + (j + (dy > 0)) * cell - oy) / dy
+    wait_i, wait_j = cell / abs(dx), cell / abs(dy)
     t = begin
     while t < end:
         leave = min(next_i, next_j)
         at = j * wide + i
-        if min(oz + t * dz, oz + leave * dz) < scene.cell_top_m[at]:
-            for n in range(scene.cells[at], scene.cells[at + 1]):
-                candidate = scene.cell_rocks[n]
-                enter, plane = _cut(scene, candidate, ox, oy, oz, dx, dy, dz)
+        if min(oz + t * dz, oz + leave * dz) < cell_top[at]:
+            for n in range(cells[at], cells[at + 1]):
+                enter, plane = _cut(rocks, forms, cell_rocks[n], ox, oy, oz, dx, dy, dz)
                 if enter < best:
-                    best, rock, face = enter, candidate, plane
+                    best, rock, face = enter, cell_rocks[n], plane
                     if any_of:
                         return best, rock, face
             if best <= leave:
                 break
         t = leave
         if next_i < next_j:
-            i, next_i = i + to_i, next_i + cell / abs(dx)
+            i, next_i = i + to_i, next_i + wait_i
             if i < 0 or i >= wide:
                 break
         else:
-            j, next_j = j + to_j, next_j + cell / abs(dy)
+            j, next_j = j + to_j, next_j + wait_j
             if j < 0 or j >= deep:
                 break
     return best, rock, face
@@ -363,8 +401,8 @@ def _openness(scene: Scene, x: float, y: float) -> float:
     if i < 0 or j < 0 or i >= wide or j >= deep:
         return out
     for n in range(scene.cells[j * wide + i], scene.cells[j * wide + i + 1]):
-        rock = scene.rocks[scene.cell_rocks[n]]
-        away = math.hypot(x - rock[0], y - rock[1]) / rock[15]
+        rock = scene.cell_rocks[n]
+        away = math.hypot(x - scene.rocks[rock, 0], y - scene.rocks[rock, 1]) / scene.rocks[rock, 15]
         if away < 1.6:
             out *= 1 - 0.5 * min(1.0, (1.6 - away) / 0.9)
     return out
@@ -374,43 +412,59 @@ def _openness(scene: Scene, x: float, y: float) -> float:
 
 
 @compiled
-def _reflected(scene: Scene, nx: float, ny: float, nz: float, albedo: float, sunlit: float, sky: float) -> float:
+def _reflected(sun_at: FloatArray, nx: float, ny: float, nz: float, albedo: float, sunlit: float, sky: float) -> float:
     """Radiance of a rough surface of unit normal under sun and sky."""
-    sun = max(0.0, nx * scene.sun[0] + ny * scene.sun[1] + nz * scene.sun[2])
+    sun = max(0.0, nx * sun_at[0] + ny * sun_at[1] + nz * sun_at[2])
     return albedo * (sunlit * sun + sky * 0.22 * (0.6 + 0.4 * nz))
 
 
 @compiled
 def _pebbles(
-    scene: Scene, x: float, y: float, foot: float, cell: float, share: float, key: int
-) -> tuple[float, float, float, float]:
-    """A small stone, at most one a cell: how much of it is here, slopes of its top, and its shadow here."""
+    sun_at: FloatArray, x: float, y: float, foot: float, cell: float, share: float, key: int
+) -> tuple[float, float, float, float, float]:
+    """A small stone, at most one a cell: how much of it is here, slopes of its top, shadow, shade."""
     i, j = math.floor(x / cell), math.floor(y / cell)
     h = _hash(int(i), int(j), key)
     if (h & 0xFF) > 255 * share:
-        return 0.0, 0.0, 0.0, 0.0
+        return 0.0, 0.0, 0.0, 0.0, 0.0
     g = _hash(int(i), int(j), key + 1)
     size = (h >> 8 & 0xFF) / 255.0
-    radius = cell * (0.07 + 0.17 * size * size)
+    radius = cell * (0.05 + 0.12 * size * size * size)
+    room = cell - 7 * radius
+    cx = i * cell + 3.5 * radius + max(room, 0.0) * (g >> 16 & 0xFF) / 255.0
+    cy = j * cell + 3.5 * radius + max(room, 0.0) * (g >> 24 & 0xFF) / 255.0
+    if abs(x - cx) > 3.3 * radius or abs(y - cy) > 3.3 * radius:
+        return 0.0, 0.0, 0.0, 0.0, 0.0
     turn = _PI * (g & 0xFF) / 255.0
-    long = 1.0 + 0.7 * (g >> 8 & 0xFF) / 255.0
-    room = cell - 4.4 * radius
-    cx = i * cell + 2.2 * radius + max(room, 0.0) * (g >> 16 & 0xFF) / 255.0
-    cy = j * cell + 2.2 * radius + max(room, 0.0) * (g >> 24 & 0xFF) / 255.0
     c, s = math.cos(turn), math.sin(turn)
+    long = 1.0 + 0.8 * (g >> 8 & 0xFF) / 255.0
+    # A polygon of five uneven sides, so that they are stones and no drops.
+    level = h >> 16
+    away = lean_u = lean_v = shaded = 0.0
+    across = math.hypot(sun_at[0], sun_at[1]) + 1e-9
+    length = (0.5 + 0.5 * (level & 15) / 15.0) * radius * across / max(sun_at[2], 0.2)
     u, v = (c * (x - cx) + s * (y - cy)) / (radius * long), (-s * (x - cx) + c * (y - cy)) / radius
-    # Corners, so that they are stones and no drops.
-    away = math.sqrt(u * u + v * v) * (1 + 0.12 * math.cos(3 * math.atan2(v, u) + turn * 5))
-    edge = max(foot / radius, 0.12)
+    px, py = x + length * sun_at[0] / across - cx, y + length * sun_at[1] / across - cy
+    p, q = (c * px + s * py) / (radius * long), (-s * px + c * py) / radius
+    # Between the stone and the tip of its shadow: the tip's own distance, or that of the nearest place before.
+    tu, tv = u - p, v - q
+    part = min(1.0, max(0.0, (u * tu + v * tv) / (tu * tu + tv * tv + 1e-12)))
+    wu, wv = u - part * tu, v - part * tv
+    narrow = 1 + 0.5 * part
+    for k in range(5):
+        angle = 1.2566 * k + 0.5 * ((g >> (4 * k) & 15) / 15.0 - 0.5)
+        a, b = math.cos(angle), math.sin(angle)
+        side = (a * u + b * v) * (0.9 + 0.35 * (h >> (3 * k) & 7) / 7.0)
+        shaded = max(shaded, (a * wu + b * wv) * narrow)
+        if side > away:
+            away, lean_u, lean_v = side, a, b
+    edge = max(foot / radius, 0.1)
     fade = min(1.0, max(0.0, 2.2 - foot / radius))
     here = fade * min(1.0, max(0.0, (1 - away) / edge + 0.5))
-    length = 0.55 * radius * math.hypot(scene.sun[0], scene.sun[1]) / max(scene.sun[2], 0.2)
-    across = math.hypot(scene.sun[0], scene.sun[1]) + 1e-9
-    sx, sy = x + length * scene.sun[0] / across - cx, y + length * scene.sun[1] / across - cy
-    shaded = math.hypot((c * sx + s * sy) / (radius * long), (-s * sx + c * sy) / radius)
-    shadow = fade * min(1.0, max(0.0, (1 - shaded) / edge + 0.5)) * (1 - here)
-    lean = 1.1 * min(away, 1.0) / max(away, 1e-6)
-    return here, -lean * (c * u - s * v), -lean * (s * u + c * v), shadow
+    shadow = fade * min(1.0, max(0.0, (1 - shaded) / (1.5 * edge) + 0.5)) * (1 - here)
+    lean = 0.25 + 0.65 * min(away, 1.0)
+    lean_u, lean_v = lean * (0.6 * lean_u + 0.4 * u), lean * (0.6 * lean_v + 0.4 * v)
+    return here, -(c * lean_u - s * lean_v), -(s * lean_u + c * lean_v), shadow, (level >> 4 & 15) / 15.0
 
 
 @compiled
@@ -443,7 +497,7 @@ def _soil(scene: Scene, level: int, x: float, y: float, foot: float, sunlit: flo
         hx, hy, a, o = _sample(scene, level, m + 1, x, y)
         gx, gy, albedo, outcrop = gx + part * (hx - gx), gy + part * (hy - gy), albedo + part * (a - albedo), outcrop + part * (o - outcrop)
     if level > 0:
-        return _finish(scene, gx, gy, albedo, sunlit, sky)
+        return _finish(scene.sun, gx, gy, albedo, sunlit, sky)
     rough = 1 - 0.6 * outcrop
     length, px, py, k = 2.4 * step, x, y, scene.key
     c, s = 1.0, 0.0
@@ -457,28 +511,30 @@ def _soil(scene: Scene, level: int, x: float, y: float, foot: float, sunlit: flo
         c, s = 0.8 * c - 0.6 * s, 0.6 * c + 0.8 * s
         length, k = 0.5 * length, k + 1
     if outcrop > 0.02 and foot < 0.08:
-        wx, wy = 0.06 * noise(x * 6, y * 6, scene.key + 40)[0], 0.06 * noise(x * 6, y * 6, scene.key + 41)[0]
-        joint, shade = _crack((x + wx) * 4.5, (y + wy) * 3.2, scene.key + 42)
-        width = max(0.05, foot * 4)
-        depth = (0.05 / width) * max(0.0, 1 - joint / width)
-        albedo *= 1 + outcrop * (0.10 * shade - 0.5 * depth)
+        wx, wy = 0.13 * noise(x * 7, y * 7, scene.key + 40)[0], 0.13 * noise(x * 7, y * 7, scene.key + 41)[0]
+        joint, shade = _crack((x + wx) * 6.5, (y + wy) * 4.5, scene.key + 42)
+        width = 0.03 + 0.06 * max(0.0, noise(2 * x, 2 * y, scene.key + 43)[0]) + 4 * foot
+        depth = (0.03 / width) * max(0.0, 1 - joint / width)
+        broken = max(0.0, min(1.0, 0.5 + 2.2 * noise(1.3 * x, 1.3 * y, scene.key + 44)[0]))
+        albedo *= 1 + outcrop * (0.07 * shade - 0.55 * broken * depth)
+    gravel = (0.35 + 1.6 * max(0.0, 0.35 + noise(0.7 * x, 0.7 * y, scene.key + 50)[0])) * (1 - 0.6 * outcrop)
     shadow = 0.0
-    for n in range(3):
-        cell = 0.14 * 0.4**n
-        if foot > 0.4 * cell:
+    for n in range(5):
+        cell = 0.21 * 0.55**n
+        if foot > 0.35 * cell:
             break
-        share = (0.30 + 0.22 * n) * (1 - 0.75 * outcrop)
-        here, sx, sy, dark = _pebbles(scene, x, y, foot, cell, share, scene.key + 60 + 2 * n)
-        gx, gy = gx * (1 - here) - here * sx, gy * (1 - here) - here * sy
-        albedo *= 1 - 0.12 * here
+        share = min(0.9, (0.35 + 0.14 * n) * gravel)
+        here, sx, sy, dark, shade = _pebbles(scene.sun, x, y, foot, cell, share, scene.key + 60 + 2 * n)
+        gx, gy = gx * (1 - 0.7 * here) + here * sx, gy * (1 - 0.7 * here) + here * sy
+        albedo *= 1 + (0.25 * shade - 0.25) * here
         shadow = max(shadow * (1 - here), dark)
-    return _finish(scene, gx, gy, albedo, sunlit * (1 - 0.85 * shadow), sky * (1 - 0.4 * shadow))
+    return _finish(scene.sun, gx, gy, albedo, sunlit * (1 - 0.85 * shadow), sky * (1 - 0.4 * shadow))
 
 
 @compiled
-def _finish(scene: Scene, gx: float, gy: float, albedo: float, sunlit: float, sky: float) -> float:
+def _finish(sun_at: FloatArray, gx: float, gy: float, albedo: float, sunlit: float, sky: float) -> float:
     norm = 1 / math.sqrt(1 + gx * gx + gy * gy)
-    return _reflected(scene, -gx * norm, -gy * norm, norm, albedo, sunlit, sky)
+    return _reflected(sun_at, -gx * norm, -gy * norm, norm, albedo, sunlit, sky)
 
 
 @compiled
@@ -486,26 +542,26 @@ def _stone(
     scene: Scene, rock: int, face: int, x: float, y: float, z: float, foot: float, sunlit: float
 ) -> float:
     """Radiance of a rock's surface."""
-    m = scene.rocks[rock]
-    px, py, pz = x - m[0], y - m[1], z - m[2]
+    m = scene.rocks
+    px, py, pz = x - m[rock, 0], y - m[rock, 1], z - m[rock, 2]
     if face < 0:
         ux, uy, uz = (
-            m[3] * px + m[4] * py + m[5] * pz,
-            m[6] * px + m[7] * py + m[8] * pz,
-            m[9] * px + m[10] * py + m[11] * pz,
+            m[rock, 3] * px + m[rock, 4] * py + m[rock, 5] * pz,
+            m[rock, 6] * px + m[rock, 7] * py + m[rock, 8] * pz,
+            m[rock, 9] * px + m[rock, 10] * py + m[rock, 11] * pz,
         )
     else:
-        form = int(m[13])
+        form = int(m[rock, 13])
         ux, uy, uz = scene.forms[form, face, 0], scene.forms[form, face, 1], scene.forms[form, face, 2]
     nx, ny, nz = (
-        m[3] * ux + m[6] * uy + m[9] * uz,
-        m[4] * ux + m[7] * uy + m[10] * uz,
-        m[5] * ux + m[8] * uy + m[11] * uz,
+        m[rock, 3] * ux + m[rock, 6] * uy + m[rock, 9] * uz,
+        m[rock, 4] * ux + m[rock, 7] * uy + m[rock, 10] * uz,
+        m[rock, 5] * ux + m[rock, 8] * uy + m[rock, 11] * uz,
     )
     norm = 1 / math.sqrt(nx * nx + ny * ny + nz * nz)
     nx, ny, nz = nx * norm, ny * norm, nz * norm
-    albedo = m[14]
-    length, key = 0.7 * m[15], int(m[16])
+    albedo = m[rock, 14]
+    length, key = 0.7 * m[rock, 15], int(m[rock, 16])
     while length > 2 * foot and length > 0.001:
         weight = min(1.0, length / foot - 2)
         value, gx, gy, gz = _noise_in_space(px / length, py / length, pz / length, key)
@@ -515,8 +571,8 @@ def _stone(
     norm = 1 / math.sqrt(nx * nx + ny * ny + nz * nz)
     nz *= norm
     albedo *= 1 + 0.25 * max(0.0, nz)  # dust settles on top
-    low = min(1.0, max(0.0, (pz + 0.2 * (m[12] - m[2])) / (m[12] - m[2]) + 0.35))  # little sky near the ground
-    return _reflected(scene, nx * norm, ny * norm, nz, albedo, sunlit, low)
+    low = min(1.0, max(0.0, (pz + 0.2 * (m[rock, 12] - m[rock, 2])) / (m[rock, 12] - m[rock, 2]) + 0.35))  # little sky near the ground
+    return _reflected(scene.sun, nx * norm, ny * norm, nz, albedo, sunlit, low)
 
 
 @compiled
@@ -583,8 +639,8 @@ def _trace(
     scene: Scene, deck: Deck, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, pixel: float
 ) -> tuple[float, float, int]:
     """Radiance and distance of a ray, and a number that changes where the picture has an edge."""
-    t = _march(scene, ox, oy, oz, dx, dy, dz)
-    t, rock, face = _hit_rocks(scene, ox, oy, oz, dx, dy, dz, t, False)
+    t, begin = _march(scene, ox, oy, oz, dx, dy, dz)
+    t, rock, face = _hit_rocks(scene, ox, oy, oz, dx, dy, dz, begin, t, False)
     t, plate, plate_x, plate_y, rim = _hit_deck(deck, ox, oy, oz, dx, dy, dz, t)
     if t == math.inf:
         return _sky(scene, dx, dy, dz), t, -1
@@ -592,21 +648,21 @@ def _trace(
     sx, sy, sz = scene.sun
     # From a little above the surface, or it would shade itself.
     lift = 1e-4 + 1e-5 * t
-    shaded = _hit_rocks(scene, x, y, z + lift, sx, sy, sz, 60.0, True)[1] >= 0
+    shaded = _hit_rocks(scene, x, y, z + lift, sx, sy, sz, 0.0, 60.0, True)[1] >= 0
     if not shaded and t < 8:
         shaded = _hit_deck(deck, x, y, z + lift, sx, sy, sz, 8.0)[1] >= 0
     sunlit = 0.0 if shaded else 1.0
     across = pixel * t
     if plate >= 0:
-        up = deck.rotation[:, 2]
         albedo = _panel(plate, plate_x, plate_y, rim, across / max(0.15, abs(dz)))
-        light = _reflected(scene, up[0], up[1], up[2], albedo, sunlit, 1.0)
+        light = _reflected(
+            scene.sun, deck.rotation[0, 2], deck.rotation[1, 2], deck.rotation[2, 2], albedo, sunlit, 1.0)
         key = 2 + plate + 16 * (rim < 0.03)
     elif rock >= 0:
         light = _stone(scene, rock, face, x, y, z, 1.3 * across, sunlit)
         key = (rock + 1) * _FACES * 2 + (face + 1) * 2
     else:
-        level = _level(scene, x, y)
+        level = _level(scene.shape, scene.frame_m, x, y)
         gx, gy, _, _ = _sample(scene, level, 0, x, y)
         facing = (gx * dx + gy * dy - dz) / math.sqrt(1 + gx * gx + gy * gy)
         along = across / max(facing, 0.02)
@@ -724,6 +780,6 @@ def hits(scene: Scene, deck: Deck, origin_m: FloatArray, direction: FloatArray, 
     for i in range(len(direction)):
         ox, oy, oz = origin_m[i]
         dx, dy, dz = direction[i]
-        t = _march(scene, ox, oy, oz, dx, dy, dz)
-        t = _hit_rocks(scene, ox, oy, oz, dx, dy, dz, t, False)[0]
+        t, begin = _march(scene, ox, oy, oz, dx, dy, dz)
+        t = _hit_rocks(scene, ox, oy, oz, dx, dy, dz, begin, t, False)[0]
         distance_m[i] = _hit_deck(deck, ox, oy, oz, dx, dy, dz, t)[0]

@@ -31,7 +31,7 @@ _OVERLAP = 0.2  # of neighbouring frames, as a share of the widest eye's field
 _BELOW_HORIZON = 0.4  # where the row looks, as a share of the field down
 _BAND_PX = 128  # rows that one thread renders at a time
 _KEPT_PX = 8_000_000  # lines of sight that are kept from image to image
-_EDGE_RAYS = 3  # along each side of a pixel that lies on an edge
+_EDGE_RAYS = 2  # along each side of a pixel that lies on an edge
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -3,8 +3,9 @@
 import gtsam
 import numpy as np
 from scipy.ndimage import map_coordinates
+from scipy.spatial.transform import Rotation
 
-from pancam_graph.geometry import FloatArray, IntArray, rz
+from pancam_graph.geometry import FloatArray, IntArray
 from pancam_graph.simulate._options import RenderOptions
 from pancam_graph.simulate._raycast import Deck, Grids, Scene, heights, noises
 
@@ -51,8 +52,10 @@ def make_scene(options: RenderOptions, xy_m: FloatArray, rng: np.random.Generato
         outcrop=arrays[2],
         shape=shape,
         frame_m=frame_m,
-        slope=np.maximum.accumulate(slope[::-1])[::-1].copy(),
+        slope=slope,
         top_m=float(max(level[0].max() for level in levels)),
+        rough_m=2 * float(np.abs(fine[0] - _finer(mid, mid_frame, fine_frame)[0]).max()),
+        tall_m=0.0,
         rocks=empty,
         forms=_forms(rng),
         cells=np.zeros(2, dtype=np.int64),
@@ -129,7 +132,7 @@ def _far(nodes: Nodes, middle: FloatArray, ridge_m: float, key: int) -> Level:
     away = np.hypot(dx, dy)
     bend = noises(dx, dy, 1.2 * ridge_m, 0.1 * ridge_m, 0.5, key)
     crest = ridge_m * (1 + 0.35 * bend)
-    gullies = noises(x, y, 0.25 * ridge_m, 0.01 * ridge_m, 0.6, key + 20)
+    gullies = noises(x, y, 0.25 * ridge_m, 0.02 * ridge_m, 0.5, key + 20)
     size = _RIDGE_SIZE * ridge_m * np.clip(0.75 + 1.5 * noises(dx, dy, 0.8 * ridge_m, 0.2 * ridge_m, 0.5, key + 10), 0.15, 2)
     ridge = size * np.exp(-(((away - crest) / (0.22 * ridge_m)) ** 2)) * (1 + 0.55 * gullies)
     # Ground drops a little away from the drive, so that the plains are seen and not only their edge.
@@ -237,7 +240,7 @@ def _with_rocks(
     n = len(size)
     axes = 0.5 * size[:, None] * rng.uniform([0.9, 0.65, 0.45], [1.25, 1.0, 0.85], (n, 3))
     yaw, lean, towards = rng.uniform(0, 2 * np.pi, n), 0.3 * rng.standard_normal(n), rng.uniform(0, np.pi, n)
-    turn = np.array([rz(a) @ rz(c) @ gtsam.Rot3.Ry(b).matrix() @ rz(-c) for a, b, c in zip(yaw, lean, towards, strict=True)])
+    turn = Rotation.from_euler("ZYZ", np.column_stack([yaw + towards, lean, -towards])).as_matrix()
     tall = np.sqrt(np.sum((turn[:, 2] * axes) ** 2, axis=1))
     z = heights(scene, xy) + tall * rng.uniform(-0.25, 0.45, n)
     rocks = np.zeros((n, 17))
@@ -246,10 +249,12 @@ def _with_rocks(
     rocks[:, 12] = z + tall
     rocks[:, 13] = rng.integers(len(scene.forms), size=n)
     bright = rng.random(n) < 0.2
-    rocks[:, 14] = np.where(bright, rng.uniform(0.22, 0.32, n), rng.uniform(0.10, 0.19, n))
+    rocks[:, 14] = np.where(bright, rng.uniform(0.19, 0.24, n), rng.uniform(0.12, 0.19, n))
     rocks[:, 15] = axes[:, :2].max(axis=1)
     rocks[:, 16] = rng.integers(2**20, size=n)
-    return _sorted_into_cells(scene._replace(rocks=rocks), low, high)
+    # A rock's top may be over lower ground than its middle.
+    tall_m = float((rocks[:, 12] - heights(scene, xy) + scene.slope[0] * rocks[:, 15]).max())
+    return _sorted_into_cells(scene._replace(rocks=rocks, tall_m=tall_m), low, high)
 
 
 def _sorted_into_cells(scene: Scene, low: FloatArray, high: FloatArray) -> Scene:
