@@ -6,8 +6,10 @@ everywhere. Detail finer than a pixel's footprint is left out, octave by octave.
 """
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar, cast
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,11 +18,13 @@ from pancam_graph.kernel import compiled
 
 __all__ = ["Deck", "Scene", "heights", "hits", "noise", "noises", "render", "smooth"]
 
+_F = TypeVar("_F", bound=Callable[..., Any])
+
 Grids = NDArray[np.float32]
 
 _NEAREST_M = 0.05
 _MAX_STEPS = 800
-_MAX_TAPS = 6
+_MAX_TAPS = 4
 _FACES = 64
 _PI = math.pi
 
@@ -79,6 +83,12 @@ class Deck(NamedTuple):
     """(3,) of the mast in the world."""
     plates_m: FloatArray
     """(plates, corners, 3): convex, anticlockwise, in the mast frame; none where there is no deck."""
+
+
+def _inlined(function: _F) -> _F:
+    """Compile into its callers: to hand the many arrays of a scene to a call costs as much as its work."""
+    dispatcher: Any = numba.njit(inline="always", nogil=True, error_model="numpy", fastmath={"contract"})(function)
+    return cast(_F, dispatcher)
 
 
 # --- noise ---
@@ -195,7 +205,7 @@ def heights(scene: Scene, xy_m: FloatArray) -> FloatArray:
     return out
 
 
-@compiled
+@_inlined
 def _sample(scene: Scene, level: int, mip: int, x: float, y: float) -> tuple[float, float, float, float]:
     """Slopes along x and y, albedo and outcrop of a mip: quadratic B-splines over its nodes."""
     step = scene.frame_m[level, mip, 2]
@@ -221,7 +231,7 @@ def _sample(scene: Scene, level: int, mip: int, x: float, y: float) -> tuple[flo
     return slope_x / step, slope_y / step, albedo, outcrop
 
 
-@compiled
+@_inlined
 def _march(
     scene: Scene, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float
 ) -> tuple[float, float]:
@@ -273,17 +283,21 @@ def _march(
     if not found:
         return math.inf, free_of_rocks
     # Regula falsi (Illinois) between above and below.
-    low, high, above, below = before, t, was, over
+    low, high, above, below, side = before, t, was, over, 0
     for _ in range(40):
         t = low + (high - low) * above / (above - below)
         x, y = ox + t * dx, oy + t * dy
         over = oz + t * dz - _height(height, shape, frame, _level(shape, frame, x, y), x, y)
-        if abs(over) < 1e-8 * (1 + t) or high - low < 1e-9 * (1 + t):
+        if abs(over) < 1e-7 * (1 + t) or high - low < 1e-9 * (1 + t):
             break
         if over > 0:
-            low, above, below = t, over, 0.5 * below
+            low, above = t, over
+            below *= 0.5 if side > 0 else 1.0
+            side = 1
         else:
-            high, below, above = t, over, 0.5 * above
+            high, below = t, over
+            above *= 0.5 if side < 0 else 1.0
+            side = -1
     return t, free_of_rocks
 
 
@@ -391,7 +405,7 @@ def _hit_rocks(
     return best, rock, face
 
 
-@compiled
+@_inlined
 def _openness(scene: Scene, x: float, y: float) -> float:
     """Share of the sky's light that rocks nearby leave to the ground."""
     wide, deep = scene.cell_shape
@@ -411,7 +425,7 @@ def _openness(scene: Scene, x: float, y: float) -> float:
 # --- light ---
 
 
-@compiled
+@_inlined
 def _reflected(sun_at: FloatArray, nx: float, ny: float, nz: float, albedo: float, sunlit: float, sky: float) -> float:
     """Radiance of a rough surface of unit normal under sun and sky."""
     sun = max(0.0, nx * sun_at[0] + ny * sun_at[1] + nz * sun_at[2])
@@ -485,7 +499,7 @@ def _crack(x: float, y: float, key: int) -> tuple[float, float]:
     return 0.5 * (math.sqrt(second) - math.sqrt(first)), shade
 
 
-@compiled
+@_inlined
 def _soil(scene: Scene, level: int, x: float, y: float, foot: float, sunlit: float, sky: float) -> float:
     """Radiance of the ground around a place, over a round footprint of that width."""
     step = scene.frame_m[level, 0, 2]
@@ -496,9 +510,7 @@ def _soil(scene: Scene, level: int, x: float, y: float, foot: float, sunlit: flo
     if part > 0:
         hx, hy, a, o = _sample(scene, level, m + 1, x, y)
         gx, gy, albedo, outcrop = gx + part * (hx - gx), gy + part * (hy - gy), albedo + part * (a - albedo), outcrop + part * (o - outcrop)
-    if level > 0:
-        return _finish(scene.sun, gx, gy, albedo, sunlit, sky)
-    rough = 1 - 0.6 * outcrop
+    rough = 1 - 0.6 * outcrop if level == 0 else 1.6
     length, px, py, k = 2.4 * step, x, y, scene.key
     c, s = 1.0, 0.0
     while length > 2 * foot and length > 0.0008:
@@ -510,13 +522,17 @@ def _soil(scene: Scene, level: int, x: float, y: float, foot: float, sunlit: flo
         px, py = 0.8 * px - 0.6 * py, 0.6 * px + 0.8 * py
         c, s = 0.8 * c - 0.6 * s, 0.6 * c + 0.8 * s
         length, k = 0.5 * length, k + 1
-    if outcrop > 0.02 and foot < 0.08:
+    if level > 0:
+        return _finish(scene.sun, gx, gy, albedo, sunlit, sky)
+    if outcrop > 0.05 and foot < 0.04:
         wx, wy = 0.13 * noise(x * 7, y * 7, scene.key + 40)[0], 0.13 * noise(x * 7, y * 7, scene.key + 41)[0]
         joint, shade = _crack((x + wx) * 6.5, (y + wy) * 4.5, scene.key + 42)
         width = 0.03 + 0.06 * max(0.0, noise(2 * x, 2 * y, scene.key + 43)[0]) + 4 * foot
         depth = (0.03 / width) * max(0.0, 1 - joint / width)
         broken = max(0.0, min(1.0, 0.5 + 2.2 * noise(1.3 * x, 1.3 * y, scene.key + 44)[0]))
         albedo *= 1 + outcrop * (0.07 * shade - 0.55 * broken * depth)
+    if foot > 0.35 * 0.21:
+        return _finish(scene.sun, gx, gy, albedo, sunlit, sky)
     gravel = (0.35 + 1.6 * max(0.0, 0.35 + noise(0.7 * x, 0.7 * y, scene.key + 50)[0])) * (1 - 0.6 * outcrop)
     shadow = 0.0
     for n in range(5):
@@ -531,13 +547,13 @@ def _soil(scene: Scene, level: int, x: float, y: float, foot: float, sunlit: flo
     return _finish(scene.sun, gx, gy, albedo, sunlit * (1 - 0.85 * shadow), sky * (1 - 0.4 * shadow))
 
 
-@compiled
+@_inlined
 def _finish(sun_at: FloatArray, gx: float, gy: float, albedo: float, sunlit: float, sky: float) -> float:
     norm = 1 / math.sqrt(1 + gx * gx + gy * gy)
     return _reflected(sun_at, -gx * norm, -gy * norm, norm, albedo, sunlit, sky)
 
 
-@compiled
+@_inlined
 def _stone(
     scene: Scene, rock: int, face: int, x: float, y: float, z: float, foot: float, sunlit: float
 ) -> float:
@@ -575,7 +591,7 @@ def _stone(
     return _reflected(scene.sun, nx * norm, ny * norm, nz, albedo, sunlit, low)
 
 
-@compiled
+@_inlined
 def _sky(scene: Scene, dx: float, dy: float, dz: float) -> float:
     """Radiance of the dusty sky: brighter towards the horizon and around the sun."""
     up = max(0.0, dz)
@@ -586,7 +602,7 @@ def _sky(scene: Scene, dx: float, dy: float, dz: float) -> float:
 # --- the deck ---
 
 
-@compiled
+@_inlined
 def _hit_deck(
     deck: Deck, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, end: float
 ) -> tuple[float, int, float, float, float]:
@@ -666,7 +682,7 @@ def _trace(
         gx, gy, _, _ = _sample(scene, level, 0, x, y)
         facing = (gx * dx + gy * dy - dz) / math.sqrt(1 + gx * gx + gy * gy)
         along = across / max(facing, 0.02)
-        taps = min(max(int(along / (1.5 * across) + 0.5), 1), _MAX_TAPS)
+        taps = min(max(int(along / (2 * across) + 0.5), 1), _MAX_TAPS)
         foot = max(across, along / taps)
         sky = _openness(scene, x, y)
         norm = math.hypot(dx, dy) + 1e-12

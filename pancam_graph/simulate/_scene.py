@@ -132,12 +132,12 @@ def _far(nodes: Nodes, middle: FloatArray, ridge_m: float, key: int) -> Level:
     away = np.hypot(dx, dy)
     bend = noises(dx, dy, 1.2 * ridge_m, 0.1 * ridge_m, 0.5, key)
     crest = ridge_m * (1 + 0.35 * bend)
-    gullies = noises(x, y, 0.25 * ridge_m, 0.02 * ridge_m, 0.5, key + 20)
+    gullies = noises(x, y, 0.25 * ridge_m, 0.012 * ridge_m, 0.52, key + 20)
     size = _RIDGE_SIZE * ridge_m * np.clip(0.75 + 1.5 * noises(dx, dy, 0.8 * ridge_m, 0.2 * ridge_m, 0.5, key + 10), 0.15, 2)
     ridge = size * np.exp(-(((away - crest) / (0.22 * ridge_m)) ** 2)) * (1 + 0.55 * gullies)
     # Ground drops a little away from the drive, so that the plains are seen and not only their edge.
     plains = 0.02 * ridge_m * 0.25 * noises(x, y, 300.0, 25.0, 0.5, key + 30) * _rise(away, 20, 300)
-    albedo = 0.22 * (1 + 0.7 * noises(x, 1.7 * y, 260.0, 12.0, 0.65, key + 40))
+    albedo = 0.21 * (1 + 0.5 * noises(x, 1.7 * y, 260.0, 12.0, 0.65, key + 40))
     albedo *= 1 - 0.25 * _rise(away, 150, 500) * (away < crest) + 0.15 * _rise(away, 0.8 * ridge_m, ridge_m)
     outcrop = _rise(noises(x, y, 60.0, 8.0, 0.5, key + 60), 0.05, 0.35)
     return ridge + plains, np.clip(albedo, 0.08, 0.45), outcrop
@@ -149,7 +149,7 @@ def _mid(nodes: Nodes, far: Level, key: int) -> Level:
     height = far[0] + 1.1 * noises(x, y, 26.0, 1.0, 0.52, key)
     outcrop = _rise(0.6 * (far[2] - 0.3) + noises(x, y, 11.0, 0.5, 0.62, key + 20), 0.02, 0.30)
     dust = noises(x, y, 14.0, 0.7, 0.62, key + 40)
-    return height, far[1] * (1 + 0.28 * dust + 0.38 * outcrop), outcrop
+    return height, np.clip(far[1] * (1 + 0.28 * dust + 0.22 * outcrop), 0.10, 0.33), outcrop
 
 
 def _fine(nodes: Nodes, mid: Level, step: float, key: int) -> Level:
