@@ -31,10 +31,21 @@ def main() -> int:
     add("--stops", type=int, default=d.stops, help="places of the mast (%(default)s)")
     add("--spacing-m", "--step-m", type=float, default=d.spacing_m, help="from stop to stop (%(default)s)")
     add("--pans", "--azimuths", type=int, default=d.pans, help="frames per row (%(default)s)")
-    add("--sweep-deg", dest="sweep_rad", type=_degrees, help="range of pan (as far as frames overlap by 20 %%)")
+    add(
+        "--sweep-deg",
+        dest="sweep_rad",
+        type=_degrees,
+        help="range of pan (as far as frames overlap by 20 %%)",
+    )
     add("--tilts-deg", dest="tilts_rad", type=_degrees, nargs="+", help="of each row, up positive (one row)")
     add("--rocks", dest="rock_abundance", type=float, default=d.rock_abundance, help="share of ground (0.05)")
-    add("--sun-elevation-deg", dest="sun_elevation_rad", type=_degrees, default=d.sun_elevation_rad, help="(38)")
+    add(
+        "--sun-elevation-deg",
+        dest="sun_elevation_rad",
+        type=_degrees,
+        default=d.sun_elevation_rad,
+        help="(38)",
+    )
     add("--bits", type=int, choices=(8, 12), default=d.bits, help="of samples; 12 in 16-bit files (8)")
     add("--deck", action="store_true", help="show the rover's own deck, which moves along with it")
     add("--pointing-scale", type=float, default=1.0, help="errors of pan and tilt, times the rig's (1)")

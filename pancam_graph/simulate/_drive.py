@@ -25,6 +25,7 @@ __all__ = [
     "telemetry",
 ]
 
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Truth:
     """What really was, in the order of the traverse's entries. No solver may see it."""

@@ -73,7 +73,7 @@ class DriveOptions:
 
     def _require_whole(self, name: str, low: int, *, or_none: bool = False) -> None:
         value = getattr(self, name)
-        fits = (isinstance(value, int | np.integer) and value >= low) or (or_none and value is None)
+        fits = or_none if value is None else isinstance(value, int | np.integer) and bool(value >= low)
         self._require(name, fits, f"a whole number of {low} or more")
 
     def _require(self, name: str, fits: bool, expected: str) -> None:
@@ -114,7 +114,9 @@ class RenderOptions(DriveOptions):
         self._require("rock_abundance", 0 <= self.rock_abundance <= 0.3, "a share from 0 to 0.3")
         self._require("ridge_m", 100 <= self.ridge_m <= 5000, "a distance from 100 m to 5 km")
         low, high = np.deg2rad([15, 90])
-        self._require("sun_elevation_rad", low <= self.sun_elevation_rad <= high, "an angle from 0.262 to pi/2")
+        self._require(
+            "sun_elevation_rad", low <= self.sun_elevation_rad <= high, "an angle from 0.262 to pi/2"
+        )
         self._require("sun_azimuth_rad", bool(np.isfinite(self.sun_azimuth_rad)), "an angle")
         self._require("bits", self.bits in {8, 12}, "8 or 12")
         self._require("sensor_noise", 0 <= self.sensor_noise < np.inf, "a number of 0 or above")

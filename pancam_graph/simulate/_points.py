@@ -264,5 +264,3 @@ def _cone(camera: Camera) -> tuple[FloatArray, float]:
         return axis, -1.0
     widest = float(np.arccos(np.clip(rays.direction @ axis, -1, 1)).max())
     return axis, float(np.cos(min(np.pi, widest + 0.1)))
-
-

@@ -1,4 +1,4 @@
-"""Rays against the ground, its rocks and the rover's deck, and the light that comes back: what runs per pixel.
+"""Rays against ground, rocks and the rover's deck, and the light that comes back: what runs per pixel.
 
 One module, since Numba's cache on disk watches only the file of a function, not those that it calls. All
 detail is a function of the place on the surface, never of the image: the same point looks the same from
@@ -51,7 +51,7 @@ class Scene(NamedTuple):
     tall_m: float
     """By how much rocks rise over the ground."""
     rocks: FloatArray
-    """(rocks, 17): centre, world to unit ball (9, by rows), top, form, albedo, radius seen from above, key."""
+    """(rocks, 17): centre, world to unit ball (9, by rows), top, form, albedo, radius from above, key."""
     forms: FloatArray
     """(forms, planes, 4): unit normal and distance of the planes that cut a ball into a rock's form."""
     cells: IntArray
@@ -87,7 +87,9 @@ class Deck(NamedTuple):
 
 def _inlined(function: _F) -> _F:
     """Compile into its callers: to hand the many arrays of a scene to a call costs as much as its work."""
-    dispatcher: Any = numba.njit(inline="always", nogil=True, error_model="numpy", fastmath={"contract"})(function)
+    dispatcher: Any = numba.njit(inline="always", nogil=True, error_model="numpy", fastmath={"contract"})(
+        function
+    )
     return cast(_F, dispatcher)
 
 
@@ -123,7 +125,11 @@ def noise(x: float, y: float, key: int) -> tuple[float, float, float]:
     low_x = ax + s * (bx - ax) + ds * (at_b - at_a)
     high_x = cx + s * (dx - cx) + ds * (at_d - at_c)
     low_y, high_y = ay + s * (by - ay), cy + s * (dy - cy)
-    return low + r * (high - low), low_x + r * (high_x - low_x), low_y + r * (high_y - low_y) + dr * (high - low)
+    return (
+        low + r * (high - low),
+        low_x + r * (high_x - low_x),
+        low_y + r * (high_y - low_y) + dr * (high - low),
+    )
 
 
 @compiled
@@ -189,8 +195,8 @@ def _height(height_m: Grids, shape: IntArray, frame_m: FloatArray, level: int, x
     u, v = a - i, b - j
     wide = shape[level, 0, 1]
     at = shape[level, 0, 0] + j * wide + i
-    low = height_m[at] + u * (height_m[at + 1] - height_m[at])
-    high = height_m[at + wide] + u * (height_m[at + wide + 1] - height_m[at + wide])
+    low: float = height_m[at] + u * (height_m[at + 1] - height_m[at])
+    high: float = height_m[at + wide] + u * (height_m[at + wide + 1] - height_m[at + wide])
     return low + v * (high - low)
 
 
@@ -212,8 +218,8 @@ def _sample(scene: Scene, level: int, mip: int, x: float, y: float) -> tuple[flo
     a = (x - scene.frame_m[level, mip, 0]) / step
     b = (y - scene.frame_m[level, mip, 1]) / step
     wide, deep = scene.shape[level, mip, 1], scene.shape[level, mip, 2]
-    i = min(max(int(math.floor(a + 0.5)), 1), wide - 2)
-    j = min(max(int(math.floor(b + 0.5)), 1), deep - 2)
+    i = min(max(math.floor(a + 0.5), 1), wide - 2)
+    j = min(max(math.floor(b + 0.5), 1), deep - 2)
     u, v = min(max(a - i, -0.5), 0.5), min(max(b - j, -0.5), 0.5)
     u0, u1, u2 = 0.5 * (0.5 - u) ** 2, 0.75 - u * u, 0.5 * (0.5 + u) ** 2
     v0, v1, v2 = 0.5 * (0.5 - v) ** 2, 0.75 - v * v, 0.5 * (0.5 + v) ** 2
@@ -306,7 +312,15 @@ def _march(
 
 @compiled
 def _cut(
-    rocks: FloatArray, forms: FloatArray, n: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float
+    rocks: FloatArray,
+    forms: FloatArray,
+    n: int,
+    ox: float,
+    oy: float,
+    oz: float,
+    dx: float,
+    dy: float,
+    dz: float,
 ) -> tuple[float, int]:
     """Where a ray enters rock n (infinite: nowhere), and through which plane (-1: through the ball)."""
     px, py, pz = ox - rocks[n, 0], oy - rocks[n, 1], oz - rocks[n, 2]
@@ -409,8 +423,8 @@ def _hit_rocks(
 def _openness(scene: Scene, x: float, y: float) -> float:
     """Share of the sky's light that rocks nearby leave to the ground."""
     wide, deep = scene.cell_shape
-    i = int(math.floor((x - scene.cell_frame_m[0]) / scene.cell_frame_m[2]))
-    j = int(math.floor((y - scene.cell_frame_m[1]) / scene.cell_frame_m[2]))
+    i = math.floor((x - scene.cell_frame_m[0]) / scene.cell_frame_m[2])
+    j = math.floor((y - scene.cell_frame_m[1]) / scene.cell_frame_m[2])
     out = 1.0
     if i < 0 or j < 0 or i >= wide or j >= deep:
         return out
@@ -426,9 +440,11 @@ def _openness(scene: Scene, x: float, y: float) -> float:
 
 
 @_inlined
-def _reflected(sun_at: FloatArray, nx: float, ny: float, nz: float, albedo: float, sunlit: float, sky: float) -> float:
+def _reflected(
+    sun_at: FloatArray, nx: float, ny: float, nz: float, albedo: float, sunlit: float, sky: float
+) -> float:
     """Radiance of a rough surface of unit normal under sun and sky."""
-    sun = max(0.0, nx * sun_at[0] + ny * sun_at[1] + nz * sun_at[2])
+    sun: float = max(0.0, nx * sun_at[0] + ny * sun_at[1] + nz * sun_at[2])
     return albedo * (sunlit * sun + sky * 0.22 * (0.6 + 0.4 * nz))
 
 
@@ -460,7 +476,7 @@ def _pebbles(
     u, v = (c * (x - cx) + s * (y - cy)) / (radius * long), (-s * (x - cx) + c * (y - cy)) / radius
     px, py = x + length * sun_at[0] / across - cx, y + length * sun_at[1] / across - cy
     p, q = (c * px + s * py) / (radius * long), (-s * px + c * py) / radius
-    # Between the stone and the tip of its shadow: the tip's own distance, or that of the nearest place before.
+    # The nearest place to here on the line from the stone to the tip of its shadow.
     tu, tv = u - p, v - q
     part = min(1.0, max(0.0, (u * tu + v * tv) / (tu * tu + tv * tv + 1e-12)))
     wu, wv = u - part * tu, v - part * tv
@@ -509,7 +525,12 @@ def _soil(scene: Scene, level: int, x: float, y: float, foot: float, sunlit: flo
     gx, gy, albedo, outcrop = _sample(scene, level, m, x, y)
     if part > 0:
         hx, hy, a, o = _sample(scene, level, m + 1, x, y)
-        gx, gy, albedo, outcrop = gx + part * (hx - gx), gy + part * (hy - gy), albedo + part * (a - albedo), outcrop + part * (o - outcrop)
+        gx, gy, albedo, outcrop = (
+            gx + part * (hx - gx),
+            gy + part * (hy - gy),
+            albedo + part * (a - albedo),
+            outcrop + part * (o - outcrop),
+        )
     rough = 1 - 0.6 * outcrop if level == 0 else 1.6
     length, px, py, k = 2.4 * step, x, y, scene.key
     c, s = 1.0, 0.0
@@ -527,13 +548,14 @@ def _soil(scene: Scene, level: int, x: float, y: float, foot: float, sunlit: flo
     if outcrop > 0.05 and foot < 0.04:
         wx, wy = 0.13 * noise(x * 7, y * 7, scene.key + 40)[0], 0.13 * noise(x * 7, y * 7, scene.key + 41)[0]
         joint, shade = _crack((x + wx) * 6.5, (y + wy) * 4.5, scene.key + 42)
-        width = 0.03 + 0.06 * max(0.0, noise(2 * x, 2 * y, scene.key + 43)[0]) + 4 * foot
+        width = 0.04 + 4 * foot
         depth = (0.03 / width) * max(0.0, 1 - joint / width)
-        broken = max(0.0, min(1.0, 0.5 + 2.2 * noise(1.3 * x, 1.3 * y, scene.key + 44)[0]))
-        albedo *= 1 + outcrop * (0.07 * shade - 0.55 * broken * depth)
+        albedo *= 1 + outcrop * (
+            0.07 * shade - 0.5 * min(1.0, 1.6 * (1 - outcrop) + 0.25 * (shade + 1)) * depth
+        )
     if foot > 0.35 * 0.21:
         return _finish(scene.sun, gx, gy, albedo, sunlit, sky)
-    gravel = (0.35 + 1.6 * max(0.0, 0.35 + noise(0.7 * x, 0.7 * y, scene.key + 50)[0])) * (1 - 0.6 * outcrop)
+    gravel = (0.35 + 4 * max(0.0, 0.30 - albedo)) * (1 - 0.6 * outcrop)  # where it lies, the ground is darker
     shadow = 0.0
     for n in range(5):
         cell = 0.21 * 0.55**n
@@ -587,7 +609,9 @@ def _stone(
     norm = 1 / math.sqrt(nx * nx + ny * ny + nz * nz)
     nz *= norm
     albedo *= 1 + 0.25 * max(0.0, nz)  # dust settles on top
-    low = min(1.0, max(0.0, (pz + 0.2 * (m[rock, 12] - m[rock, 2])) / (m[rock, 12] - m[rock, 2]) + 0.35))  # little sky near the ground
+    low = min(
+        1.0, max(0.0, (pz + 0.2 * (m[rock, 12] - m[rock, 2])) / (m[rock, 12] - m[rock, 2]) + 0.35)
+    )  # little sky near the ground
     return _reflected(scene.sun, nx * norm, ny * norm, nz, albedo, sunlit, low)
 
 
@@ -595,7 +619,7 @@ def _stone(
 def _sky(scene: Scene, dx: float, dy: float, dz: float) -> float:
     """Radiance of the dusty sky: brighter towards the horizon and around the sun."""
     up = max(0.0, dz)
-    near = max(0.0, dx * scene.sun[0] + dy * scene.sun[1] + dz * scene.sun[2])
+    near: float = max(0.0, dx * scene.sun[0] + dy * scene.sun[1] + dz * scene.sun[2])
     return 0.150 + 0.035 * math.exp(-5 * up) + 0.05 * near**6
 
 
@@ -672,7 +696,8 @@ def _trace(
     if plate >= 0:
         albedo = _panel(plate, plate_x, plate_y, rim, across / max(0.15, abs(dz)))
         light = _reflected(
-            scene.sun, deck.rotation[0, 2], deck.rotation[1, 2], deck.rotation[2, 2], albedo, sunlit, 1.0)
+            scene.sun, deck.rotation[0, 2], deck.rotation[1, 2], deck.rotation[2, 2], albedo, sunlit, 1.0
+        )
         key = 2 + plate + 16 * (rim < 0.03)
     elif rock >= 0:
         light = _stone(scene, rock, face, x, y, z, 1.3 * across, sunlit)
@@ -783,15 +808,19 @@ def smooth(
                         norm += d[k] * d[k]
                     norm = 1 / math.sqrt(norm)
                     for k in range(3):
-                        ray[k] = norm * (rotation[k, 0] * d[0] + rotation[k, 1] * d[1] + rotation[k, 2] * d[2])
-                    total += _trace(
-                        scene, deck, start[0], start[1], start[2], ray[0], ray[1], ray[2], pixel
-                    )[0]
+                        ray[k] = norm * (
+                            rotation[k, 0] * d[0] + rotation[k, 1] * d[1] + rotation[k, 2] * d[2]
+                        )
+                    total += _trace(scene, deck, start[0], start[1], start[2], ray[0], ray[1], ray[2], pixel)[
+                        0
+                    ]
             light[v, u] = total / (side * side)
 
 
 @compiled
-def hits(scene: Scene, deck: Deck, origin_m: FloatArray, direction: FloatArray, distance_m: FloatArray) -> None:
+def hits(
+    scene: Scene, deck: Deck, origin_m: FloatArray, direction: FloatArray, distance_m: FloatArray
+) -> None:
     """Distance along rays (n, 3) in the world to what they meet first; infinite in the sky."""
     for i in range(len(direction)):
         ox, oy, oz = origin_m[i]

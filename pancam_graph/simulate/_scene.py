@@ -43,7 +43,9 @@ def make_scene(options: RenderOptions, xy_m: FloatArray, rng: np.random.Generato
     fine = _fine(_nodes(fine_frame), _finer(mid, mid_frame, fine_frame), fine_frame[1], key + 200)
     frames, levels = (fine_frame, mid_frame, far_frame), (fine, mid, far)
     arrays, shape, frame_m = _pyramids(levels, frames)
-    slope = np.array([_steepest(level[0].reshape(f[2]), f[1]) for level, f in zip(levels, frames, strict=True)])
+    slope = np.array(
+        [_steepest(level[0].reshape(f[2]), f[1]) for level, f in zip(levels, frames, strict=True)]
+    )
     az, el = options.sun_azimuth_rad, options.sun_elevation_rad
     empty = np.zeros((0, 17))
     scene = Scene(
@@ -133,7 +135,11 @@ def _far(nodes: Nodes, middle: FloatArray, ridge_m: float, key: int) -> Level:
     bend = noises(dx, dy, 1.2 * ridge_m, 0.1 * ridge_m, 0.5, key)
     crest = ridge_m * (1 + 0.35 * bend)
     gullies = noises(x, y, 0.25 * ridge_m, 0.012 * ridge_m, 0.52, key + 20)
-    size = _RIDGE_SIZE * ridge_m * np.clip(0.75 + 1.5 * noises(dx, dy, 0.8 * ridge_m, 0.2 * ridge_m, 0.5, key + 10), 0.15, 2)
+    size = (
+        _RIDGE_SIZE
+        * ridge_m
+        * np.clip(0.75 + 1.5 * noises(dx, dy, 0.8 * ridge_m, 0.2 * ridge_m, 0.5, key + 10), 0.15, 2)
+    )
     ridge = size * np.exp(-(((away - crest) / (0.22 * ridge_m)) ** 2)) * (1 + 0.55 * gullies)
     # Ground drops a little away from the drive, so that the plains are seen and not only their edge.
     plains = 0.02 * ridge_m * 0.25 * noises(x, y, 300.0, 25.0, 0.5, key + 30) * _rise(away, 20, 300)
@@ -166,21 +172,25 @@ def _fine(nodes: Nodes, mid: Level, step: float, key: int) -> Level:
     return height, albedo * (1 + 0.08 * sand * (wave - 0.5)), outcrop
 
 
-def _pyramids(levels: tuple[Level, ...], frames: tuple[Frame, ...]) -> tuple[list[Grids], IntArray, FloatArray]:
+def _pyramids(
+    levels: tuple[Level, ...], frames: tuple[Frame, ...]
+) -> tuple[list[Grids], IntArray, FloatArray]:
     """All grids of all levels, each followed by its halvings, one after the other."""
     shape, frame_m = np.zeros((len(levels), _MIPS, 3), dtype=np.int64), np.zeros((len(levels), _MIPS, 3))
     parts: list[list[FloatArray]] = [[], [], []]
     start = 0
-    for i, (level, (first, step, size)) in enumerate(zip(levels, frames, strict=True)):
-        grids = [a.reshape(size) for a in level]
-        corner = first.astype(float)
+    for i, (level, (first, finest, whole)) in enumerate(zip(levels, frames, strict=True)):
+        grids: list[FloatArray] = [a.reshape(whole) for a in level]
+        size = whole
+        corner, step = first.astype(float), finest
         for mip in range(_MIPS):
-            deep, across = grids[0].shape
+            deep, across = size
             shape[i, mip], frame_m[i, mip] = (start, across, deep), (*corner, step)
             start += deep * across
             for part, grid in zip(parts, grids, strict=True):
                 part.append(grid.ravel())
             corner, step = corner + step / 2, 2 * step
+            size = (deep // 2, across // 2)
             even = [g[: deep // 2 * 2, : across // 2 * 2] for g in grids]
             grids = [0.25 * (g[::2, ::2] + g[1::2, ::2] + g[::2, 1::2] + g[1::2, 1::2]) for g in even]
     return [np.concatenate(part).astype(np.float32) for part in parts], shape, frame_m

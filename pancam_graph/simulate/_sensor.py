@@ -33,5 +33,5 @@ def expose(light: FloatArray, options: RenderOptions, rng: np.random.Generator) 
     sigma = options.sensor_noise * np.sqrt(np.maximum(electrons, 0) + _READ_NOISE**2)
     electrons += sigma * rng.standard_normal(image.shape)
     full = 2**options.bits - 1
-    samples = np.clip(np.rint(electrons / _FULL_WELL * full), 0, full)
+    samples: FloatArray = np.clip(np.rint(electrons / _FULL_WELL * full), 0, full)
     return samples.astype(np.uint8) if options.bits == 8 else samples.astype(np.uint16)
