@@ -29,10 +29,11 @@ def small_world() -> Iterator[None]:
     """The same ground and rocks over less of it."""
     with pytest.MonkeyPatch.context() as patch:
         for name, value in (
-            ("_FINE_REACH_M", 9.0),
-            ("_MID_REACH_M", 40.0),
-            ("_FAR_NODES", 256),
-            ("_ROCK_REACH_M", 30.0),
+            ("_FINE_REACH_M", 6.0),
+            ("_MID_STEP_M", 0.5),
+            ("_MID_REACH_M", 25.0),
+            ("_FAR_NODES", 128),
+            ("_ROCK_REACH_M", 15.0),
         ):
             patch.setattr(scene_module, name, value)
         yield

@@ -197,7 +197,8 @@ def _height(height_m: Grids, shape: IntArray, frame_m: FloatArray, level: int, x
     at = shape[level, 0, 0] + j * wide + i
     low: float = height_m[at] + u * (height_m[at + 1] - height_m[at])
     high: float = height_m[at + wide] + u * (height_m[at + wide + 1] - height_m[at + wide])
-    return low + v * (high - low)
+    over: float = low + v * (high - low)
+    return over
 
 
 @compiled
