@@ -25,6 +25,7 @@ Grids = NDArray[np.float32]
 _NEAREST_M = 0.05
 _MAX_STEPS = 800
 _MAX_TAPS = 4
+_PEBBLE_CELL_M = 0.12  # pebbles up to 2 cm are painted on the ground; what is larger is a rock
 _FACES = 64
 _PI = math.pi
 
@@ -554,12 +555,12 @@ def _soil(scene: Scene, level: int, x: float, y: float, foot: float, sunlit: flo
         albedo *= 1 + outcrop * (
             0.07 * shade - 0.5 * min(1.0, 1.6 * (1 - outcrop) + 0.25 * (shade + 1)) * depth
         )
-    if foot > 0.35 * 0.21:
+    if foot > 0.35 * _PEBBLE_CELL_M:
         return _finish(scene.sun, gx, gy, albedo, sunlit, sky)
     gravel = (0.35 + 4 * max(0.0, 0.30 - albedo)) * (1 - 0.6 * outcrop)  # where it lies, the ground is darker
     shadow = 0.0
     for n in range(5):
-        cell = 0.21 * 0.55**n
+        cell = _PEBBLE_CELL_M * 0.55**n
         if foot > 0.35 * cell:
             break
         share = min(0.9, (0.35 + 0.14 * n) * gravel)
