@@ -1,0 +1,117 @@
+"""The images of one eye at one stop, where telemetry and where the adjustment puts them."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from pancam_graph.cameras import Camera
+from pancam_graph.errors import ImageError
+from pancam_graph.geometry import BoolArray, FloatArray
+from pancam_graph.images._normalise import usable_mask
+from pancam_graph.io.image_files import GreyImage, read_eye_image
+from pancam_graph.solution import Solution
+
+__all__ = ["POINTINGS", "PlacedImage", "Pointing", "Station", "View", "placed_images", "view_from_stop"]
+
+Pointing = Literal["telemetry", "refined"]
+POINTINGS: tuple[Pointing, ...] = ("telemetry", "refined")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Station:
+    """A camera at a pose in the world."""
+
+    camera: Camera
+    world_R_camera: FloatArray
+    """(3, 3)"""
+    centre_m: FloatArray
+    """(3,)"""
+
+    def project(self, points_m: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Pixels (n, 2) of world points (n, 3) and their validity; see `Camera.project`."""
+        return self.camera.project((points_m - self.centre_m) @ self.world_R_camera)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlacedImage:
+    """An image with its two stations."""
+
+    id: str
+    grey: GreyImage
+    usable: BoolArray
+    """Where the image has data, of the image's shape."""
+    at: dict[Pointing, Station]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class View:
+    """All cameras and landmarks as one pointing has them, in the world, seen from one stop's refined mast."""
+
+    world_R_camera: FloatArray
+    """(images, 3, 3)"""
+    world_t_camera: FloatArray
+    """(images, 3)"""
+    landmarks_m: FloatArray
+    """(landmarks, 3); a row of NaN where there is no usable point."""
+
+
+def view_from_stop(solution: Solution, stop: int, pointing: Pointing) -> View:
+    """What a pointing says, with the stop's mast where the adjustment has it.
+
+    Telemetry, and the landmarks that it gives, are carried along with the stop's mast: where a mosaic stands
+    in the world is then the same for both pointings, and only what the stop's images say of each other
+    differs.
+    """
+    final, initial = solution.final, solution.initial
+    if pointing == "refined":
+        return View(
+            world_R_camera=final.world_R_camera,
+            world_t_camera=final.world_t_camera,
+            landmarks_m=final.landmarks_m,
+        )
+    move = final.world_T_mast[stop].compose(initial.world_T_mast[stop].inverse())
+    R, t = move.rotation().matrix(), move.translation()
+    return View(
+        world_R_camera=R @ initial.world_R_camera,
+        world_t_camera=initial.world_t_camera @ R.T + t,
+        landmarks_m=initial.landmarks_m @ R.T + t,
+    )
+
+
+def placed_images(
+    solution: Solution, stop: int, eye: int, views: dict[Pointing, View]
+) -> tuple[list[PlacedImage], list[str]]:
+    """The images that an eye took at a stop, and a warning for each that cannot be had.
+
+    Where the rig was adjusted, its calibration belongs to the refined pointing only.
+    """
+    traverse = solution.traverse
+    folder = traverse.folder or Path()
+    images, warnings = [], []
+    for row in np.flatnonzero((traverse.image_stop == stop) & (traverse.image_eye == eye)).tolist():
+        entry = traverse.images[row]
+        if entry.file is None:
+            warnings.append(f"mosaic: image {entry.id} is left out: it has no file")
+            continue
+        poses = [(v.world_R_camera[row], v.world_t_camera[row]) for v in views.values()]
+        if not all(np.isfinite(a).all() for pose in poses for a in pose):
+            warnings.append(f"mosaic: image {entry.id} is left out: its camera has no pose")
+            continue
+        try:
+            grey = read_eye_image(folder / entry.file, traverse.rig, eye)
+        except ImageError as error:
+            warnings.append(f"mosaic: image {entry.id} is left out: {error}")
+            continue
+        camera = traverse.rig.eyes[eye].camera
+        stations = {}
+        for pointing, view in views.items():
+            own = camera
+            if pointing == "refined" and np.any(solution.calibration[row] != traverse.calibration[row]):
+                own = camera.with_calibration(solution.calibration[row])
+            stations[pointing] = Station(
+                camera=own, world_R_camera=view.world_R_camera[row], centre_m=view.world_t_camera[row]
+            )
+        images.append(PlacedImage(id=entry.id, grey=grey, usable=usable_mask(grey), at=stations))
+    return images, warnings
