@@ -1,10 +1,10 @@
 """What an adjustment returns."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import gtsam
 import numpy as np
@@ -15,6 +15,9 @@ from pancam_graph.geometry import BoolArray, FloatArray, IntArray, corrected_pos
 from pancam_graph.rigs import Rig
 from pancam_graph.sharing import Quantity
 from pancam_graph.traverse import Traverse
+
+if TYPE_CHECKING:
+    from pancam_graph.images.mosaic import MosaicOptions
 
 __all__ = ["Refined", "RigCorrection", "Seconds", "Solution", "State", "rms_px"]
 
@@ -257,20 +260,30 @@ class Solution:
         return replace(self, cross_validation=found)
 
     def save(
-        self, out: Path | str, *, report: bool = True, exports: Sequence[Literal["colmap", "cahvor"]] = ()
+        self,
+        out: Path | str,
+        *,
+        report: bool = True,
+        exports: Sequence[Literal["colmap", "cahvor"]] = (),
+        mosaics: "MosaicOptions | None" = None,
+        progress: Callable[[str, int, int], None] | None = None,
     ) -> "Solution":
         """Write solution.json, points.ply, residuals.csv and report.html into the folder `out`.
 
         `exports` go into folders in it: `colmap` is a COLMAP workspace with undistorted images, `cahvor` the
-        refined cameras as text.
+        refined cameras as text. With options of `mosaics`, a folder of mosaics too; `progress` is told of
+        them.
 
         Everything is written beside and renamed when complete; an older folder of results is replaced
-        only then. Returns this solution with the report's time filled in. Raises InputError where `out` is
+        only then. Returns this solution with the report's time filled in, and with warnings of images that
+        mosaics lack. Raises InputError where `out` is
         something else than a folder of results.
         """
         from pancam_graph.io import save_solution  # noqa: PLC0415  io imports this module
 
-        return save_solution(self, Path(out), report=report, exports=exports)
+        return save_solution(
+            self, Path(out), report=report, exports=exports, mosaics=mosaics, progress=progress
+        )
 
 
 def _common(corrections: FloatArray) -> FloatArray:

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from pancam_graph import SolveOptions, cross_validate, find_observations, read_input, solve
+from pancam_graph.images.mosaic import MosaicOptions
 from pancam_graph.io import EXPORTS, check_exports, check_out
 from pancam_graph.kernel import must_compile
 from pancam_graph.program import SHARING_HELP, Parser, Progress, print_summary, run, show_log
@@ -73,6 +74,11 @@ def main() -> int:
         help="write a folder more into OUT (may be given for each); colmap: undistorted images and a model "
         "with rigs and frames, for dense reconstruction; cahvor: the refined cameras as text files",
     )
+    parser.add_argument(
+        "--mosaic",
+        action="store_true",
+        help="write mosaics of each stop before and after too, around the horizon and from above",
+    )
     parser.add_argument("--no-report", action="store_true", help="do not write report.html")
     arguments = parser.parse_args()
     show_log(verbose=arguments.verbose)
@@ -97,7 +103,9 @@ def main() -> int:
             found = cross_validate(traverse, options, solution=solution, progress=progress.counted)
             solution = solution.with_cross_validation(found)
         progress.say("writing the results")
-        solution = solution.save(arguments.out, report=not arguments.no_report, exports=arguments.export)
+        mosaics = MosaicOptions() if arguments.mosaic else None
+        results = {"report": not arguments.no_report, "exports": arguments.export, "mosaics": mosaics}
+        solution = solution.save(arguments.out, **results, progress=progress.counted)
     print_summary(solution, str(arguments.out))
     return 0 if solution.converged else 1
 

@@ -19,6 +19,7 @@ from pancam_graph.rigs import Eye, Rig, rig_template
 from pancam_graph.sharing import Freedom, Sharing
 
 __all__ = [
+    "MOSAIC_FORMAT",
     "SOLUTION_FORMAT",
     "TRAVERSE_FORMAT",
     "VERSION",
@@ -37,6 +38,7 @@ __all__ = [
 
 TRAVERSE_FORMAT = "pancam-graph/traverse"
 SOLUTION_FORMAT = "pancam-graph/solution"
+MOSAIC_FORMAT = "pancam-graph/mosaics"
 VERSION = 1
 
 Text = Annotated[str, Field(min_length=0)]

@@ -2,25 +2,34 @@
 
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pancam_graph.errors import InputError
 from pancam_graph.io._atomic import whole_folder
 from pancam_graph.io._brightness import brightness_of
 from pancam_graph.io._exported import require_export
 from pancam_graph.io._json import read_json, refused_by_schema
-from pancam_graph.io._schema import SOLUTION_FORMAT, VERSION
+from pancam_graph.io._schema import MOSAIC_FORMAT, SOLUTION_FORMAT, VERSION
 from pancam_graph.io.exports import EXPORTS, Export, check_exports, fill_exports
 from pancam_graph.io.ply import points_ply
 from pancam_graph.io.residuals_csv import residuals_csv
 from pancam_graph.io.solution_json import solution_json
 from pancam_graph.solution import Solution
 
-__all__ = ["RESULT_FILES", "check_out", "save_solution"]
+if TYPE_CHECKING:
+    from pancam_graph.images.mosaic import MosaicOptions
+
+__all__ = ["MOSAICS", "MOSAIC_INDEX", "RESULT_FILES", "check_out", "save_solution"]
 
 RESULT_FILES = ("solution.json", "points.ply", "residuals.csv", "report.html")
 """What a folder of results consists of; the report may be missing."""
+MOSAICS = "mosaics"
+"""Name of the folder of mosaics in it, where they were asked for."""
+MOSAIC_INDEX = "mosaics.json"
+"""The file in that folder which knows the others."""
 
 
 def check_out(out: Path | str) -> None:
@@ -57,14 +66,21 @@ def check_out(out: Path | str) -> None:
 
 
 def save_solution(
-    solution: Solution, out: Path | str, *, report: bool = True, exports: Sequence[Export] = ()
+    solution: Solution,
+    out: Path | str,
+    *,
+    report: bool = True,
+    exports: Sequence[Export] = (),
+    mosaics: "MosaicOptions | None" = None,
+    progress: Callable[[str, int, int], None] | None = None,
 ) -> Solution:
     """Write the results of a solution into the folder `out`; see `RESULT_FILES` and `exports.EXPORTS`.
 
     Everything is written into a folder beside and renamed when complete: an older folder of results stays
-    whole until then, and is there as before if anything fails. Returns the solution with the time that
-    writing took as its `seconds.report`. Raises InputError as `check_out` and `check_exports` do, and where
-    writing fails.
+    whole until then, and is there as before if anything fails. With options of `mosaics`, a folder of them
+    is among the results; `progress` is told of each. Returns the solution with the time that writing took as
+    its `seconds.report`, and with warnings of images that the mosaics lack. Raises InputError as `check_out`
+    and `check_exports` do, and where writing fails.
     """
     out = Path(out)
     check_out(out)
@@ -76,16 +92,37 @@ def save_solution(
             (folder / "points.ply").write_bytes(points_ply(solution, brightness.grey))
             fill_exports(solution, exports, folder, brightness)
             (folder / "residuals.csv").write_bytes(residuals_csv(solution))
+            written = None
+            if mosaics is not None:
+                from pancam_graph.images.mosaic import write_mosaics  # noqa: PLC0415  it imports this package
+
+                (folder / MOSAICS).mkdir()
+                written = write_mosaics(solution, folder / MOSAICS, mosaics, progress=progress)
+                solution = replace(solution, warnings=(*solution.warnings, *written.warnings))
             if report:
                 from pancam_graph.report import write_report  # noqa: PLC0415  Plotly is only for reports
 
-                write_report(solution, folder / "report.html")
+                write_report(solution, folder / "report.html", written)
             # Last: it says how long the others took.
             timed = solution.with_seconds(report=solution.seconds.report + time.perf_counter() - started)
             (folder / "solution.json").write_bytes(solution_json(timed))
     except OSError as error:
         raise InputError(f"{out}: expected a place where results can be written, found: {error}") from error
     return timed
+
+
+def _no_mosaics(folder: Path) -> list[str]:
+    """Names in a folder that its index does not know as mosaics; all where there is no index."""
+    found = sorted(p.name for p in folder.iterdir()) if folder.is_dir() and not folder.is_symlink() else [""]
+    try:
+        index = read_json(folder / MOSAIC_INDEX, MOSAIC_FORMAT, VERSION)
+    except InputError:
+        return found
+    ours = {MOSAIC_INDEX}
+    for entry in index["mosaics"] if isinstance(index.get("mosaics"), list) else []:
+        files = entry.get("files") if isinstance(entry, dict) else None
+        ours |= {f for f in files.values() if isinstance(f, str)} if isinstance(files, dict) else set()
+    return [n for n in found if n not in ours or not (folder / n).is_file()]
 
 
 def _require_results(folder: Path, expected: str) -> None:
@@ -95,6 +132,9 @@ def _require_results(folder: Path, expected: str) -> None:
     strangers = [
         n for n in found if n not in exports and (n not in RESULT_FILES or not (folder / n).is_file())
     ]
+    if MOSAICS in strangers:
+        strangers.remove(MOSAICS)
+        strangers += [f"{MOSAICS}/{n}" for n in _no_mosaics(folder / MOSAICS)]
     if strangers:
         more = f" and {len(strangers) - 1} more" if len(strangers) > 1 else ""
         raise InputError(f"{expected}, found other things in it: {strangers[0]}{more}")

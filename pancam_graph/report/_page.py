@@ -8,11 +8,13 @@ from html import escape
 
 from plotly.offline import get_plotlyjs
 
+from pancam_graph.images.mosaic import WrittenMosaics
 from pancam_graph.report._cross_validation import cross_validation_section
 from pancam_graph.report._figures import make_corrections, make_histogram
 from pancam_graph.report._images import image_residuals, vector_panels
 from pancam_graph.report._look import AFTER, BEFORE, REJECTED, Figure, axis, layout
 from pancam_graph.report._map import make_map
+from pancam_graph.report._mosaics import mosaic_section
 from pancam_graph.report._numbers import Json, fixed, short
 from pancam_graph.report._scene import make_masts, make_scene
 from pancam_graph.report._script import SCRIPT
@@ -37,8 +39,8 @@ _REASONS = {
 }
 
 
-def make_page(solution: Solution) -> str:
-    """The whole page of a solution as HTML."""
+def make_page(solution: Solution, mosaics: WrittenMosaics | None = None) -> str:
+    """The whole page of a solution as HTML, with its mosaics where there are any."""
     table, rows_of = image_residuals(solution)
     terrain = make_terrain(solution)
     scene, views = make_scene(solution, terrain, make_masts(solution))
@@ -64,6 +66,7 @@ def make_page(solution: Solution) -> str:
         map=_section("Map", map_figure),
         histogram=_section("Residuals before and after", histogram),
         vectors=_section("Residuals in single images", vectors, VECTOR_CONTROLS) if panels else NO_VECTORS,
+        mosaics=mosaic_section(mosaics),
         corrections=_section("Corrections of pan and tilt", corrections),
         cross_validation=cross_validation_section(solution.cross_validation, solution.traverse),
         images=image_table(solution, table),

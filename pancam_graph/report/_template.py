@@ -47,7 +47,7 @@ script-src 'unsafe-inline' 'unsafe-eval'; img-src data: blob:; connect-src data:
 {map}
 {histogram}
 </div>
-{vectors}
+{mosaics}{vectors}
 {corrections}
 {cross_validation}
 <section>

@@ -50,9 +50,7 @@ def choose_look(layers: Sequence[tuple[int, Layer]], height_px: int, width_px: i
     corners = [(layer.left_px // shrink, layer.top_px // shrink) for _, layer in layers]
     gain = _gains(layers, small, corners)
     labels = _labels(layers, small, corners, gain, (height_px, width_px))
-    shown = np.concatenate(
-        [gain[n] * _some(layer, labels[layer.box] == n) for n, layer in layers]
-    )
+    shown = np.concatenate([gain[n] * _some(layer, labels[layer.box] == n) for n, layer in layers])
     dark, bright = np.quantile(shown, [_DARK, _BRIGHT]) if len(shown) else (0.0, 1.0)
     return Look(labels=labels, gain=gain, dark=float(dark), bright=float(max(bright, dark + 1e-6)))
 
@@ -71,9 +69,7 @@ def _shrunk(layer: Layer, shrink: int, scale: float) -> tuple[NDArray[np.uint8],
     if shrink > 1:
         pad = (0, height * shrink - grey.shape[0], 0, width * shrink - grey.shape[1])
         grey, mask = (
-            cv2.resize(
-                cv2.copyMakeBorder(a, *pad, border), (width, height), interpolation=cv2.INTER_AREA
-            )
+            cv2.resize(cv2.copyMakeBorder(a, *pad, border), (width, height), interpolation=cv2.INTER_AREA)
             for a, border in ((grey, cv2.BORDER_REPLICATE), (mask, cv2.BORDER_CONSTANT))
         )
     return grey, ((mask == 255) * np.uint8(255)).astype(np.uint8)
@@ -84,7 +80,8 @@ def _gains(
     small: Sequence[tuple[NDArray[np.uint8], NDArray[np.uint8]]],
     corners: Sequence[tuple[int, int]],
 ) -> dict[int, float]:
-    compensator: Any = cv2.detail.ExposureCompensator_createDefault(cv2.detail.ExposureCompensator_GAIN)
+    detail: Any = cv2.detail  # its types lack what it makes
+    compensator = detail.ExposureCompensator_createDefault(detail.ExposureCompensator_GAIN)
     compensator.feed(corners, [cv2.merge([grey] * 3) for grey, _ in small], [mask for _, mask in small])
     found = [float(np.ravel(g)[0]) for g in compensator.getMatGains()]
     # An image across the ends of a closed mosaic has two layers; it has one exposure.
@@ -132,7 +129,7 @@ def _filled(labels: NDArray[np.int32], layers: Sequence[tuple[int, Layer]]) -> N
     for number, layer in layers:
         part = out[layer.box]
         part[layer.valid & (part < 0)] = number
-    return out
+    return np.asarray(out)
 
 
 def blend(layers: Sequence[tuple[int, Layer]], look: Look) -> NDArray[np.uint8]:
@@ -156,7 +153,7 @@ def blend(layers: Sequence[tuple[int, Layer]], look: Look) -> NDArray[np.uint8]:
         blender.feed(cv2.merge([_continued(fine, layer.valid)] * 3), mask, (layer.left_px, layer.top_px))
     picture, _ = blender.blend(None, None)
     grey8 = np.clip(np.rint(picture[:, :, 0] / _FINE), 1, 255).astype(np.uint8)
-    return np.where(labels >= 0, grey8, np.uint8(0))
+    return np.asarray(np.where(labels >= 0, grey8, 0), dtype=np.uint8)
 
 
 def _continued(grey: NDArray[np.int16], valid: NDArray[np.bool_]) -> NDArray[np.int16]:
@@ -168,4 +165,4 @@ def _continued(grey: NDArray[np.int16], valid: NDArray[np.bool_]) -> NDArray[np.
     )
     value = np.zeros(int(nearest.max()) + 1, dtype=np.int16)
     value[nearest[valid]] = grey[valid]
-    return value[nearest]
+    return np.asarray(value[nearest])

@@ -102,12 +102,12 @@ def make_mosaics(
     if stop not in stops:
         raise InputError(f"mosaic: stop: expected the id of a stop, found {stop!r}")
     shared = ground or stop_ground(solution, stops[stop])
-    images, warnings = placed_images(
-        solution, stops[stop], traverse.rig.eye_index(camera), shared.views
-    )
+    images, warnings = placed_images(solution, stops[stop], traverse.rig.eye_index(camera), shared.views)
     if not images:
         why = f" ({warnings[0]})" if len(warnings) == 1 else ""
-        raise InputError(f"mosaic: stop {stop}, camera {camera}: expected image files, found none that serve{why}")
+        raise InputError(
+            f"mosaic: stop {stop}, camera {camera}: expected image files, found none that serve{why}"
+        )
     surface = shared.surfaces["refined"]
     native = native_px_per_degree(images)
     around = _cylinder(images, surface, options, native)
@@ -152,11 +152,9 @@ def _cylinder(
     """The cylinder that just holds all images, with both pointings."""
     sphere = _sphere(images, surface.origin_m, native)
     lattice = Lattice.over(sphere, surface)
-    seen: BoolArray = np.logical_or.reduce(
-        [lattice.seen_by(image.at[p])[1] for image in images for p in POINTINGS]
-    )
+    seen: BoolArray = np.any([lattice.seen_by(image.at[p])[1] for image in images for p in POINTINGS], axis=0)
     rows, cell_deg = np.flatnonzero(seen.any(axis=1)), STEP_PX / sphere.px_per_degree
-    start, gap = largest_gap(seen[:, : sphere.width_px // STEP_PX].any(axis=0))
+    start, gap = largest_gap(np.any(seen[:, : sphere.width_px // STEP_PX], axis=0))
     left_deg = sphere.left_deg - (start + gap) * cell_deg
     top_deg = sphere.top_deg - float(rows[0]) * cell_deg if len(rows) else sphere.top_deg
     height_deg = min((len(rows) and int(rows[-1] - rows[0]) + 1) * cell_deg, top_deg + 90)
@@ -198,7 +196,7 @@ def _part(
     *,
     closed: bool,
 ) -> Cylinder:
-    """A cylinder of about a scale; one that goes round has whole cells of the lattice, and the scale for it."""
+    """A cylinder of about a scale; one that goes round has whole cells of the lattice."""
     if closed:
         width = max(STEP_PX * int(360 * scale / STEP_PX), STEP_PX)
         scale, left_deg = width / 360, 180.0

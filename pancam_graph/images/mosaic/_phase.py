@@ -65,7 +65,9 @@ def displacements(first: NDArray[Any], second: NDArray[Any]) -> Displacements:
     normal += 1e-12 * np.eye(2)
     for _ in range(_STEPS):
         phase = np.angle(cross * np.exp(1j * (shift @ omega.T)))
-        step = np.linalg.solve(normal, (np.einsum("nk,nk,ki->ni", weight, phase, omega) / total[:, None])[..., None])
+        step = np.linalg.solve(
+            normal, (np.einsum("nk,nk,ki->ni", weight, phase, omega) / total[:, None])[..., None]
+        )
         shift = shift - np.clip(step[..., 0], -1.0, 1.0)
     left = cross * np.exp(1j * (shift @ omega.T))
     coherence = np.abs(left.sum(axis=1)) / total

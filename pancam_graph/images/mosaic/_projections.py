@@ -91,7 +91,7 @@ class Ground:
         )
 
     def points_m(self, surface: Surface, column_px: FloatArray, row_px: FloatArray) -> FloatArray:
-        """World points (n, 3) of the surface at pixels, columns (n,) and rows (n,); NaN where it is hidden."""
+        """World points (n, 3) of the surface at columns (n,) and rows (n,); NaN where it is hidden."""
         xy_m = np.column_stack([self.left_m + column_px * self.m_per_px, self.top_m - row_px * self.m_per_px])
         return surface.ground_m(xy_m)
 

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,6 +39,7 @@ _DRAWN: tuple[tuple[Case, Pointing, Pointing], ...] = (
 _BLOCK = 128
 _CLOSE_UP_PX = (168, 112)
 """Width and height."""
+_DETAIL_PX = 12.0
 _STEEPEST_DEG = 65.0
 """Above and below, columns of a panorama converge too fast for windows to keep their shape."""
 
@@ -125,7 +127,7 @@ def seam_error(
 
 def _around(overview: Cylinder, cells: BoolArray, px_per_degree: float) -> Cylinder:
     """The cylinder that holds cells (rows, columns) of another's lattice, at another scale."""
-    rows, columns = np.flatnonzero(cells.any(axis=1)), cells.any(axis=0)
+    rows, columns = np.flatnonzero(np.any(cells, axis=1)), np.any(cells, axis=0)
     if overview.closed:  # its lattice goes one cell beyond the last column
         columns = columns[: overview.width_px // STEP_PX]
         start, gap = largest_gap(columns)
@@ -160,15 +162,15 @@ def _overlap(
         )
         for case, pointing, ground in _DRAWN
     }
-    common = np.logical_and.reduce([canvas.valid for pair in drawn.values() for canvas in pair])
+    common: BoolArray = np.all([canvas.valid for pair in drawn.values() for canvas in pair], axis=0)
     at = _windows(common, around)
     if not len(at):
         return None
     measured = {case: _displaced(*pair, at) for case, pair in drawn.items()}
-    sure = np.logical_and.reduce([m.sigma_px < _GREATEST_SIGMA_PX for m in measured.values()])
-    alike = np.logical_and.reduce([m.coherence > _LEAST_COHERENCE for m in measured.values()])
+    sure: BoolArray = np.all([m.sigma_px < _GREATEST_SIGMA_PX for m in measured.values()], axis=0)
+    alike: BoolArray = np.all([m.coherence > _LEAST_COHERENCE for m in measured.values()], axis=0)
     good = sure & alike
-    middle = at[good] + 0.5 * (WINDOW_PX - 1)
+    middle: FloatArray = at[good].astype(float) + 0.5 * (WINDOW_PX - 1)
     elevation_deg = around.elevation_deg(middle[:, 1])
     level = np.column_stack([np.cos(np.deg2rad(elevation_deg)), np.ones(len(middle))])
     close_up: dict[Pointing, NDArray[np.uint8]] = {}
@@ -204,9 +206,7 @@ class _Canvas:
         return _Canvas(grey=grey, valid=valid)
 
 
-def _close_up(
-    first: _Canvas, second: _Canvas, common: BoolArray, middle: FloatArray
-) -> NDArray[np.uint8]:
+def _close_up(first: _Canvas, second: _Canvas, common: BoolArray, middle: FloatArray) -> NDArray[np.uint8]:
     """A piece of two images, one in red, the other in green and blue."""
     corner = []
     for centre, size, length in zip(middle, common.shape[::-1], _CLOSE_UP_PX, strict=True):
@@ -215,9 +215,12 @@ def _close_up(
     shown = common[part]
     channels = []
     for canvas in (first, second):
-        low, high = np.quantile(canvas.grey[part][shown], [0.01, 0.99])
-        grey = 30 + 195 * (canvas.grey[part] - low) / max(float(high - low), 1e-6)
-        channels.append(np.where(shown, np.clip(grey, 0, 255), 235).astype(np.uint8))
+        # Unequal exposure and vignetting would colour all of it: detail alone is compared.
+        weight = cv2.GaussianBlur(shown.astype(np.float32), (0, 0), _DETAIL_PX)
+        smooth = cv2.GaussianBlur(np.where(shown, canvas.grey[part], 0), (0, 0), _DETAIL_PX)
+        detail = canvas.grey[part] - smooth / np.maximum(weight, 1e-6)
+        spread = 2.5 * max(float(np.std(detail[shown])), 1e-6)
+        channels.append(np.where(shown, np.clip(120 + 120 * detail / spread, 0, 255), 235).astype(np.uint8))
     return np.stack([channels[0], channels[1], channels[1]], axis=-1)
 
 
@@ -225,15 +228,13 @@ def _windows(common: BoolArray, around: Cylinder) -> IntArray:
     """Columns and rows (n, 2) of the corners of windows in which all is valid, evenly thinned if too many."""
     height, width = common.shape
     filled = np.pad(np.cumsum(np.cumsum(common, axis=0), axis=1), ((1, 0), (1, 0)))
-    row, column = (
-        np.arange(0, n - WINDOW_PX + 1, _STRIDE_PX, dtype=np.int64) for n in (height, width)
-    )
+    row, column = (np.arange(0, n - WINDOW_PX + 1, _STRIDE_PX, dtype=np.int64) for n in (height, width))
     v, u = (a.ravel() for a in np.meshgrid(row, column, indexing="ij"))
     steep = np.abs(around.elevation_deg(v + 0.5 * (WINDOW_PX - 1))) > _STEEPEST_DEG
     end_v, end_u = v + WINDOW_PX, u + WINDOW_PX
     area = filled[end_v, end_u] - filled[v, end_u] - filled[end_v, u] + filled[v, u]
     at = np.column_stack([u, v])[(area == WINDOW_PX**2) & ~steep]
-    return at[:: max(1, -(-len(at) // _MAX_WINDOWS))]
+    return np.asarray(at[:: max(1, -(-len(at) // _MAX_WINDOWS))])
 
 
 def _displaced(first: _Canvas, second: _Canvas, at: IntArray) -> Displacements:

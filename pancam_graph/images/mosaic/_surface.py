@@ -59,7 +59,7 @@ class Surface:
     def inverse_range(self, direction: FloatArray) -> FloatArray:
         """Inverse ranges (n,) per metre along unit directions (n, 3), 1 / FAR_M at least."""
         relief = _interpolation(direction) @ self.relief.ravel()
-        return np.maximum(_plane_inverse_range(self.plane, direction) + relief, 1 / FAR_M)
+        return np.asarray(np.maximum(_plane_inverse_range(self.plane, direction) + relief, 1 / FAR_M))
 
     def points_m(self, direction: FloatArray) -> FloatArray:
         """World points (n, 3) of the surface along unit directions (n, 3) from the origin."""
@@ -220,7 +220,7 @@ def _bilinear(column: FloatArray, row: FloatArray, *, columns: int, rows: int) -
 
 
 def _smoothness(plane: FloatArray) -> sparse.csr_array:
-    """What relief costs: its changes from cell to cell, as shares of the plane's inverse range, and itself."""
+    """What relief costs: changes from cell to cell, as shares of the plane's inverse range, and itself."""
     elevation = np.deg2rad(_CELL_DEG * np.arange(_ROWS) - 90.0)
     azimuth = np.deg2rad(_CELL_DEG) * np.arange(_COLUMNS)
     base = _plane_inverse_range(plane, directions(azimuth[None, :], elevation[:, None]).reshape(-1, 3))

@@ -12,7 +12,7 @@ from pancam_graph.images.mosaic._placed import PlacedImage, Pointing, Station
 from pancam_graph.images.mosaic._projections import Projection
 from pancam_graph.images.mosaic._surface import Surface
 
-__all__ = ["STEP_PX", "Layer", "Lattice", "largest_gap", "warp"]
+__all__ = ["STEP_PX", "Lattice", "Layer", "largest_gap", "warp"]
 
 STEP_PX = 8
 """Every how many pixels of a mosaic points are projected; between, pixels are interpolated, which is good to
@@ -57,7 +57,7 @@ class Lattice:
         return Lattice(projection=projection, points_m=points.reshape(rows, columns, 3))
 
     def seen_by(self, station: Station) -> tuple[NDArray[np.float32], BoolArray]:
-        """Where a camera sees the lattice, (rows, columns, 2), NaN far from its image; and which cells it sees.
+        """Where a camera sees the lattice, (rows, columns, 2), NaN far from its image; and which cells.
 
         Cells (rows - 1, columns - 1) count as seen if a corner of them is, or if the image could reach in.
         """
@@ -105,10 +105,10 @@ def warp(image: PlacedImage, pointing: Pointing, lattice: Lattice) -> list[Layer
     rows = np.flatnonzero(cells.any(axis=1))
     if not len(rows):
         return []
-    columns = cells.any(axis=0)
+    columns: BoolArray = np.any(cells, axis=0)
     runs = [(int(np.argmax(columns)), len(columns) - int(np.argmax(columns[::-1])))]
     start, gap = largest_gap(columns)
-    if projection.closed and gap and 0 < start and start + gap < len(columns):
+    if projection.closed and gap and start > 0 and start + gap < len(columns):
         runs = [(0, start), (start + gap, len(columns))]
     layers = []
     for first, last in runs:
@@ -122,8 +122,10 @@ def warp(image: PlacedImage, pointing: Pointing, lattice: Lattice) -> list[Layer
             np.arange(width, dtype=np.float32) / STEP_PX, np.arange(height, dtype=np.float32) / STEP_PX
         )
         # Eighths are exact in the fixed-point fractions of OpenCV.
-        uv = cv2.remap(np.ascontiguousarray(part), at_u, at_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        grey, valid = _sample(image, uv)
+        uv = cv2.remap(
+            np.ascontiguousarray(part), at_u, at_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        grey, valid = _sample(image, np.asarray(uv, dtype=np.float32))
         if valid.any():
             layers.append(_trimmed(Layer(left_px=left, top_px=top, grey=grey, valid=valid)))
     return layers
@@ -162,7 +164,7 @@ def _sample(image: PlacedImage, uv: NDArray[np.float32]) -> tuple[NDArray[np.flo
         if len(rows):
             part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
             at = [(c[part] + np.float32(0.5)) / np.float32(2**k) - np.float32(0.5) for c in (u, v)]
-            drawn = cv2.remap(source, *at, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+            drawn = cv2.remap(source, at[0], at[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
             grey[part] = np.where(level[part] == k, drawn, grey[part])
         if min(source.shape) < 2:
             break
@@ -183,4 +185,5 @@ def _levels(uv: NDArray[np.float32]) -> NDArray[np.int8]:
     # Pixels of the image per pixel of the mosaic, along its finer direction: sharp rather than smooth.
     down, right = (np.hypot(*np.moveaxis(np.gradient(uv, axis=a), -1, 0)) for a in (0, 1))
     scale = np.nan_to_num(np.minimum(down, right), nan=1.0)
-    return np.clip(np.rint(np.log2(np.maximum(scale, 1.0))), 0, _GREATEST_LEVEL).astype(np.int8)
+    level = np.clip(np.rint(np.log2(np.maximum(scale, 1.0))), 0, _GREATEST_LEVEL)
+    return np.asarray(level, dtype=np.int8)
