@@ -18,6 +18,10 @@ _SEAM_PIXELS = 1.5e6
 _DARK, _BRIGHT = 0.003, 0.997
 """Shares of the pixels that become the darkest and the brightest of 8 bits."""
 _BANDS = 4
+_NO_GAIN = 1.0
+"""How many pixels of an overlap the prior for a gain of 1 counts as much as."""
+_LEAST_COMMON = 50
+"""Pixels, in shrunken layers, from which an overlap tells a ratio of brightness."""
 _FINE = 16.0
 """Steps of the blender's integers per step of 8 bits."""
 
@@ -38,8 +42,8 @@ class Look:
 def choose_look(layers: Sequence[tuple[int, Layer]], height_px: int, width_px: int) -> Look:
     """Gains, seams and contrast for the layers of a mosaic, each with the number of its image.
 
-    Gains make overlaps equally bright (Brown and Lowe 2007, OpenCV's compensator); seams are those of least
-    difference (graph cut, Kwatra and others 2003, OpenCV's finder), sought in shrunken layers.
+    Gains make overlaps equally bright; seams are those of least difference (graph cut, Kwatra and others
+    2003, OpenCV's finder), sought in shrunken layers.
     """
     area = sum(layer.grey.size for _, layer in layers)
     shrink = 1
@@ -80,18 +84,50 @@ def _gains(
     small: Sequence[tuple[NDArray[np.uint8], NDArray[np.uint8]]],
     corners: Sequence[tuple[int, int]],
 ) -> dict[int, float]:
-    detail: Any = cv2.detail  # its types lack what it makes
-    compensator = detail.ExposureCompensator_createDefault(detail.ExposureCompensator_GAIN)
-    compensator.feed(corners, [cv2.merge([grey] * 3) for grey, _ in small], [mask for _, mask in small])
-    found = [float(np.ravel(g)[0]) for g in compensator.getMatGains()]
-    # An image across the ends of a closed mosaic has two layers; it has one exposure.
-    area: dict[int, float] = {}
-    total: dict[int, float] = {}
-    for (number, layer), gain in zip(layers, found, strict=True):
-        size = float(layer.valid.sum())
-        area[number] = area.get(number, 0.0) + size
-        total[number] = total.get(number, 0.0) + size * np.log(max(gain, 1e-3))
-    return {n: float(np.exp(total[n] / area[n])) for n in area}
+    """Gains, by image: least squares on the logarithms of brightness ratios in all overlaps.
+
+    OpenCV's compensator has a fixed prior for gains of 1, which leaves a tenth of a real change of exposure.
+    """
+    numbers = sorted({number for number, _ in layers})
+    row = {number: k for k, number in enumerate(numbers)}
+    # Groups of images without overlap keep gains about 1.
+    normal, right = _NO_GAIN * np.eye(len(numbers)), np.zeros(len(numbers))
+    for a, (first, _) in enumerate(layers):
+        for b in range(a + 1, len(layers)):
+            second = layers[b][0]
+            cut = _common(small[a][0].shape, corners[a], small[b][0].shape, corners[b])
+            if first == second or cut is None:
+                continue
+            both = (small[a][1][cut[0]] > 0) & (small[b][1][cut[1]] > 0)
+            if np.count_nonzero(both) < _LEAST_COMMON:
+                continue
+            sums = [
+                float(grey[part][both].sum(dtype=np.float64))
+                for (grey, _), part in zip((small[a], small[b]), cut, strict=True)
+            ]
+            ratio = np.log(max(sums[1], 1.0) / max(sums[0], 1.0))
+            weight = float(np.count_nonzero(both))
+            i, j = row[first], row[second]
+            normal[[i, j], [i, j]] += weight
+            normal[[i, j], [j, i]] -= weight
+            right[i] += weight * ratio
+            right[j] -= weight * ratio
+    return dict(zip(numbers, np.exp(np.linalg.solve(normal, right)).tolist(), strict=True))
+
+
+def _common(
+    shape_a: tuple[int, ...], corner_a: tuple[int, int], shape_b: tuple[int, ...], corner_b: tuple[int, int]
+) -> tuple[tuple[slice, slice], tuple[slice, slice]] | None:
+    """What two boxes share, as slices of each; None for nothing. Corners are columns and rows."""
+    low = np.maximum(corner_a, corner_b)
+    high = np.minimum(np.add(corner_a, shape_a[::-1]), np.add(corner_b, shape_b[::-1]))
+    if np.any(high <= low):
+        return None
+    parts = []
+    for corner in (corner_a, corner_b):
+        (u0, v0), (u1, v1) = (low - corner).tolist(), (high - corner).tolist()
+        parts.append((slice(v0, v1), slice(u0, u1)))
+    return parts[0], parts[1]
 
 
 def _labels(

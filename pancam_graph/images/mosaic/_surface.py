@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import LinearOperator, cg, splu
 
 from pancam_graph.geometry import FloatArray, IntArray
 from pancam_graph.images.mosaic._placed import View
@@ -31,6 +31,7 @@ _FADE_CELLS = 10.0
 _PLANE_SIGMA = 0.05
 """Of the plane's slopes about the horizontal, and of its distance as a share."""
 _ROUNDS = 5
+_MOST_GRADIENTS = 50
 _FARTHEST_GROUND_M = 300.0
 """Where the ground is no longer told from the sky."""
 _HIDDEN = 1.5
@@ -112,12 +113,17 @@ def surface_of_stop(solution: Solution, stop: int, origin_m: FloatArray, view: V
     relief = np.zeros(_ROWS * _COLUMNS)
     # What the plane misses is relief, not error: all landmarks count in full at first.
     robust = np.ones(len(rows))
+    first = None
     for _ in range(_ROUNDS if len(rows) else 0):
         data = sparse.diags(weight * robust)
         system = (at.T @ data @ at + smooth).tocsc()
-        relief = splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(
-            at.T @ (weight * robust * (inverse - base))
-        )
+        right = at.T @ (weight * robust * (inverse - base))
+        if first is None:
+            first = splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+            relief = first.solve(right)
+        else:  # weights change little: the first factorisation makes a few conjugate gradients enough
+            solver = LinearOperator(system.shape, matvec=first.solve, dtype=np.float64)
+            relief, _ = cg(system, right, x0=relief, rtol=1e-6, maxiter=_MOST_GRADIENTS, M=solver)
         robust = _robust(weight, inverse - base - at @ relief)
     return Surface(origin_m=origin_m, plane=plane, relief=relief.reshape(_ROWS, _COLUMNS))
 

@@ -1,0 +1,343 @@
+"""Mosaics: right place, right brightness, and a seam error that is the pointing error."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from mosaic_scenes import MARK_M, PLACE_M, PX_PER_RAD, Scene, solved, without_file
+from numpy.typing import NDArray
+
+from pancam_graph import Solution, find_observations, read_pds, solve, write_report
+from pancam_graph.errors import InputError
+from pancam_graph.geometry import FloatArray
+from pancam_graph.images.mosaic import (
+    Cylinder,
+    Ground,
+    MosaicOptions,
+    StopMosaics,
+    make_mosaics,
+    write_mosaics,
+)
+from pancam_graph.images.mosaic._make import stop_ground
+from pancam_graph.images.mosaic._phase import WINDOW_PX, displacements
+from pancam_graph.images.mosaic._warp import largest_gap
+from pancam_graph.io import check_out
+
+NEAR = MosaicOptions(ground_radius_m=4.0, ground_m_per_px=0.02)
+
+
+def made(scene: Scene, folder: Path) -> StopMosaics:
+    return make_mosaics(solved(scene, folder), "A/1", "left", NEAR)
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> Solution:
+    return solved(Scene(), tmp_path_factory.mktemp("truth"))
+
+
+@pytest.fixture(scope="module")
+def truth_made(truth: Solution) -> StopMosaics:
+    return make_mosaics(truth, "A/1", "left", NEAR)
+
+
+def shifted(noise: float, shift: FloatArray, n: int = 40) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Windows of a smooth random texture, and of the same displaced, cut from something larger."""
+    rng = np.random.default_rng(0)
+    side = 2 * WINDOW_PX
+    f = np.fft.fftfreq(side)
+    spectrum = np.fft.fft2(rng.normal(0, 1, (n, side, side))) * np.exp(-40 * (f[:, None] ** 2 + f**2))
+    ramp = np.exp(-2j * np.pi * (f * shift[0] + f[:, None] * shift[1]))
+    pair = [np.fft.ifft2(s).real[:, 32:96, 32:96] for s in (spectrum, spectrum * ramp)]
+    return pair[0], pair[1] + rng.normal(0, noise * pair[0].std(), pair[1].shape)
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.11, -0.07), (0.6, 0.8), (-2.4, 1.3), (12.0, -9.0)])
+def test_displacements_of_windows_are_found(shift: tuple[float, float]) -> None:
+    """Within 3 %: the taper stays where it is while the texture moves."""
+    found = displacements(*shifted(0.0, np.array(shift)))
+    assert np.median(found.shift_px, axis=0) == pytest.approx(shift, abs=0.003 + 0.03 * np.hypot(*shift))
+    assert found.coherence.min() > 0.6
+
+
+def test_displacements_know_how_sure_they_are() -> None:
+    found = displacements(*shifted(0.3, np.array([0.2, -0.1]), n=200))
+    error = np.abs(found.shift_px - [0.2, -0.1]).max(axis=1) / found.sigma_px
+    assert 0.6 < np.median(error) < 1.6
+    plain = displacements(*(np.random.default_rng(k).normal(0, 1, (50, 64, 64)) for k in (1, 2)))
+    assert np.median(plain.coherence) < 0.3
+    flat = displacements(np.full((1, 64, 64), 7.0), np.full((1, 64, 64), 7.0))
+    assert np.isfinite(flat.shift_px).all()
+
+
+def test_runs_that_are_not_covered_go_round() -> None:
+    covered = np.array([0, 1, 1, 0, 1, 0, 0, 0], dtype=bool)
+    assert largest_gap(covered) == (5, 4)
+    assert largest_gap(np.roll(covered, 3)) == (0, 4)
+    assert largest_gap(np.ones(5, dtype=bool)) == (0, 0)
+    assert largest_gap(np.zeros(5, dtype=bool)) == (0, 5)
+
+
+def test_the_surface_is_the_plane_and_fades_to_a_far_sky(truth: Solution) -> None:
+    ground = stop_ground(truth, 0)
+    surface = ground.surfaces["refined"]
+    places = np.array([[1.0, 0.3], [2.0, 1.0], [5.0, 0.0], [8.0, -3.0]])
+    points = surface.ground_m(places)
+    assert points[:, :2] == pytest.approx(places + ground.origin_m[:2])
+    assert np.abs(points[:, 2]).max() < 0.05
+    assert surface.inverse_range(np.array([[0.0, 0.6, 0.8]])) == pytest.approx(1e-5, abs=1e-4)
+
+
+def test_without_landmarks_the_ground_is_the_rigs(truth: Solution) -> None:
+    bare = replace(truth, used=np.zeros_like(truth.used))
+    point = stop_ground(bare, 0).surfaces["refined"].ground_m(np.array([[3.0, 0.0]]))
+    nominal_m = PLACE_M[2] - truth.traverse.rig.mast_height_m
+    assert point[0, 2] == pytest.approx(nominal_m, abs=0.01)
+
+
+def test_true_poses_leave_no_seam_error(truth_made: StopMosaics) -> None:
+    seams = truth_made.seams
+    assert {o.images for o in seams.overlaps} >= {("f0-left", "f1-left"), ("f1-left", "f2-left")}
+    assert seams.used >= 8
+    assert seams.median_px("refined") < 0.03
+    assert seams.median_px("telemetry") == pytest.approx(seams.median_px("refined"))
+    for overlap in seams.overlaps:
+        assert overlap.windows == overlap.plain + overlap.unlike + len(overlap.azimuth_deg)
+
+
+def test_a_pan_error_is_the_seam_error(tmp_path: Path) -> None:
+    error = 4e-3
+    seams = made(Scene(error_rad=((0.0, 0.0), (error, 0.0))), tmp_path).seams
+    assert seams.median_px("refined") < 0.03
+    for overlap, sign in zip(seams.overlaps[:2], (1, -1), strict=True):
+        level = np.cos(np.deg2rad(overlap.elevation_deg))
+        expected = -sign * error * PX_PER_RAD * level
+        assert overlap.shift_px["telemetry"][:, 0] == pytest.approx(expected, abs=0.1)
+        assert np.median(overlap.shift_px["telemetry"][:, 0]) == pytest.approx(np.median(expected), rel=0.05)
+        assert overlap.median_px("telemetry") == pytest.approx(np.median(np.abs(expected)), rel=0.06)
+
+
+def test_a_tilt_error_is_the_seam_error(tmp_path: Path) -> None:
+    error = 3e-3
+    seams = made(Scene(error_rad=((0.0, error),)), tmp_path).seams
+    (first,) = (o for o in seams.overlaps if o.images == ("f0-left", "f1-left"))
+    # Looking up by mistake puts the first image too high; the second is where it should be: lower.
+    found = np.median(first.shift_px["telemetry"][:, 1])
+    assert found == pytest.approx(error * PX_PER_RAD * np.cos(np.deg2rad(15.0)), rel=0.06)
+
+
+def test_a_known_point_is_at_the_pixel_that_the_index_says(truth: Solution, tmp_path: Path) -> None:
+    write_mosaics(truth, tmp_path, NEAR)
+    index = json.loads((tmp_path / "mosaics.json").read_text())
+    assert [(e["kind"], e["stop"], e["camera"]) for e in index["mosaics"]] == [
+        ("cylinder", "A/1", "left"),
+        ("ground", "A/1", "left"),
+    ]
+    for entry in index["mosaics"]:
+        d = MARK_M - entry["origin_m"]
+        if entry["kind"] == "cylinder":
+            azimuth, elevation = np.rad2deg([np.arctan2(d[1], d[0]), np.arctan2(d[2], np.hypot(d[0], d[1]))])
+            column = (entry["left_azimuth_deg"] - azimuth) % 360 * entry["px_per_degree"]
+            row = (entry["top_elevation_deg"] - elevation) * entry["px_per_degree"]
+        else:
+            column = (MARK_M[0] - entry["left_x_m"]) / entry["m_per_px"]
+            row = (entry["top_y_m"] - MARK_M[1]) / entry["m_per_px"]
+        picture = cv2.imread(str(tmp_path / entry["files"]["refined"]), cv2.IMREAD_UNCHANGED)
+        assert picture.shape == (entry["height_px"], entry["width_px"])
+        dark = (picture > 0) & (picture < 40)
+        near = np.zeros_like(dark)
+        reach = 12
+        u, v = round(column), round(row)
+        near[v - reach : v + reach + 1, u - reach : u + reach + 1] = True
+        v_found, u_found = np.nonzero(dark & near)
+        assert (np.mean(u_found), np.mean(v_found)) == pytest.approx((column, row), abs=0.7)
+
+
+def test_projections_go_to_points_and_back(truth: Solution) -> None:
+    surface = stop_ground(truth, 0).surfaces["refined"]
+    u, v = np.array([3.0, 40.5, 90.0]), np.array([60.0, 33.25, 80.0])
+    cylinder = Cylinder(
+        origin_m=surface.origin_m, width_px=100, height_px=90, px_per_degree=1.5, left_deg=40.0, top_deg=-5.0
+    )
+    for projection in (cylinder, Ground.around(surface.origin_m, 4.0, 0.05)):
+        points = projection.points_m(surface, u, v)
+        assert projection.pixels(points) == pytest.approx(np.column_stack([u, v]), abs=1e-6)
+
+
+def test_exposures_are_evened_out(truth_made: StopMosaics, tmp_path: Path) -> None:
+    uneven = made(Scene(exposure=(1.5, 1.0, 0.7)), tmp_path)
+    same, other = (m.cylinder.pictures["refined"].astype(float) for m in (truth_made, uneven))
+    both = (same > 0) & (other > 0)
+    assert both.mean() > 0.5
+    thirds = np.array_split(np.arange(same.shape[1]), 3)
+    gap = [np.median((other - same)[:, c][both[:, c]]) for c in thirds]
+    assert np.ptp(gap) < 8  # of 255; unevened it would be a hundred
+
+
+def test_both_pointings_share_seams_and_exposure(tmp_path: Path) -> None:
+    pictures = made(Scene(error_rad=((2e-3, -2e-3),)), tmp_path).cylinder.pictures
+    assert pictures["telemetry"].shape == pictures["refined"].shape
+    # The last image stands where it stood: nothing of it changes but at its seam.
+    last = slice(-60, None)
+    assert np.mean(pictures["telemetry"][:, last] == pictures["refined"][:, last]) > 0.99
+    assert np.mean(pictures["telemetry"] == pictures["refined"]) < 0.9
+
+
+def test_a_panorama_that_goes_round_has_no_hole_and_no_cut(tmp_path: Path) -> None:
+    scene = Scene(pans_rad=tuple(np.deg2rad(np.arange(0, 360, 36.0))), points=8000)
+    whole = made(scene, tmp_path)
+    picture, projection = whole.cylinder.pictures["refined"], whole.cylinder.projection
+    assert isinstance(projection, Cylinder)
+    assert projection.closed
+    assert projection.width_px / projection.px_per_degree == pytest.approx(360)
+    middle = picture[picture.shape[0] // 4 : 3 * picture.shape[0] // 4]
+    assert (middle > 0).all()
+    step = np.abs(np.diff(middle.astype(float), axis=1)).mean()
+    cut = np.abs(middle[:, 0].astype(float) - middle[:, -1]).mean()
+    assert cut < 2 * step
+    pairs = {o.images for o in whole.seams.overlaps}
+    assert ("f0-left", "f9-left") in pairs
+    assert whole.seams.median_px("refined") < 0.03
+    assert whole.ground is not None
+    side = whole.ground.projection.height_px
+    ring = [whole.ground.pictures["refined"][v, side // 2] for v in range(0, side // 2 - 130, 20)]
+    assert min(ring) > 0
+
+
+def test_scale_is_limited_and_can_be_chosen(truth: Solution) -> None:
+    small = make_mosaics(truth, "A/1", "left", replace(NEAR, px_per_degree=1.0)).cylinder.projection
+    assert isinstance(small, Cylinder)
+    assert small.px_per_degree == pytest.approx(1.0)
+    narrow = make_mosaics(truth, "A/1", "left", replace(NEAR, max_width_px=100)).cylinder.projection
+    assert 90 <= narrow.width_px <= 100
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"px_per_degree": 0.0}, "px_per_degree: expected a number above 0, found 0.0"),
+        ({"ground_m_per_px": -1.0}, "ground_m_per_px: expected a number above 0"),
+        ({"ground_radius_m": 100.0}, "20000 pixels"),
+        ({"max_width_px": 50_000}, "found 50000"),
+    ],
+)
+def test_bad_options_are_refused(options: dict[str, Any], said: str) -> None:
+    with pytest.raises(InputError, match="MosaicOptions") as error:
+        MosaicOptions(**options)
+    assert said in str(error.value)
+
+
+def test_images_that_cannot_be_had_are_warned_of(tmp_path: Path) -> None:
+    solution = solved(Scene(pans_rad=tuple(np.deg2rad([60.0, 40.0, 20.0, 0.0, -20.0]))), tmp_path)
+    (tmp_path / "f0-left.png").unlink()
+    (tmp_path / "f1-left.png").write_bytes(b"no image")
+    cv2.imwrite(str(tmp_path / "f2-left.png"), np.ones((10, 12), np.uint8))
+    out = tmp_path / "out"
+    saved = without_file(solution, 3).save(out, mosaics=NEAR)
+    assert len(saved.warnings) == 4
+    for warning, (name, why) in zip(
+        sorted(saved.warnings),
+        [("f0", "found none"), ("f1", "that are none"), ("f2", "found 12 x 10"), ("f3", "it has no file")],
+        strict=True,
+    ):
+        assert warning.startswith(f"mosaic: image {name}-left is left out: ")
+        assert why in warning
+    index = json.loads((out / "mosaics" / "mosaics.json").read_text())
+    assert index["mosaics"][0]["images"] == ["f4-left"]
+    assert index["mosaics"][0]["seam_error"]["refined_px"] is None
+    assert "f0-left is left out" in (out / "report.html").read_text()
+    assert json.loads((out / "solution.json").read_text())["warnings"] == list(saved.warnings)
+
+
+def test_no_image_at_all_is_a_warning(tmp_path: Path) -> None:
+    solution = solved(Scene(pans_rad=(0.0,)), tmp_path)
+    (tmp_path / "f0-left.png").unlink()
+    saved = solution.save(tmp_path / "out", mosaics=NEAR)
+    (warning,) = saved.warnings
+    assert warning.startswith("mosaic: stop A/1, camera left: expected image files, found none that serve")
+    assert json.loads((tmp_path / "out" / "mosaics" / "mosaics.json").read_text())["mosaics"] == []
+    with pytest.raises(InputError, match="expected the id of a stop, found 'B'"):
+        make_mosaics(solution, "B", "left")
+
+
+def test_each_eye_has_its_mosaic_and_the_report_shows_them(tmp_path: Path) -> None:
+    solution = solved(Scene(pans_rad=(0.4, -0.1), cameras=("left", "right")), tmp_path)
+    out = tmp_path / "out"
+    told: list[tuple[str, int, int]] = []
+    solution.save(out, mosaics=NEAR, progress=lambda *said: told.append(said))
+    assert told == [("mosaics", 1, 2), ("mosaics", 2, 2)]
+    entries = json.loads((out / "mosaics" / "mosaics.json").read_text())["mosaics"]
+    assert [(e["camera"], e["kind"]) for e in entries] == [
+        ("left", "cylinder"),
+        ("left", "ground"),
+        ("right", "cylinder"),
+        ("right", "ground"),
+    ]
+    assert entries[0]["origin_m"] == entries[2]["origin_m"]
+    named = {f for e in entries for f in e["files"].values()} | {"mosaics.json"}
+    assert {p.name for p in (out / "mosaics").iterdir()} == named
+    assert {f.rsplit(".", 1)[1] for f in named} == {"png", "jpg", "json"}
+    page = (out / "report.html").read_text()
+    assert page.count('<figure class="blink"') == 2 * 3
+    assert page.count("seam error") >= 2
+    assert 'id="mosaic-blink"' in page
+
+
+def test_without_mosaics_nothing_is_different(truth: Solution, tmp_path: Path) -> None:
+    write_report(truth, tmp_path / "report.html")
+    assert "mosaic" not in (tmp_path / "report.html").read_text()
+    truth.save(tmp_path / "out", report=False)
+    assert not (tmp_path / "out" / "mosaics").exists()
+
+
+def test_older_mosaics_are_replaced_and_strangers_kept(truth: Solution, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    truth.save(out, report=False, mosaics=NEAR)
+    truth.save(out, report=False, mosaics=NEAR)
+    assert (out / "mosaics" / "mosaics.json").exists()
+    truth.save(out, report=False)
+    assert not (out / "mosaics").exists()
+    truth.save(out, report=False, mosaics=NEAR)
+    (out / "mosaics" / "mine.png").write_bytes(b"precious")
+    with pytest.raises(InputError, match=r"found other things in it: mosaics/mine\.png"):
+        check_out(out)
+    (out / "mosaics" / "mine.png").unlink()
+    check_out(out)
+    (out / "mosaics" / "mosaics.json").write_text("{}")
+    with pytest.raises(InputError, match="found other things in it: mosaics/"):
+        check_out(out)
+
+
+def test_a_failure_leaves_the_older_results_whole(
+    truth: Solution, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    truth.save(out, report=False, mosaics=NEAR)
+    before = sorted(p.relative_to(out) for p in out.rglob("*"))
+
+    def interrupted(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pancam_graph.images.mosaic._files.comparison", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        truth.save(out, report=False, mosaics=NEAR)
+    assert sorted(p.relative_to(out) for p in out.rglob("*")) == before
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.slow
+def test_opportunity_seams_are_at_least_halved(opportunity_folder: Path) -> None:
+    """Against telemetry on its own landmarks; an independent adjustment: 0.82 to 0.12, 0.46 to 0.19, 0.60 to 0.21."""
+    solution = solve(find_observations(read_pds(opportunity_folder)))
+    traverse = solution.traverse
+    seams = make_mosaics(solution, traverse.stops[0].id, traverse.images[0].camera).seams
+    assert len(seams.overlaps) == 3
+    for overlap in seams.overlaps:
+        assert len(overlap.azimuth_deg) >= 40
+        assert overlap.median_px("refined") < 0.21
+        assert overlap.median_px("refined") < 0.5 * overlap.median_px("telemetry_own_surface")
+        assert overlap.median_px("telemetry_own_surface") < overlap.median_px("telemetry")
+    assert seams.median_px("refined") < 0.25 * seams.median_px("telemetry_own_surface")
