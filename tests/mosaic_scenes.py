@@ -1,11 +1,13 @@
 """Images of a textured plane with known poses, for tests of mosaics."""
 
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from pancam_graph import Frame, Image, Observations, Solution, Stop, Traverse
 from pancam_graph.geometry import FloatArray
@@ -38,16 +40,21 @@ class Scene:
     )
 
 
+@lru_cache(maxsize=1)
+def _texture() -> NDArray[np.float32]:
+    noise = np.random.default_rng(5).normal(0, 1, (_ALONG, _ACROSS)).astype(np.float32)
+    joined = cv2.GaussianBlur(np.hstack([noise[:, -64:], noise, noise[:, :64]]), (0, 0), 10.0)
+    texture = joined[:, 64 : _ACROSS + 64 + 8]
+    return np.asarray(texture / texture.std(), dtype=np.float32)
+
+
 def brightness(xy_m: FloatArray) -> FloatArray:
     """Of the plane at places (n, 2): about as coarse as pixels are, at any distance from the mast."""
-    noise = np.random.default_rng(5).normal(0, 1, (_ALONG, _ACROSS)).astype(np.float32)
-    texture = cv2.GaussianBlur(np.hstack([noise, noise, noise]), (0, 0), 10.0)[:, _ACROSS : 2 * _ACROSS]
-    texture = np.hstack([texture, texture[:, :8]]) / texture.std()
     d = xy_m - PLACE_M[:2]
     column = (np.arctan2(d[:, 1], d[:, 0]) % (2 * np.pi)) / (2 * np.pi) * _ACROSS
     row = (np.log(np.hypot(d[:, 0], d[:, 1])) - np.log(0.3)) / np.log(100) * _ALONG
-    at = [a.astype(np.float32).reshape(-1, 1024 // 32) for a in (column, row)]
-    grey = 1000 + 250 * cv2.remap(texture, at[0], at[1], cv2.INTER_CUBIC).ravel()
+    at = [a.astype(np.float32).reshape(-1, 32) for a in (column, row)]
+    grey = 1000 + 250 * cv2.remap(_texture(), at[0], at[1], cv2.INTER_CUBIC).ravel()
     away = np.linalg.norm(xy_m - MARK_M[:2], axis=1) / MARK_RADIUS_M
     return np.where(away < 1, 100.0, grey)
 

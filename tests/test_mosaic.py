@@ -18,12 +18,14 @@ from pancam_graph.images.mosaic import (
     Cylinder,
     Ground,
     MosaicOptions,
+    Overlap,
     StopMosaics,
     make_mosaics,
     write_mosaics,
 )
 from pancam_graph.images.mosaic._make import stop_ground
 from pancam_graph.images.mosaic._phase import WINDOW_PX, displacements
+from pancam_graph.images.mosaic._surface import directions
 from pancam_graph.images.mosaic._warp import largest_gap
 from pancam_graph.io import check_out
 
@@ -57,9 +59,8 @@ def shifted(noise: float, shift: FloatArray, n: int = 40) -> tuple[NDArray[Any],
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.11, -0.07), (0.6, 0.8), (-2.4, 1.3), (12.0, -9.0)])
 def test_displacements_of_windows_are_found(shift: tuple[float, float]) -> None:
-    """Within 3 %: the taper stays where it is while the texture moves."""
     found = displacements(*shifted(0.0, np.array(shift)))
-    assert np.median(found.shift_px, axis=0) == pytest.approx(shift, abs=0.003 + 0.03 * np.hypot(*shift))
+    assert np.median(found.shift_px, axis=0) == pytest.approx(shift, abs=0.003 + 0.003 * np.hypot(*shift))
     assert found.coherence.min() > 0.6
 
 
@@ -108,25 +109,43 @@ def test_true_poses_leave_no_seam_error(truth_made: StopMosaics) -> None:
         assert overlap.windows == overlap.plain + overlap.unlike + len(overlap.azimuth_deg)
 
 
-def test_a_pan_error_is_the_seam_error(tmp_path: Path) -> None:
-    error = 4e-3
-    seams = made(Scene(error_rad=((0.0, 0.0), (error, 0.0))), tmp_path).seams
+def expected_shift(solution: Solution, row: int, overlap: Overlap) -> FloatArray:
+    """How far telemetry draws what an image shows from where it is, at the middles of windows, pixels.
+
+    Exact for the plane: from a direction to the ground, to the pixel that telemetry takes, to the ground
+    that this pixel really shows, and back to its direction.
+    """
+    azimuth, elevation = np.deg2rad(overlap.azimuth_deg), np.deg2rad(overlap.elevation_deg)
+    origin = solution.final.world_t_camera.mean(axis=0)
+    ray = directions(azimuth, elevation)
+    point = origin - ray * (origin[2] / ray[:, 2])[:, None]
+    start, end = solution.initial, solution.final
+    camera = solution.traverse.rig.eyes[0].camera
+    uv, valid = camera.project((point - start.world_t_camera[row]) @ start.world_R_camera[row])
+    assert valid.all()
+    ray = camera.unproject(uv).direction @ end.world_R_camera[row].T
+    shown = end.world_t_camera[row] - ray * (end.world_t_camera[row, 2] / ray[:, 2])[:, None] - origin
+    moved_azimuth = azimuth - np.arctan2(shown[:, 1], shown[:, 0])
+    moved_elevation = elevation - np.arctan2(shown[:, 2], np.hypot(shown[:, 0], shown[:, 1]))
+    right = -np.arctan2(np.sin(moved_azimuth), np.cos(moved_azimuth)) * np.cos(elevation)
+    return PX_PER_RAD * np.column_stack([right, -moved_elevation])
+
+
+@pytest.mark.parametrize("error", [(4e-3, 0.0), (0.0, -3e-3), (-2e-3, 5e-3)])
+def test_a_pointing_error_is_the_seam_error(tmp_path: Path, error: tuple[float, float]) -> None:
+    solution = solved(Scene(error_rad=((0.0, 0.0), error)), tmp_path)
+    seams = make_mosaics(solution, "A/1", "left", NEAR).seams
     assert seams.median_px("refined") < 0.03
-    for overlap, sign in zip(seams.overlaps[:2], (1, -1), strict=True):
-        level = np.cos(np.deg2rad(overlap.elevation_deg))
-        expected = -sign * error * PX_PER_RAD * level
-        assert overlap.shift_px["telemetry"][:, 0] == pytest.approx(expected, abs=0.1)
-        assert np.median(overlap.shift_px["telemetry"][:, 0]) == pytest.approx(np.median(expected), rel=0.05)
-        assert overlap.median_px("telemetry") == pytest.approx(np.median(np.abs(expected)), rel=0.06)
-
-
-def test_a_tilt_error_is_the_seam_error(tmp_path: Path) -> None:
-    error = 3e-3
-    seams = made(Scene(error_rad=((0.0, error),)), tmp_path).seams
-    (first,) = (o for o in seams.overlaps if o.images == ("f0-left", "f1-left"))
-    # Looking up by mistake puts the first image too high; the second is where it should be: lower.
-    found = np.median(first.shift_px["telemetry"][:, 1])
-    assert found == pytest.approx(error * PX_PER_RAD * np.cos(np.deg2rad(15.0)), rel=0.06)
+    sizes = []
+    for overlap in seams.overlaps:
+        if "f1-left" in overlap.images:
+            # The second image is displaced against the first: the wrong one is second, or first.
+            sign = 1 if overlap.images[1] == "f1-left" else -1
+            expected = sign * expected_shift(solution, 1, overlap)
+            assert overlap.shift_px["telemetry"] == pytest.approx(expected, abs=0.08)
+            sizes.append(np.linalg.norm(expected, axis=1))
+            assert overlap.median_px("telemetry") == pytest.approx(np.median(sizes[-1]), rel=0.04)
+    assert len(sizes) == 2
 
 
 def test_a_known_point_is_at_the_pixel_that_the_index_says(truth: Solution, tmp_path: Path) -> None:
@@ -147,9 +166,9 @@ def test_a_known_point_is_at_the_pixel_that_the_index_says(truth: Solution, tmp_
             row = (entry["top_y_m"] - MARK_M[1]) / entry["m_per_px"]
         picture = cv2.imread(str(tmp_path / entry["files"]["refined"]), cv2.IMREAD_UNCHANGED)
         assert picture.shape == (entry["height_px"], entry["width_px"])
-        dark = (picture > 0) & (picture < 40)
+        dark = (picture > 0) & (picture < 20)
         near = np.zeros_like(dark)
-        reach = 12
+        reach = 5
         u, v = round(column), round(row)
         near[v - reach : v + reach + 1, u - reach : u + reach + 1] = True
         v_found, u_found = np.nonzero(dark & near)
@@ -330,7 +349,7 @@ def test_a_failure_leaves_the_older_results_whole(
 
 @pytest.mark.slow
 def test_opportunity_seams_are_at_least_halved(opportunity_folder: Path) -> None:
-    """Against telemetry on its own landmarks; an independent adjustment: 0.82 to 0.12, 0.46 to 0.19, 0.60 to 0.21."""
+    """An independent adjustment went from 0.82 to 0.12, 0.46 to 0.19, 0.60 to 0.21 px."""
     solution = solve(find_observations(read_pds(opportunity_folder)))
     traverse = solution.traverse
     seams = make_mosaics(solution, traverse.stops[0].id, traverse.images[0].camera).seams

@@ -15,7 +15,8 @@ WINDOW_PX = 64
 
 _HIGHEST_FREQUENCY = 0.25
 """Cycles per pixel: above, cameras' optics and lossy compression leave little but noise."""
-_STEPS = 6
+_STEPS = 5
+_TURNS = 3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,36 +40,28 @@ def displacements(first: NDArray[Any], second: NDArray[Any]) -> Displacements:
     correlation takes a centroid about the peak, whose scatter on rover images, 0.17 px, is as large as what
     is to be measured here.
     """
-    n, side = len(first), WINDOW_PX
-    taper = np.hanning(side + 2)[1:-1]
-    window = taper[:, None] * taper
-    spectra = []
-    for image in (first, second):
-        grey = np.asarray(image, dtype=np.float64)
-        mean = np.einsum("nij,ij->n", grey, window) / window.sum()
-        spectra.append(np.fft.fft2((grey - mean[:, None, None]) * window))
-    cross = np.conj(spectra[0]) * spectra[1]
-    strength = np.abs(cross)
+    side = WINDOW_PX
     f = np.fft.fftfreq(side)
     low = np.hypot(f[:, None], f) <= _HIGHEST_FREQUENCY
     low[0, 0] = False
-
-    unit = np.where(low, cross / np.maximum(strength, 1e-30), 0.0)
-    peak = np.argmax(np.fft.ifft2(unit).real.reshape(n, -1), axis=1)
-    whole = np.column_stack([peak % side, peak // side]).astype(np.float64)
-    shift = (whole + side / 2) % side - side / 2
-
     omega = 2 * np.pi * np.column_stack([np.tile(f, (side, 1))[low], np.tile(f[:, None], (1, side))[low]])
-    cross, weight = cross[:, low], strength[:, low]
-    total = np.maximum(weight.sum(axis=1), 1e-30)
-    normal = np.einsum("nk,ki,kj->nij", weight, omega, omega) / total[:, None, None]
-    normal += 1e-12 * np.eye(2)
-    for _ in range(_STEPS):
-        phase = np.angle(cross * np.exp(1j * (shift @ omega.T)))
-        step = np.linalg.solve(
-            normal, (np.einsum("nk,nk,ki->ni", weight, phase, omega) / total[:, None])[..., None]
-        )
-        shift = shift - np.clip(step[..., 0], -1.0, 1.0)
+
+    shift: FloatArray = np.zeros((len(first), 2))
+    for turn in range(_TURNS):
+        # Tapers go along with the texture: between two that stand still it would seem to move less.
+        cross = np.conj(_spectrum(first, -0.5 * shift)) * _spectrum(second, 0.5 * shift)
+        if turn == 0:
+            shift = _peak(np.where(low, cross, 0.0))
+        cross = cross[:, low]
+        weight = np.abs(cross)
+        total = np.maximum(weight.sum(axis=1), 1e-30)
+        normal = np.einsum("nk,ki,kj->nij", weight, omega, omega) / total[:, None, None]
+        normal += 1e-12 * np.eye(2)
+        for _ in range(_STEPS):
+            phase = np.angle(cross * np.exp(1j * (shift @ omega.T)))
+            slope = np.einsum("nk,nk,ki->ni", weight, phase, omega) / total[:, None]
+            step = np.linalg.solve(normal, slope[..., None])
+            shift = shift - np.clip(step[..., 0], -1.0, 1.0)
     left = cross * np.exp(1j * (shift @ omega.T))
     coherence = np.abs(left.sum(axis=1)) / total
     # A phase's variance is taken to be as its weight's inverse. Half of the frequencies mirror the other
@@ -80,3 +73,23 @@ def displacements(first: NDArray[Any], second: NDArray[Any]) -> Displacements:
         sigma_px=np.sqrt(np.maximum(np.linalg.eigvalsh(variance)[:, -1], 0.0)),
         coherence=coherence,
     )
+
+
+def _spectrum(windows: NDArray[Any], shift_px: FloatArray) -> NDArray[np.complex128]:
+    """Spectra (n, 64, 64) of windows about the means of what their tapers, moved by shifts (n, 2), show."""
+    middle, half = 0.5 * (WINDOW_PX - 1), 0.5 * (WINDOW_PX + 1)
+    away = np.arange(WINDOW_PX) - middle - np.clip(shift_px, -0.5 * half, 0.5 * half)[..., None]
+    hann = np.where(np.abs(away) < half, np.cos(0.5 * np.pi * away / half) ** 2, 0.0)
+    taper = hann[:, 1, :, None] * hann[:, 0, None, :]
+    grey = np.asarray(windows, dtype=np.float64)
+    mean = np.einsum("nij,nij->n", grey, taper) / taper.sum(axis=(1, 2))
+    return np.asarray(np.fft.fft2((grey - mean[:, None, None]) * taper))
+
+
+def _peak(cross: NDArray[np.complex128]) -> FloatArray:
+    """Whole shifts (n, 2) at which the normalised cross-power spectra (n, 64, 64) correlate best."""
+    side = WINDOW_PX
+    unit = cross / np.maximum(np.abs(cross), 1e-30)
+    peak = np.argmax(np.fft.ifft2(unit).real.reshape(len(cross), -1), axis=1)
+    whole = np.column_stack([peak % side, peak // side]).astype(np.float64)
+    return (whole + side / 2) % side - side / 2
