@@ -53,7 +53,7 @@ def brightness(xy_m: FloatArray) -> FloatArray:
     d = xy_m - PLACE_M[:2]
     column = (np.arctan2(d[:, 1], d[:, 0]) % (2 * np.pi)) / (2 * np.pi) * _ACROSS
     row = (np.log(np.hypot(d[:, 0], d[:, 1])) - np.log(0.3)) / np.log(100) * _ALONG
-    at = [a.astype(np.float32).reshape(-1, 32) for a in (column, row)]
+    at = [a.astype(np.float32).reshape(-1, 64) for a in (column, row)]
     grey = 1000 + 250 * cv2.remap(_texture(), at[0], at[1], cv2.INTER_CUBIC).ravel()
     away = np.linalg.norm(xy_m - MARK_M[:2], axis=1) / MARK_RADIUS_M
     return np.where(away < 1, 100.0, grey)

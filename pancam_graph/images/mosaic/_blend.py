@@ -17,7 +17,7 @@ _SEAM_PIXELS = 1.5e6
 """Seams are sought in layers shrunk until they have about this many pixels together."""
 _DARK, _BRIGHT = 0.003, 0.997
 """Shares of the pixels that become the darkest and the brightest of 8 bits."""
-_BANDS = 4
+_BANDS = 7
 _NO_GAIN = 1.0
 """How many pixels of an overlap the prior for a gain of 1 counts as much as."""
 _LEAST_COMMON = 50

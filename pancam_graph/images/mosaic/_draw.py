@@ -144,7 +144,7 @@ def _draw_circles(picture: Picture, projection: Ground, scale: float) -> None:
     cv2.addWeighted(layer, 0.6, picture, 0.4, 0, dst=picture)
     cv2.drawMarker(picture, middle, (0, 94, 213), cv2.MARKER_CROSS, 18, 2)
     for r in rings:  # between two lines of azimuth, where nothing else is written
-        d = np.array([np.cos(np.deg2rad(-15)), -np.sin(np.deg2rad(-15))]) * float(r) * per_m
+        d = np.array([np.cos(np.deg2rad(-15)), -np.sin(np.deg2rad(-15))]) * (float(r) * per_m - 22)
         _write_over(picture, f"{r:g} m", np.array(centre) + d)
     for azimuth in range(0, 360, 30):
         d = np.array([np.cos(np.deg2rad(azimuth)), -np.sin(np.deg2rad(azimuth))])
