@@ -1,6 +1,7 @@
 """Mosaics: right place, right brightness, and a seam error that is the pointing error."""
 
 import json
+import runpy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import pytest
 from mosaic_scenes import MARK_M, PLACE_M, PX_PER_RAD, Scene, solved, without_file
 from numpy.typing import NDArray
 
-from pancam_graph import Solution, find_observations, read_pds, solve, write_report
+from pancam_graph import Solution, find_observations, read_pds, solve, write_report, write_traverse
 from pancam_graph.errors import InputError
 from pancam_graph.geometry import FloatArray
 from pancam_graph.images.mosaic import (
@@ -303,6 +304,29 @@ def test_each_eye_has_its_mosaic_and_the_report_shows_them(tmp_path: Path) -> No
     assert page.count('<figure class="blink"') == 2 * 3
     assert page.count("seam error") >= 2
     assert 'id="mosaic-blink"' in page
+
+
+def test_the_program_writes_mosaics_when_asked(
+    scripts_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = Scene(error_rad=((1e-3, -1e-3), (-1e-3, 1.5e-3)), points=400)
+    write_traverse(solved(scene, tmp_path).traverse, tmp_path)
+    (tmp_path / "f2-left.png").write_bytes(b"no image")
+    program = str(scripts_folder / "optimize_traverse.py")
+    for asked in ([], ["--mosaic"]):
+        arguments = [program, str(tmp_path), "--out", str(tmp_path / "out"), "--no-report", *asked]
+        monkeypatch.setattr("sys.argv", arguments)
+        with pytest.raises(SystemExit) as ended:
+            runpy.run_path(program, run_name="__main__")
+        assert ended.value.code == 0, capsys.readouterr().err
+        assert (tmp_path / "out" / "mosaics").is_dir() == bool(asked)
+    entry = json.loads((tmp_path / "out" / "mosaics" / "mosaics.json").read_text())["mosaics"][0]
+    assert entry["images"] == ["f0-left", "f1-left"]
+    seams = entry["seam_error"]
+    assert seams["refined_px"] < 0.1
+    assert seams["telemetry_px"] > 0.3
+    warnings = json.loads((tmp_path / "out" / "solution.json").read_text())["warnings"]
+    assert any(w.startswith("mosaic: image f2-left is left out: ") for w in warnings)
 
 
 def test_without_mosaics_nothing_is_different(truth: Solution, tmp_path: Path) -> None:
