@@ -1,8 +1,8 @@
 """Refine a rover traverse: mast poses, pointing and terrain points from images taken by a camera mast.
 
 TRAVERSE is a folder with traverse.json, or a folder of rover images with PDS labels (MER, MSL,
-Mars 2020). OUT gets solution.json, points.ply, residuals.csv and report.html; an older OUT is
-replaced once the new results are complete.
+Mars 2020). OUT gets solution.json, points.ply, residuals.csv and report.html, and with
+--mosaic a folder of mosaics; an older OUT is replaced once the new results are complete.
 
 Exit status: 0 solved, 1 not converged (results are written), 2 bad input (nothing is written).
 """

@@ -156,8 +156,8 @@ def _cylinder(
     rows, cell_deg = np.flatnonzero(seen.any(axis=1)), STEP_PX / sphere.px_per_degree
     start, gap = largest_gap(np.any(seen[:, : sphere.width_px // STEP_PX], axis=0))
     left_deg = sphere.left_deg - (start + gap) * cell_deg
-    top_deg = sphere.top_deg - float(rows[0]) * cell_deg if len(rows) else sphere.top_deg
-    height_deg = min((len(rows) and int(rows[-1] - rows[0]) + 1) * cell_deg, top_deg + 90)
+    top_deg = sphere.top_deg - float(rows[0]) * cell_deg
+    height_deg = min((int(rows[-1] - rows[0]) + 1) * cell_deg, top_deg + 90)
     width_deg = 360 - gap * cell_deg
     # What is seen is known to a few cells; drawn once, it is known to the pixel.
     scale = min(options.px_per_degree or native, options.max_width_px / max(width_deg, height_deg))
