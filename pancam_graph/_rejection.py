@@ -50,11 +50,13 @@ def screen(
     *,
     cutoff_sigma: float,
     min_scale: float,
+    scale: float | None = None,
 ) -> Screening:
     """Reject and re-admit observations with all cameras held.
 
     `accepted` (n,) is where to start. An observation goes when its test exceeds the chi-square quantile
-    that a Gaussian exceeds beyond `cutoff_sigma`, in units of a robust scale that is at least `min_scale`.
+    that a Gaussian exceeds beyond `cutoff_sigma`, in units of a robust scale that is at least `min_scale`, or
+    of `scale` where these are not all, but those that look wrong.
     Of a track with two observations that disagree both go, for nothing tells which is wrong.
     """
     seen, n, n_landmarks = seen_by(measurements, views), len(measurements.image), measurements.n_landmarks
@@ -68,7 +70,7 @@ def screen(
     lost, changed = np.empty(n_landmarks, dtype=bool), np.empty(n_landmarks, dtype=bool)
     tail = erfc(cutoff_sigma / np.sqrt(2.0))  # of a Gaussian beyond the cutoff, on either side
     limit = np.array([np.inf, chdtri(1, tail), chdtri(2, tail)])
-    scale = min_scale
+    known, scale = scale, min_scale if scale is None else scale
     which = np.arange(n_landmarks)
     fresh = np.flatnonzero(np.minimum.reduceat(weight, starts) > 0)
     for sweep in range(_SWEEPS):
@@ -89,7 +91,7 @@ def screen(
         over_landmarks(kernel.free_derivatives, which, begin, vector, b)
         over_landmarks(kernel.cofactors, which, begin, b, weight, cofactor)
         over_landmarks(kernel.tests, which, begin, residual, cofactor, test, freedom)
-        if sweep == 0:
+        if sweep == 0 and known is None:
             counts = (weight > 0) & in_front
             scale = max(min_scale, _robust_scale(test[counts], freedom[counts]))
         over_landmarks(

@@ -11,4 +11,5 @@ from pancam_graph.graph._projective import ProjectiveTemplate as ProjectiveTempl
 from pancam_graph.graph._rig_variables import RigVariables as RigVariables
 from pancam_graph.graph._soft import SoftTemplate as SoftTemplate
 from pancam_graph.graph._template import FactorTemplate as FactorTemplate
+from pancam_graph.graph._template import diagonal_noise as diagonal_noise
 from pancam_graph.graph._template import read_variable as read_variable

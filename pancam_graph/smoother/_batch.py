@@ -1,0 +1,57 @@
+"""The whole drive at once, as `solve` takes it: where iSAM2's steps are no good, and for results."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+
+from pancam_graph._eliminated import EliminatedSolver
+from pancam_graph._problem import Problem
+from pancam_graph.graph import HardTemplate
+from pancam_graph.landmarks import Landmarks
+from pancam_graph.smoother._map import DriveMap
+from pancam_graph.stopping import StopRule
+from pancam_graph.traverse import Traverse
+
+__all__ = ["solved_anew", "whole_problem", "whole_traverse"]
+
+
+def whole_traverse(drive: DriveMap) -> Traverse:
+    """All stops with all observations, in the order in which they were added."""
+    parts = [s.traverse for s in drive.stations]
+    return Traverse(
+        name="",
+        rig=parts[0].rig,
+        stops=tuple(stop for t in parts for stop in t.stops),
+        frames=tuple(frame for t in parts for frame in t.frames),
+        images=tuple(image for t in parts for image in t.images),
+        observations=drive.ledger.observations if len(drive.ledger) else None,
+    )
+
+
+def whole_problem(drive: DriveMap, values: gtsam.Values) -> Problem:
+    """What is used of the drive, landmarks as they were linearised last."""
+    placed, factors = drive.whole(), gtsam.NonlinearFactorGraph()
+    for factor in drive.factors(firm=True):
+        factors.push_back(factor)
+    template = HardTemplate(whole_traverse(drive), drive.stations[0].template.rig_variables.sharing)
+    return Problem(
+        template=template,
+        factors=factors,
+        measurements=placed.measurements,
+        accepted=np.ones(len(placed.measurements.row), dtype=bool),
+        values=values,
+        landmarks=placed.landmarks,
+    )
+
+
+def solved_anew(drive: DriveMap, values: gtsam.Values) -> gtsam.Values:
+    """The optimum near values by Levenberg-Marquardt; landmarks of the blocks are put there too."""
+    problem = whole_problem(drive, values).placed()
+    found, _ = EliminatedSolver(None, is_near=True).adjust(problem, StopRule())
+    track = drive.whole().track
+    for block in drive.blocks.values():
+        at = np.searchsorted(track, block.placed.track)
+        landmarks = Landmarks(vector=found.landmarks.vector[at], origin_m=found.landmarks.origin_m[at])
+        block.replace(replace(block.placed, landmarks=landmarks))
+    return found.values

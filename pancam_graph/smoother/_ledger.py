@@ -1,0 +1,134 @@
+"""All observations ever given, and what became of each."""
+
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pancam_graph.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.traverse import Observations
+
+__all__ = ["Fate", "Ledger"]
+
+
+class Fate(IntEnum):
+    """What became of an observation."""
+
+    WAITING = 0
+    """Its track was seen once: one ray places nothing."""
+    USED = 1
+    OUTLIER = 2
+    OUTSIDE = 3
+    """Outside the domain of its camera model."""
+    CLOSURE = 4
+    """Of a loop closure that is not believed."""
+    REMOVED = 5
+
+
+_COLUMNS: dict[str, tuple[tuple[int, ...], type]] = {
+    "image": ((), np.int64),
+    "track": ((), np.int64),
+    "uv_px": ((2,), np.float64),
+    "sigma_px": ((), np.float64),
+    "covariance_px2": ((2, 2), np.float64),
+    "carried_px": ((2,), np.float64),
+    "whitening": ((2, 2), np.float64),
+    "fate": ((), np.int8),
+}
+
+
+class Ledger:
+    """Columns of equal length that grow; a row never moves."""
+
+    def __init__(self) -> None:
+        self._n = 0
+        self._column = {name: np.zeros((1024, *shape), dtype) for name, (shape, dtype) in _COLUMNS.items()}
+        self.has_covariances = False
+
+    def __len__(self) -> int:
+        """Number of observations."""
+        return self._n
+
+    def append(
+        self,
+        image: IntArray,
+        observations: Observations,
+        carried_px: FloatArray,
+        whitening: FloatArray,
+        valid: BoolArray,
+    ) -> IntArray:
+        """Add observations of images (n,) of the drive, carried to pinholes; their rows (n,)."""
+        n, new = len(observations), np.zeros(0)
+        rows = np.arange(self._n, self._n + n)
+        for name, column in self._column.items():
+            if len(column) < self._n + n:
+                new = np.zeros((max(2 * len(column), self._n + n), *column.shape[1:]), column.dtype)
+                new[: self._n] = column[: self._n]
+                self._column[name] = new
+        self._n += n
+        covariance = observations.covariance_px2
+        self.has_covariances |= covariance is not None
+        if covariance is None:
+            covariance = np.square(observations.sigma_px)[:, None, None] * np.eye(2)
+        fate = np.where(valid, int(Fate.WAITING), int(Fate.OUTSIDE))
+        of = observations
+        for name, part in zip(
+            _COLUMNS,
+            (image, of.track, of.uv_px, of.sigma_px, covariance, carried_px, whitening, fate),
+            strict=True,
+        ):
+            self._column[name][rows] = part
+        return rows
+
+    def _all(self, name: str) -> NDArray[Any]:
+        return self._column[name][: self._n]
+
+    @property
+    def image(self) -> IntArray:
+        """(n,) row among the drive's images"""
+        return self._all("image")
+
+    @property
+    def track(self) -> IntArray:
+        """(n,)"""
+        return self._all("track")
+
+    @property
+    def carried_px(self) -> FloatArray:
+        """(n, 2) pixels of the pinhole of the same camera"""
+        return self._all("carried_px")
+
+    @property
+    def whitening(self) -> FloatArray:
+        """(n, 2, 2) takes a residual of the pinhole to raw pixels of unit covariance"""
+        return self._all("whitening")
+
+    @property
+    def fate(self) -> NDArray[np.int8]:
+        """(n,) of Fate; may be written to"""
+        return self._all("fate")
+
+    @property
+    def observations(self) -> Observations:
+        """As they were given, images counted over the whole drive."""
+        covariance = self._all("covariance_px2").copy() if self.has_covariances else None
+        return Observations(
+            image=self.image.copy(),
+            track=self.track.copy(),
+            uv_px=self._all("uv_px").copy(),
+            sigma_px=self._all("sigma_px").copy(),
+            covariance_px2=covariance,
+        )
+
+    def with_fate(self, rows: IntArray, fate: Fate) -> IntArray:
+        """Which of the rows have this fate."""
+        return rows[self.fate[rows] == int(fate)]
+
+    def all_with(self, fate: Fate) -> IntArray:
+        """All rows that have this fate."""
+        return np.flatnonzero(self.fate == int(fate))
+
+    def set_fate(self, rows: IntArray, fate: Fate) -> None:
+        """Say what became of some."""
+        self.fate[rows] = int(fate)

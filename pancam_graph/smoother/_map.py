@@ -1,0 +1,183 @@
+"""What a drive consists of: stations, observations, and landmarks in blocks by the stop that saw them first."""
+
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+
+from pancam_graph.geometry import BoolArray, IntArray
+from pancam_graph.smoother._block import LandmarkBlock
+from pancam_graph.smoother._ledger import Fate, Ledger
+from pancam_graph.smoother._placing import Placed, Seen, believed, combined, gathered, placed_anew
+from pancam_graph.smoother._station import Patch, Postures, Station
+
+__all__ = ["Change", "DriveMap"]
+
+
+@dataclass(kw_only=True)
+class Change:
+    """What an update has done to the blocks before they are linearised."""
+
+    touched: set[int] = field(default_factory=set)
+    """Blocks with other observations than before."""
+    slots: list[int] = field(default_factory=list)
+    """Factors of iSAM2 whose blocks are no more."""
+    rejected: int = 0
+
+
+class DriveMap:
+    """Stations, observations and blocks. A block is named by the number of the station that saw it first."""
+
+    def __init__(self, outlier_sigma: float | None) -> None:
+        self._outlier_sigma = outlier_sigma
+        self.stations: list[Station] = []
+        self.ledger = Ledger()
+        self.blocks: dict[int, LandmarkBlock] = {}
+        self.image_station = np.zeros(0, dtype=np.int64)
+        """(images,) of the whole drive"""
+        self._track, self._home = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+
+    def add(self, station: Station) -> None:
+        """Add a station; its number is that of stations so far."""
+        self.stations.append(station)
+        own = np.full(len(station.traverse.images), station.number)
+        self.image_station = np.concatenate([self.image_station, own])
+
+    def factors(self, *, firm: bool) -> list[gtsam.NonlinearFactor]:
+        """All factors but those of landmarks; see `Station.factors`."""
+        shared = self.stations[0].shared_priors() if self.stations else []
+        return [*shared, *(factor for s in self.stations for factor in s.factors(firm=firm))]
+
+    def station_of(self, rows: IntArray) -> IntArray:
+        """Station (n,) of rows of the ledger."""
+        return self.image_station[self.ledger.image[rows]]
+
+    def home(self, track: IntArray) -> IntArray:
+        """Block (n,) of tracks; -1 for those without a place."""
+        at = np.searchsorted(self._track, track).clip(max=max(len(self._track) - 1, 0))
+        if not len(self._track):
+            return np.full(len(track), -1)
+        return np.where(self._track[at] == track, self._home[at], -1)
+
+    def near(self, number: int) -> set[int]:
+        """Stations that share landmarks with one, itself among them."""
+        out = {number}
+        for block in self.blocks.values():
+            if number in block.patch.place:
+                out |= block.patch.place.keys()
+        return out
+
+    def idle(self, track: IntArray, *fates: Fate) -> IntArray:
+        """Rows of tracks that have one of these fates."""
+        rows = np.concatenate([self.ledger.all_with(fate) for fate in fates])
+        return rows[np.isin(self.ledger.track[rows], track)]
+
+    def take_in(self, rows: IntArray, cameras: Postures, change: Change, but: IntArray) -> None:
+        """Landmarks get observations, or are born of them; what waited for a second ray takes part too.
+
+        `but` are rows that shall go on waiting.
+        """
+        ledger = self.ledger
+        track = np.unique(ledger.track[rows])
+        rows = np.union1d(rows, np.setdiff1d(self.idle(track, Fate.WAITING, Fate.OUTLIER), but))
+        own, station = np.searchsorted(track, ledger.track[rows]), self.station_of(rows)
+        home = self.home(track)
+        known = home >= 0
+        fits = ledger.fate[rows] != int(Fate.OUTLIER)
+        enough = np.bincount(own, fits, minlength=len(track)) >= 2
+        first = np.full(len(track), len(self.stations))
+        np.minimum.at(first, own, station)
+        home = np.where(known, home, np.where(enough, first, -1))
+        of_row = home[own]
+        for name in np.unique(of_row[of_row >= 0]).tolist():
+            self._rebuild(name, rows[of_row == name], np.zeros(0, dtype=np.int64), cameras, change)
+
+    def give_up(self, rows: IntArray, cameras: Postures, change: Change) -> None:
+        """Landmarks lose observations, whose fate has been set; others that these had ruled out may come back."""
+        ledger = self.ledger
+        track = np.unique(ledger.track[rows])
+        idle = self.idle(track, Fate.OUTLIER)
+        home, home_idle = self.home(ledger.track[rows]), self.home(ledger.track[idle])
+        for name in np.unique(home[home >= 0]).tolist():
+            self._rebuild(name, idle[home_idle == name], rows[home == name], cameras, change)
+
+    def _rebuild(self, name: int, rows: IntArray, lost: IntArray, cameras: Postures, change: Change) -> None:
+        ledger, block = self.ledger, self.blocks.pop(name, None)
+        before = () if block is None else block.patch.stations
+        more = np.setdiff1d(self.station_of(rows), [s.number for s in before])
+        patch = (
+            Patch([*before, *(self.stations[i] for i in more)]) if len(more) or block is None else block.patch
+        )
+        known = None if block is None else block.placed
+        if block is not None and block.slot >= 0:
+            change.slots.append(block.slot)
+        seen = gathered(ledger, self.image_station, patch, known, rows, lost)
+        if len(seen.placed.track):
+            views = patch.views(cameras)
+            seen = believed(placed_anew(seen, views), views, self._outlier_sigma)
+            self._settle(name, seen, change)
+        change.touched.discard(name)
+        if name in self.blocks:
+            change.touched.add(name)
+
+    def _settle(self, name: int, seen: Seen, change: Change) -> None:
+        """Say what became of observations, and make the block of what is left."""
+        placed, accepted, ledger = seen.placed, seen.accepted, self.ledger
+        m = placed.measurements
+        stays = np.bincount(m.landmark, accepted, minlength=m.n_landmarks) >= 2
+        used = accepted & stays[m.landmark]
+        before = ledger.fate[m.row]
+        ledger.fate[m.row] = np.where(
+            used, int(Fate.USED), np.where(accepted, int(Fate.WAITING), int(Fate.OUTLIER))
+        )
+        change.rejected += int(np.sum(~accepted & (before != int(Fate.OUTLIER))))
+        self._set_home(placed.track[~stays], -1)
+        self._set_home(placed.track[stays], name)
+        if stays.any():
+            self.blocks[name] = LandmarkBlock(placed.part(stays, used))
+
+    def _set_home(self, track: IntArray, name: int) -> None:
+        at = np.searchsorted(self._track, track)
+        known = np.zeros(len(track), dtype=bool)
+        if len(self._track):
+            known = self._track[at.clip(max=len(self._track) - 1)] == track
+        self._home[at[known]] = name
+        self._track = np.insert(self._track, at[~known], track[~known])
+        self._home = np.insert(self._home, at[~known], name)
+
+    def seen_from(self, track: IntArray, stations: set[int]) -> BoolArray:
+        """(n,) whether known tracks are seen from any of some stations; False of unknown ones."""
+        out, home = np.zeros(len(track), dtype=bool), self.home(track)
+        for name in np.unique(home[home >= 0]).tolist():
+            block, own = self.blocks[name], np.flatnonzero(home == name)
+            if block.patch.place.keys() <= stations:
+                out[own] = True
+                continue
+            placed = block.placed
+            of_image = np.repeat(
+                [s.number in stations for s in block.patch.stations], np.diff(block.patch.image_begin)
+            )
+            m = placed.measurements
+            any_of = np.bincount(m.landmark, of_image[m.image], minlength=m.n_landmarks) > 0
+            out[own] = any_of[np.searchsorted(placed.track, track[own])]
+        return out
+
+    def excerpt(self, track: IntArray, rows: IntArray, free: Station) -> Seen:
+        """Some tracks (ascending) with all their observations, and new rows, as if one station alone moved."""
+        home = self.home(track)
+        parts = []
+        for name in np.unique(home[home >= 0]).tolist():
+            placed = self.blocks[name].placed
+            which = np.isin(placed.track, track, assume_unique=True)
+            parts.append(placed.part(which, which[placed.measurements.landmark]))
+        images = [p.measurements.row for p in parts]
+        numbers = np.unique(np.concatenate([self.station_of(r) for r in (rows, *images)]))
+        stations = [self.stations[i] for i in numbers if i != free.number]
+        patch = Patch([*stations, free], free)
+        known = combined(self.ledger, self.image_station, patch, parts) if parts else None
+        return gathered(self.ledger, self.image_station, patch, known, rows, rows[:0])
+
+    def whole(self) -> Placed:
+        """All landmarks, as all stations see them."""
+        parts = [block.placed for block in self.blocks.values()]
+        return combined(self.ledger, self.image_station, Patch(self.stations), parts)

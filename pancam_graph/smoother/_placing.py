@@ -1,0 +1,213 @@
+"""Landmarks seen again or for the first time: where they are, and which of their observations to believe."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import chdtri, erfc
+
+from pancam_graph._rejection import screen
+from pancam_graph.geometry import BoolArray, IntArray
+from pancam_graph.landmarks import (
+    CameraViews,
+    Landmarks,
+    Measurements,
+    rays_of,
+    refine,
+    residuals,
+    triangulate,
+)
+from pancam_graph.smoother._ledger import Fate, Ledger
+from pancam_graph.smoother._station import Patch
+
+__all__ = ["Placed", "Seen", "believed", "combined", "gathered", "placed_anew"]
+
+_FEW_VIEWS = 4
+"""Landmarks with no more observations may hide an outlier in residuals that are all small."""
+_HIDDEN = 3.0
+"""Others hide none in residuals whose squares are so many times below the limit."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Placed:
+    """Landmarks with their observations, as a patch of stations sees them."""
+
+    patch: Patch
+    track: IntArray
+    """(landmarks,) ascending"""
+    measurements: Measurements
+    """Their `row` is that of the ledger."""
+    landmarks: Landmarks
+
+    def part(self, which: BoolArray, rows: BoolArray) -> "Placed":
+        """Some landmarks (landmarks,) with some of their observations (n,), at least one of each."""
+        return Placed(
+            patch=self.patch,
+            track=self.track[which],
+            measurements=self.measurements.part(np.flatnonzero(rows & which[self.measurements.landmark])),
+            landmarks=Landmarks(vector=self.landmarks.vector[which], origin_m=self.landmarks.origin_m[which]),
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Seen:
+    """Landmarks of which some are seen anew."""
+
+    placed: Placed
+    touched: BoolArray
+    """(landmarks,) that have new observations, or lost some"""
+    fresh: BoolArray
+    """(landmarks,) that had no place before"""
+    accepted: BoolArray
+    """(n,)"""
+
+
+def combined(ledger: Ledger, image_station: IntArray, patch: Patch, parts: Sequence[Placed]) -> Placed:
+    """Landmarks of several blocks together, as another patch sees them."""
+    track = np.concatenate([p.track for p in parts])
+    order = np.argsort(track)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    begin = np.cumsum([0, *(len(p.track) for p in parts)])
+    landmark = np.concatenate([rank[b + p.measurements.landmark] for b, p in zip(begin, parts, strict=False)])
+    row = np.concatenate([p.measurements.row for p in parts])
+    return Placed(
+        patch=patch,
+        track=track[order],
+        measurements=_measurements(ledger, image_station, patch, row, landmark),
+        landmarks=Landmarks(
+            vector=np.concatenate([p.landmarks.vector for p in parts])[order],
+            origin_m=np.concatenate([p.landmarks.origin_m for p in parts])[order],
+        ),
+    )
+
+
+def _measurements(
+    ledger: Ledger, image_station: IntArray, patch: Patch, row: IntArray, landmark: IntArray
+) -> Measurements:
+    """Rows of the ledger (n,) that see landmarks (n,), sorted by these and then by image."""
+    image = ledger.image[row]
+    image = patch.image(image, image_station[image])
+    # Mostly runs that are in order already: a stable sort merges them.
+    order = np.argsort(landmark * int(patch.image_begin[-1]) + image, kind="stable")
+    row = row[order]
+    return Measurements(
+        row=row,
+        image=image[order],
+        landmark=landmark[order],
+        uv_px=ledger.carried_px.take(row, axis=0),
+        whitening=ledger.whitening.take(row, axis=0),
+    )
+
+
+def gathered(
+    ledger: Ledger,
+    image_station: IntArray,
+    patch: Patch,
+    known: Placed | None,
+    rows: IntArray,
+    lost: IntArray,
+) -> Seen:
+    """Known landmarks, less rows of the ledger that they lose, and new rows, be they of these tracks or others.
+
+    Rows that are outliers take part as such.
+    """
+    new, gone = ledger.track[rows], np.unique(ledger.track[lost])
+    if known is not None and len(lost):
+        stay = ~np.isin(known.measurements.row, lost)
+        left = np.bincount(known.measurements.landmark, stay, minlength=len(known.track)) > 0
+        known = known.part(left, stay) if left.any() else None
+    none = np.zeros(0, dtype=np.int64)
+    old_track = none if known is None else known.track
+    track = np.union1d(old_track, new)
+    at = np.searchsorted(track, old_track)
+    old = none if known is None else known.measurements.row
+    old_landmark = none if known is None else at[known.measurements.landmark]
+    all_rows = np.concatenate([old, rows])
+    landmark = np.concatenate([old_landmark, np.searchsorted(track, new)])
+    vector, origin = np.zeros((len(track), 4)), np.zeros((len(track), 3))
+    fresh, touched = np.ones(len(track), dtype=bool), np.zeros(len(track), dtype=bool)
+    touched[np.searchsorted(track, new)] = True
+    touched |= np.isin(track, gone)
+    if known is not None:
+        vector[at], origin[at], fresh[at] = known.landmarks.vector, known.landmarks.origin_m, False
+    measurements = _measurements(ledger, image_station, patch, all_rows, landmark)
+    return Seen(
+        placed=Placed(
+            patch=patch,
+            track=track,
+            measurements=measurements,
+            landmarks=Landmarks(vector=vector, origin_m=origin),
+        ),
+        touched=touched,
+        fresh=fresh,
+        accepted=ledger.fate[measurements.row] != int(Fate.OUTLIER),
+    )
+
+
+def placed_anew(seen: Seen, views: CameraViews) -> Seen:
+    """Fresh landmarks from their rays, and all that are touched where they fit best with cameras as they are."""
+    placed = seen.placed
+    m, landmarks, weight = placed.measurements, placed.landmarks, seen.accepted.astype(float)
+    if seen.fresh.any():
+        rows = np.flatnonzero(seen.fresh[m.landmark])
+        part = m.part(rows)
+        found = triangulate(*rays_of(part, views), part.landmark, weight[rows])
+        vector, origin = landmarks.vector.copy(), landmarks.origin_m.copy()
+        vector[seen.fresh], origin[seen.fresh] = found.vector, found.origin_m
+        landmarks = Landmarks(vector=vector, origin_m=origin)
+    which = np.flatnonzero(seen.touched)
+    landmarks = refine(landmarks, m, views, weight, beyond_infinity=True, only=which)
+    return replace(seen, placed=replace(placed, landmarks=landmarks))
+
+
+def believed(seen: Seen, views: CameraViews, cutoff_sigma: float | None) -> Seen:
+    """Touched landmarks without the observations that contradict the others; see `_rejection.screen`.
+
+    Only those that may hide an outlier are looked at. Observations of landmarks behind their camera go.
+    """
+    placed = seen.placed
+    m, n = placed.measurements, placed.measurements.n_landmarks
+    whitened, in_front = residuals(placed.landmarks, m, views)
+    if cutoff_sigma is None:
+        return replace(seen, accepted=seen.accepted & (in_front | ~seen.touched[m.landmark]))
+    weight = seen.accepted.astype(float)
+    square = weight * np.sum(whitened**2, axis=1)
+    total, count = np.bincount(m.landmark, square, minlength=n), np.bincount(m.landmark, weight, minlength=n)
+    largest = np.maximum.reduceat(square, m.starts)
+    tail = erfc(cutoff_sigma / np.sqrt(2.0))
+    limit = float(chdtri(1, tail))
+    suspect = (total >= limit) & ((count <= _FEW_VIEWS) | (largest * _HIDDEN >= limit))
+    suspect |= np.bincount(m.landmark, ~in_front | ~seen.accepted, minlength=n) > 0
+    suspect &= seen.touched
+    if not suspect.any():
+        return seen
+    judged = seen.touched & (count > 2)
+    scale = float(np.sqrt(np.median(total[judged] / (2 * count[judged] - 3)))) if judged.any() else 1.0
+    rows = np.flatnonzero(suspect[m.landmark])
+    part = m.part(rows)
+    screening = screen(
+        Landmarks(vector=placed.landmarks.vector[suspect], origin_m=placed.landmarks.origin_m[suspect]),
+        part,
+        views,
+        seen.accepted[rows],
+        cutoff_sigma=cutoff_sigma,
+        min_scale=1.0,
+        scale=max(1.0, scale),
+    )
+    accepted, vector, origin = (
+        seen.accepted.copy(),
+        placed.landmarks.vector.copy(),
+        placed.landmarks.origin_m.copy(),
+    )
+    accepted[rows] = screening.accepted
+    vector[suspect], origin[suspect] = screening.landmarks.vector, screening.landmarks.origin_m
+    landmarks = refine(
+        Landmarks(vector=vector, origin_m=origin),
+        m,
+        views,
+        accepted.astype(float),
+        beyond_infinity=True,
+        only=np.flatnonzero(suspect),
+    )
+    return replace(seen, placed=replace(placed, landmarks=landmarks), accepted=accepted)

@@ -1,0 +1,274 @@
+"""One stop as a template of its own, and several of them joined into the structure of a landmark system."""
+
+from collections.abc import Iterable
+from functools import cached_property
+
+import gtsam
+import numpy as np
+
+from pancam_graph.elimination import Linkage, Posture
+from pancam_graph.factors import Key
+from pancam_graph.geometry import FloatArray, IntArray
+from pancam_graph.graph import HardTemplate, diagonal_noise, read_variable
+from pancam_graph.landmarks import CameraViews
+from pancam_graph.sharing import Sharing
+from pancam_graph.solution import State
+from pancam_graph.traverse import Traverse
+
+__all__ = ["Patch", "Postures", "Station", "copied"]
+
+
+class Station:
+    """A stop, its frames and images; its variables under the keys that they have in the whole drive."""
+
+    def __init__(self, number: int, traverse: Traverse, sharing: Sharing, first_image: int) -> None:
+        """`traverse` has this one stop; `number` counts stops, `first_image` the images before, as added."""
+        self.number, self.traverse, self.first_image = number, traverse, first_image
+        self.template = HardTemplate(traverse, sharing)
+        self.link = self.template.linkage
+        self.global_key = self._global_keys()
+        """Of each of the template's keys; what stops share has one key for all of them."""
+        slot = self.template.mast(0)
+        self.mast = self.global_key[slot.key] if isinstance(slot, Key) else None
+        """Key of the mast pose; None where it is held."""
+        self.angles = int(gtsam.symbol("A", number))
+        """Key of its angles, if any is free."""
+        self.motion: gtsam.NonlinearFactor | None = None
+        """From another station, where that is known in place of the mast's pose."""
+        self.own = tuple(
+            self.global_key[k] for k, g in zip(self.link.key, self.link.group, strict=True) if g == 0
+        )
+        self.shared = tuple(k for k, g in zip(self.link.key, self.link.group, strict=True) if g == 1)
+
+    def _global_keys(self) -> dict[int, int]:
+        """The keys that a template of the whole drive has."""
+        out = {key: int(gtsam.symbol(chr(gtsam.symbolChr(key)), self.number)) for key in self.link.key}
+        for v in self.template.rig_variables.variables:
+            letter, index = chr(gtsam.symbolChr(v.key)), gtsam.symbolIndex(v.key)
+            if v.image is not None:
+                index += self.first_image
+            elif v.stop is not None:
+                index += (
+                    self.number if v.quantity == "pan_T_tilt" else self.number * len(self.traverse.rig.eyes)
+                )
+            out[v.key] = int(gtsam.symbol(letter, index))
+        return out
+
+    @property
+    def id(self) -> str:
+        """Of the stop."""
+        return self.traverse.stops[0].id
+
+    @property
+    def held_of_mast(self) -> IntArray:
+        """Components of its pose's tangent that telemetry holds while others are free."""
+        slot = self.template.mast(0)
+        return (
+            self.template.held_of_stops()[slot.key] if isinstance(slot, Key) else np.zeros(0, dtype=np.int64)
+        )
+
+    def local(self, values: gtsam.Values) -> gtsam.Values:
+        """The template's own variables, out of those of the whole drive."""
+        out = gtsam.Values()
+        for key, name in self.global_key.items():
+            out.insert(key, read_variable(values, name))
+        return out
+
+    def start(self, world_T_mast: gtsam.Pose3) -> gtsam.Values:
+        """Its own variables with the mast at a pose, angles as telemetry has them, the rig as it is said to be."""
+        t = self.traverse
+        rotation, centre = t.camera_poses([world_T_mast])
+        state = State(
+            world_T_mast=(world_T_mast,),
+            pan_tilt_rad=t.pan_tilt_rad,
+            world_R_camera=rotation,
+            world_t_camera=centre,
+            landmarks_m=np.zeros((0, 3)),
+        )
+        local, out = self.template.values(state), gtsam.Values()
+        for key, name in self.global_key.items():
+            out.insert(name, read_variable(local, key))
+        return out
+
+    def world_T_mast(self, values: gtsam.Values) -> gtsam.Pose3:
+        """Where it stands at values of the whole drive."""
+        return self.traverse.stops[0].world_T_mast if self.mast is None else values.atPose3(self.mast)
+
+    def pan_tilt_rad(self, values: gtsam.Values) -> FloatArray:
+        """Angles (frames, 2) at values of the whole drive."""
+        local = self.local(values)
+        return self.template.state(local, np.zeros((0, 3))).pan_tilt_rad
+
+    def factors(self, *, firm: bool) -> list[gtsam.NonlinearFactor]:
+        """Priors of what is its own, or of the mast the motion that led here.
+
+        `firm`: what telemetry holds within a variable is held by the prior; else the prior says of it that it
+        is about there, for who holds it otherwise.
+        """
+        t, out = self.traverse, list[gtsam.NonlinearFactor]()
+
+        if self.motion is not None:
+            out.append(self.motion)
+        elif self.mast is not None:
+            stop = t.stops[0]
+            sigmas = np.repeat([stop.sigma_rotation_rad, stop.sigma_translation_m], 3)
+            out.append(gtsam.PriorFactorPose3(self.mast, stop.world_T_mast, _noise(sigmas, firm=firm)))
+        return out + self.other_priors(firm=firm)
+
+    def other_priors(self, *, firm: bool) -> list[gtsam.NonlinearFactor]:
+        """Those of `factors` that are not of the mast."""
+        t, out = self.traverse, list[gtsam.NonlinearFactor]()
+        sigmas = np.array([[f.sigma_pan_rad, f.sigma_tilt_rad] for f in t.frames])
+        free = sigmas.any(axis=1)
+        if free.any():
+            noise = _noise(sigmas[free].ravel(), firm=firm)
+            out.append(gtsam.PriorFactorVector(self.angles, t.pan_tilt_rad[free].ravel(), noise))
+        return out + self._rig_priors(0)
+
+    def shared_priors(self) -> list[gtsam.NonlinearFactor]:
+        """Priors of what of the rig all stops share."""
+        return self._rig_priors(None)
+
+    def _rig_priors(self, owner: int | None) -> list[gtsam.NonlinearFactor]:
+        return [
+            gtsam.PriorFactorVector(
+                self.global_key[v.key], np.zeros(len(v.sigma)), gtsam.noiseModel.Diagonal.Sigmas(v.sigma)
+            )
+            for v in self.template.rig_variables.of_stop(owner)
+            if np.isfinite(v.sigma).any()
+        ]
+
+
+class Postures:
+    """Cameras of stations at some values, each worked out once."""
+
+    def __init__(self, values: gtsam.Values) -> None:
+        self.values = values
+        self._of: dict[int, Posture] = {}
+
+    def of(self, station: Station) -> Posture:
+        """The posture of one station."""
+        found = self._of.get(station.number)
+        if found is None:
+            found = self._of[station.number] = station.template.posture(station.local(self.values))
+        return found
+
+    def moved(self, station: Station, own: gtsam.Values) -> "Postures":
+        """The same with one station's own variables elsewhere."""
+        values = gtsam.Values(self.values)
+        values.update(own)
+        twin = Postures(values)
+        twin._of = {number: found for number, found in self._of.items() if number != station.number}
+        return twin
+
+
+class Patch:
+    """Several stations as one structure of images, units and variables, in the order in which they are given.
+
+    With one station that is free, all others only show their images, and what is shared is held.
+    """
+
+    def __init__(self, stations: Iterable[Station], free: Station | None = None) -> None:
+        """`free` is the only station whose own variables move; None: all variables move."""
+        self.stations = tuple(stations)
+        # Which segments of each station there are.
+        self._segments = [
+            np.ones(len(s.link.segment_variable), dtype=bool)
+            if free is None
+            else (s is free) & (s.link.group[s.link.segment_variable] == 0)
+            for s in self.stations
+        ]
+        self._movable = self.stations if free is None else (free,)
+        self._shared = tuple(sorted({key for s in self.stations for key in s.shared})) if free is None else ()
+        self.place = {s.number: i for i, s in enumerate(self.stations)}
+        counts = [len(s.traverse.images) for s in self.stations]
+        self.image_begin = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        """(stations + 1,) first image of each"""
+
+    @cached_property
+    def linkage(self) -> Linkage:
+        """One group per free station, then one of what these share."""
+        dim_of = {
+            s.global_key[k]: int(d)
+            for s in self.stations
+            for k, d in zip(s.link.key, s.link.dim, strict=True)
+        }
+        keys = [*(key for s in self._movable for key in s.own), *self._shared]
+        row = {key: i for i, key in enumerate(keys)}
+        # A station that nothing moves has no group: all others are numbered without gaps.
+        owners = [s for s in self._movable if s.own]
+        group = [g for g, s in enumerate(owners) for _ in s.own] + [len(owners)] * len(self._shared)
+        units, counts, variables, columns, widths, plain = [], [], [], [], [], []
+        n_units = 0
+        for station, taken in zip(self.stations, self._segments, strict=True):
+            link = station.link
+            units.append(n_units + link.image_unit)
+            n_units += len(link.segment_begin) - 1
+            within = np.concatenate([[0], np.cumsum(taken)])[link.segment_begin]
+            counts.append(np.diff(within))
+            to_row = np.array([row.get(station.global_key[k], -1) for k in link.key], dtype=np.int64)
+            variables.append(to_row[link.segment_variable[taken]])
+            columns.append(link.segment_column[taken])
+            widths.append(link.segment_width[taken])
+            plain.append(link.segment_plain[taken])
+        return Linkage(
+            key=tuple(keys),
+            dim=np.array([dim_of[k] for k in keys], dtype=np.int64),
+            group=np.array(group, dtype=np.int64),
+            image_unit=np.concatenate(units),
+            segment_begin=np.concatenate([[0], np.cumsum(np.concatenate(counts))]).astype(np.int64),
+            segment_variable=np.concatenate(variables),
+            segment_column=np.concatenate(columns),
+            segment_width=np.concatenate(widths),
+            segment_plain=np.concatenate(plain),
+        )
+
+    def posture(self, postures: Postures) -> Posture:
+        """Cameras and chain rule."""
+        of = [postures.of(s) for s in self.stations]
+        views = [p.views for p in of]
+        chains = [p.chain[taken] for p, taken in zip(of, self._segments, strict=True)]
+        return Posture(
+            views=CameraViews(
+                world_R_camera=np.concatenate([v.world_R_camera for v in views]),
+                world_t_camera=np.concatenate([v.world_t_camera for v in views]),
+                calibration=np.concatenate([v.calibration for v in views]),
+            ),
+            unit_R=np.concatenate([p.unit_R for p in of]),
+            unit_t=np.concatenate([p.unit_t for p in of]),
+            chain=np.concatenate(chains),
+        )
+
+    def views(self, postures: Postures) -> CameraViews:
+        """Cameras alone."""
+        return self.posture(postures).views
+
+    def held_columns(self) -> dict[int, IntArray]:
+        """By group, the columns that telemetry holds."""
+        link, out = self.linkage, dict[int, IntArray]()
+        for station in self.stations:
+            for key, components in station.template.held_columns().items():
+                name = station.global_key[key]
+                if len(components) and name in link.row:
+                    g, columns = int(link.group[link.row[name]]), link.columns_of(name).start + components
+                    out[g] = np.concatenate([out.get(g, np.zeros(0, dtype=np.int64)), columns])
+        return out
+
+    def image(self, image: IntArray, station: IntArray) -> IntArray:
+        """Rows among the patch's images, of images (n,) of the whole drive that are of stations (n,)."""
+        shift = np.zeros(max(self.place) + 1, dtype=np.int64)
+        for number, i in self.place.items():
+            shift[number] = self.image_begin[i] - self.stations[i].first_image
+        return image + shift[station]
+
+
+def _noise(sigmas: FloatArray, *, firm: bool) -> gtsam.noiseModel.Base:
+    return diagonal_noise(sigmas if firm else np.where(sigmas > 0, sigmas, 1.0))
+
+
+def copied(values: gtsam.Values, keys: Iterable[int], into: gtsam.Values | None = None) -> gtsam.Values:
+    """Some of the values, added to others if given."""
+    out = gtsam.Values() if into is None else into
+    for key in keys:
+        out.insert(key, read_variable(values, key))
+    return out
