@@ -13,93 +13,115 @@ import numpy as np
 from pancam_graph.elimination import LandmarkSystem, Panels
 from pancam_graph.geometry import FloatArray
 from pancam_graph.graph import read_variable
+from pancam_graph.landmarks import Landmarks
+from pancam_graph.smoother._frame import CommonMotion, carried, posture_in
 from pancam_graph.smoother._placing import Placed
 from pancam_graph.smoother._station import Postures, copied
 
-__all__ = ["LandmarkBlock", "difference"]
+__all__ = ["LandmarkBlock"]
 
 
 class LandmarkBlock:
     """Landmarks, where they are at the point of linearisation, and what is left of them there."""
 
     def __init__(self, placed: Placed) -> None:
-        self._placed, self.patch = placed, placed.patch
-        self.system = LandmarkSystem(placed.patch.linkage, placed.measurements, placed.landmarks)
+        """Landmarks placed where the estimate has the cameras."""
+        self.patch = placed.patch
         self.slot = -1
         """Of its factor in iSAM2."""
         self.cost = 0.0
         """At the last estimate that it was evaluated at."""
-        self.delta = np.zeros(0)
-        """Of its variables at that estimate, as iSAM2 has it."""
         self.factor: gtsam.LinearContainerFactor | None = None
-        self._here: gtsam.Values | None = None
-        self._at: Postures | None = None
+        self.replace(placed)
+
+    def replace(self, placed: Placed) -> None:
+        """Put its landmarks elsewhere; the block must then be linearised anew."""
+        self._placed = placed
+        self.system = LandmarkSystem(self.patch.linkage, placed.measurements, placed.landmarks)
+        self._frame = gtsam.Pose3()
 
     @property
     def placed(self) -> Placed:
-        """Its landmarks as they were linearised."""
-        return replace(self._placed, landmarks=self.system.landmarks())
-
-    def replace(self, placed: Placed) -> None:
-        """Put the same landmarks elsewhere; the block must then be linearised anew."""
-        self._placed = placed
-        self.system = LandmarkSystem(self.patch.linkage, placed.measurements, placed.landmarks)
+        """Its landmarks about where the estimate has them."""
+        return replace(self._placed, landmarks=carried(self.system.landmarks(), self._frame.inverse()))
 
     @property
     def keys(self) -> tuple[int, ...]:
         """Variables that it touches."""
         return self.system.linkage.key
 
-    def linearise(self, theta: Postures) -> None:
-        """Make the factor at a point of linearisation; landmarks stay where they are."""
-        link = self.system.linkage
-        panels = self.system.linearise(self.patch.posture(theta))
+    def linearise(self, theta: Postures, estimate: gtsam.Values, unit: FloatArray) -> None:
+        """Make the factor at a point of linearisation, landmarks carried to there from the estimate.
+
+        `unit` (6,) are the rotations and shifts of masts that weigh alike.
+        """
+        link, stations, system = self.system.linkage, self.patch.stations, self.system
+        there = [s.world_T_mast(theta.values) for s in stations]
+        self._common = CommonMotion(there, unit, held=any(s.mast is None or len(s.held_of_mast) for s in stations))
+        apart = [a.localCoordinates(s.world_T_mast(estimate)) for a, s in zip(there, stations, strict=True)]
+        frame = gtsam.Pose3.Expmap(-self._common.of(np.concatenate(apart))[0])
+        moved = carried(
+            Landmarks(vector=system.vector, origin_m=system.origin_m), frame * self._frame.inverse()
+        )
+        system.vector, system.origin_m, self._frame = moved.vector, moved.origin_m, frame
+        panels = system.linearise(self.patch.posture(theta))
         panels.hold(self.patch.held_columns())
-        self.cost = float(self.system.reduced.cost.sum())
-        self._here, self._at = copied(theta.values, link.key), None
-        self.factor = gtsam.LinearContainerFactor(_quadratic(panels, self.system, self.cost), self._here)
+        self.cost = float(system.reduced.cost.sum())
+        self._here = copied(theta.values, link.key)
+        self._theta = there
+        self.factor = gtsam.LinearContainerFactor(_quadratic(panels, system), self._here)
+
+    def apart(self, estimate: gtsam.Values) -> float:
+        """How far masts are, beside a common motion, from where they were linearised, in units."""
+        stations = self.patch.stations
+        delta = [a.localCoordinates(s.world_T_mast(estimate)) for a, s in zip(self._theta, stations, strict=True)]
+        twist, largest = self._common.of(np.concatenate(delta))
+        self._frame = gtsam.Pose3.Expmap(-twist)
+        return largest
+
+    def left_apart(self, theta: gtsam.Values, estimate: gtsam.Values, moving: set[int]) -> float:
+        """As `apart`, if stops whose mast is among these variables moved to the estimate and others did not."""
+        stations = self.patch.stations
+        there = [s.world_T_mast(estimate if s.mast in moving else theta) for s in stations]
+        delta = [a.localCoordinates(s.world_T_mast(estimate)) for a, s in zip(there, stations, strict=True)]
+        return self._common.of(np.concatenate(delta))[1]
 
     def follow(self, estimate: Postures) -> float:
         """Landmarks follow the cameras to an estimate; the true cost there."""
         link = self.system.linkage
+        self.apart(estimate.values)
+        posture = posture_in(self.patch.posture(estimate), self._frame)
         step = np.zeros(int(link.group_column[-1]))
         begin = link.group_column[link.group] + link.variable_column
         for key, first, dim in zip(link.key, begin, link.dim, strict=True):
-            step[first : first + dim] = difference(self._here, estimate.values, key)
-        self.cost = float(self.system.try_step(self.patch.posture(estimate), step).sum())
-        self._at = estimate
+            here, there = read_variable(self._here, key), read_variable(estimate.values, key)
+            is_pose = isinstance(here, gtsam.Pose3)
+            step[first : first + dim] = here.localCoordinates(self._frame * there) if is_pose else there - here
+        self.cost = float(self.system.try_step(posture, step).sum())
         return self.cost
 
     def settle(self, estimate: Postures) -> None:
         """Landmarks move to where they follow the cameras; the block must then be linearised anew."""
-        if self._at is not estimate:
-            self.follow(estimate)
+        self.follow(estimate)
         self.system.adopt()
-        self._at = None
 
     def modelled_cost(self, values: gtsam.Values) -> float:
         """Cost at an estimate as the block was linearised."""
-        assert self.factor is not None
-        return float(self.factor.error(values))
+        return 0.0 if self.factor is None else float(self.factor.error(values))
 
 
-def difference(here: gtsam.Values | None, there: gtsam.Values, key: int) -> FloatArray:
-    """Local coordinates of a variable's value at another."""
-    a, b = read_variable(here, key), read_variable(there, key)
-    return np.asarray(a.localCoordinates(b) if isinstance(a, gtsam.Pose3) else b - a)
-
-
-def _quadratic(panels: Panels, system: LandmarkSystem, cost: float) -> gtsam.HessianFactor:
+def _quadratic(panels: Panels, system: LandmarkSystem) -> gtsam.HessianFactor:
     """What is left of all landmarks, as one factor.
 
-    GTSAM takes three variables at a time, so it is summed up from such parts: cost + s'x + x'Sx / 2.
+    GTSAM takes three variables at a time, so it is summed up from such parts: f + s'x + x'Sx / 2, f what
+    the cost is once landmarks have moved while the cameras stand.
     """
     link, structure = system.linkage, system.structure
     graph = gtsam.GaussianFactorGraph()
     dims = link.dim.tolist()
     zeros = {(a, b): np.zeros((a, b)) for a in set(dims) for b in set(dims)}
     zero = {a: np.zeros(a) for a in set(dims)}
-    constant = 2 * cost
+    constant = 2 * (float(system.reduced.cost.sum()) - system.gain_alone)
     members = [list(range(link.group_begin[g], link.group_begin[g + 1])) for g in range(link.n_groups)]
     column = link.variable_column
     for g, panel in enumerate(panels.panel):

@@ -7,17 +7,21 @@ import gtsam
 import numpy as np
 
 from pancam_graph.smoother._batch import solved_anew
+from pancam_graph.smoother._frame import orthonormal
 from pancam_graph.smoother._map import Change, DriveMap
 from pancam_graph.smoother._options import SmootherOptions
-from pancam_graph.smoother._station import Postures
+from pancam_graph.smoother._station import Postures, Station
 from pancam_graph.smoother._tree import Tree
 
 __all__ = ["Engine", "Rounds"]
 
 _RISE = 1e-6
 """A step that raises the cost by more than this share is a bad one."""
-_UNLIKE = 1e-5
-"""Blocks whose true cost differs from that of their linear model by this share of all are linearised anew."""
+_UNLIKE = 1.0
+"""Blocks whose true cost differs from that of their linear model by more are linearised anew: an observation
+more adds as much."""
+_LEFT = 0.3
+"""A block may be left with some stops moved and others not that are no more than so many units apart."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,10 +40,12 @@ class Engine:
 
     def __init__(self, drive: DriveMap, options: SmootherOptions) -> None:
         self._drive, self._options = drive, options
-        self._tree = Tree(options)
+        self._tree = Tree()
         self._priors = gtsam.NonlinearFactorGraph()
         """All factors but those of landmarks, for the cost."""
         self._bent: list[int] = []
+        self._apart: dict[int, float] = {}
+        self._unit = np.repeat([options.relinearise_rad, options.relinearise_m], 3)
 
     @property
     def estimate(self) -> gtsam.Values:
@@ -59,67 +65,120 @@ class Engine:
         self,
         change: Change,
         factors: Sequence[gtsam.NonlinearFactor] = (),
+        station: Station | None = None,
         values: gtsam.Values | None = None,
     ) -> Rounds:
-        """Add what is new and go on until it is settled."""
+        """Add what is new and go on until it is settled; `values` are those of a new station, about right."""
         for factor in factors:
             self._priors.push_back(factor)
-        return self._settle(change, factors, values or gtsam.Values(), bends=False)
+        new = values or gtsam.Values()
+        if station is not None and station.mast is not None and new.exists(station.mast):
+            there = new.atPose3(station.mast)
+            theta = gtsam.Values(new)
+            theta.update(station.mast, orthonormal(self._frame_at(there) * there))
+            return self._settle(change, factors, new, theta, bends=False)
+        return self._settle(change, factors, new, new, bends=False)
+
+    def _frame_at(self, world_T_mast: gtsam.Pose3) -> gtsam.Pose3:
+        """How the world about a place has moved since it was linearised, undone; as the nearest stop has it."""
+        stations = [s for s in self._drive.stations if s.mast is not None and self.theta.exists(s.mast)]
+        if not stations:
+            return gtsam.Pose3()
+        at = world_T_mast.translation()
+        apart = [np.linalg.norm(s.world_T_mast(self.estimate).translation() - at) for s in stations]
+        nearest = stations[int(np.argmin(apart))]
+        return nearest.world_T_mast(self.theta) * nearest.world_T_mast(self.estimate).inverse()
 
     def bend(self, factor: gtsam.NonlinearFactor) -> Rounds:
         """Bring the drive to where one more factor wants it, which the next advance takes out again."""
-        return self._settle(Change(), [factor], gtsam.Values(), bends=True)
+        none = gtsam.Values()
+        return self._settle(Change(), [factor], none, none, bends=True)
 
     def _settle(
-        self, change: Change, factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values, *, bends: bool
+        self,
+        change: Change,
+        factors: Sequence[gtsam.NonlinearFactor],
+        new: gtsam.Values,
+        theta: gtsam.Values,
+        *,
+        bends: bool,
     ) -> Rounds:
-        blocks = self._drive.blocks
         touched, removed = set(change.touched), [*change.slots, *self._bent]
         self._bent = []
         rounds, relinearised, handled, previous = 0, 0, 0, np.inf
-        moving = self._tree.over()
+        moving: set[int] = set()
         while True:
-            affected = self._linearise(touched, values, moving, removed)
-            slots = self._update(factors, values, removed, moving, affected)
+            affected = self._linearise(touched, new, theta, moving, removed)
+            slots = self._update(factors, theta, removed, moving, affected)
             if bends and rounds == 0:
                 self._bent = slots
             rounds, relinearised, handled = rounds + 1, relinearised + len(moving), handled + len(affected)
             unlike, cost = self._evaluate(affected)
-            moving = self._tree.over() | unlike
+            moving = self._to_move(unlike)
             # What bends the drive is no part of the cost, which may rise.
             failed = rounds >= self._options.max_rounds or (cost > previous * (1 + _RISE) and not bends)
             if not moving or failed:
                 break
-            previous, touched, removed, factors, values = cost, set(), [], [], gtsam.Values()
+            previous, touched, removed, factors, new, theta = cost, set(), [], [], gtsam.Values(), gtsam.Values()
         fell_back = bool(moving) and not bends
         if fell_back:
             self.restart(solved_anew(self._drive, self._tree.estimate))
-            _, cost = self._evaluate(set(blocks))
-        return Rounds(
-            rounds=rounds, relinearised=relinearised, blocks=handled, cost=cost, fell_back=fell_back
-        )
+            _, cost = self._evaluate(set(self._drive.blocks))
+        return Rounds(rounds=rounds, relinearised=relinearised, blocks=handled, cost=cost, fell_back=fell_back)
 
     def _linearise(
-        self, touched: set[int], values: gtsam.Values, moving: set[int], removed: list[int]
+        self, touched: set[int], new: gtsam.Values, theta: gtsam.Values, moving: set[int], removed: list[int]
     ) -> set[int]:
         """Blocks that are touched, or of variables that move, at the next point of linearisation."""
-        blocks, estimate = self._drive.blocks, Postures(self._tree.estimate)
+        blocks, values = self._drive.blocks, gtsam.Values(self._tree.estimate)
+        values.insert(new)
+        estimate = Postures(values)
         affected = touched | {b for b, block in blocks.items() if not moving.isdisjoint(block.keys)}
-        theta = Postures(self._tree.next_theta(values, moving))
+        at = Postures(self._tree.next_theta(theta, moving))
         for b in sorted(affected):
             block = blocks[b]
             if b not in touched:
                 block.settle(estimate)
             if block.slot >= 0:
                 removed.append(block.slot)
-            block.linearise(theta)
+            block.linearise(at, values, self._unit)
         return affected
+
+    def _to_move(self, unlike: set[int]) -> set[int]:
+        """Variables to linearise anew: all of blocks that are too far from where they were, or `unlike`.
+
+        And those of their neighbours that would else be left apart from them.
+        """
+        o, moved, blocks = self._options, self._tree.moved, self._drive.blocks
+        limit = {"A": o.relinearise_rad}
+        far = {
+            key
+            for key, delta in moved.items()
+            if (letter := chr(gtsam.symbolChr(key))) != "M"
+            and np.any(np.abs(delta) > limit.get(letter, o.relinearise_rig))
+        }
+        pending = {
+            b
+            for b, block in blocks.items()
+            if b in unlike or self._apart[b] > 1 or not far.isdisjoint(block.keys)
+        }
+        moving: set[int] = set()
+        while pending:
+            moving |= {key for b in pending for key in blocks[b].keys}
+            pending = {
+                b
+                for b, block in blocks.items()
+                if not moving.isdisjoint(block.keys)
+                and not moving.issuperset(block.keys)
+                and block.left_apart(self._tree.theta, self._tree.estimate, moving) > _LEFT
+            }
+        return moving
 
     def restart(self, values: gtsam.Values) -> None:
         """A new tree of all factors, linearised at these values, where landmarks are already."""
-        self._tree, self._bent, theta = Tree(self._options), [], Postures(values)
+        self._tree, self._bent, theta = Tree(), [], Postures(values)
         for block in self._drive.blocks.values():
-            block.linearise(theta)
+            block.linearise(theta, values, self._unit)
         factors = self._drive.factors(firm=False)
         self._priors = gtsam.NonlinearFactorGraph()
         for factor in factors:
@@ -142,19 +201,17 @@ class Engine:
         return slots[: len(factors)]
 
     def _evaluate(self, affected: set[int]) -> tuple[set[int], float]:
-        """Variables of blocks that are less linear than they were taken for, and the cost of everything."""
-        estimate, far = Postures(self._tree.estimate), {}
+        """Blocks that are less linear than they were taken for, and the cost of everything."""
+        estimate, unlike = Postures(self._tree.estimate), set()
         for b, block in self._drive.blocks.items():
-            delta = self._tree.delta(block.keys)
             if b in affected:
                 block.follow(estimate)
-                far[b] = abs(block.cost - block.modelled_cost(estimate.values))
-            elif not np.array_equal(delta, block.delta):
+                if abs(block.cost - block.modelled_cost(estimate.values)) > _UNLIKE:
+                    unlike.add(b)
+            else:
                 block.cost = block.modelled_cost(estimate.values)
-            block.delta = delta
-        cost = self.cost
-        unlike = {b for b, miss in far.items() if miss > _UNLIKE * cost}
-        return {key for b in unlike for key in self._drive.blocks[b].keys}, cost
+            self._apart[b] = block.apart(estimate.values)
+        return unlike, self.cost
 
     @property
     def cost(self) -> float:

@@ -14,6 +14,7 @@ from pancam_graph.rigs import Rig
 from pancam_graph.sharing import Sharing
 from pancam_graph.smoother._closure import bridge, judged, loops
 from pancam_graph.smoother._engine import Engine, Rounds
+from pancam_graph.smoother._frame import orthonormal
 from pancam_graph.smoother._ledger import Fate
 from pancam_graph.smoother._localise import localise
 from pancam_graph.smoother._map import Change, DriveMap
@@ -221,7 +222,7 @@ class TraverseSmoother:
         change = Change()
         drive.take_in(near, Postures(known), change, far)
         first = drive.stations[0].shared_priors() if station.number == 0 else []
-        done = [engine.advance(change, [*first, *station.factors(firm=False)], new)]
+        done = [engine.advance(change, [*first, *station.factors(firm=False)], station, new)]
         return self._closed(station, rows, far, change, done, begin)
 
     def _guess(self, station: Station, previous: Station | None) -> gtsam.Pose3:
@@ -230,7 +231,7 @@ class TraverseSmoother:
         if previous is None or station.mast is None:
             return said
         moved = previous.traverse.stops[0].world_T_mast.between(said)
-        return previous.world_T_mast(self._engine.estimate) * moved
+        return orthonormal(previous.world_T_mast(self._engine.estimate) * moved)
 
     def _local_priors(
         self, station: Station, previous: Station | None, values: gtsam.Values

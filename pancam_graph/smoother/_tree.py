@@ -7,7 +7,6 @@ import numpy as np
 
 from pancam_graph.errors import SolveError
 from pancam_graph.geometry import FloatArray
-from pancam_graph.smoother._options import SmootherOptions
 
 __all__ = ["Tree"]
 
@@ -22,32 +21,23 @@ _ANY = 1e-15
 class Tree:
     """The Bayes tree of all stops, its point of linearisation `theta` and its `estimate`."""
 
-    def __init__(self, options: SmootherOptions) -> None:
-        self._options = options
+    def __init__(self) -> None:
         parameters = gtsam.ISAM2Params()
         parameters.relinearizeSkip = 1
         parameters.findUnusedFactorSlots = True
         steps = gtsam.ISAM2GaussNewtonParams()
         steps.setWildfireThreshold(_WILDFIRE)
         parameters.setOptimizationParams(steps)
-        # Which variables move is decided by `over`, and GTSAM told by its list of those that must not: it has
-        # one vector of thresholds for a letter, but angles of stops have as many entries as there are frames.
+        # Which variables move is decided elsewhere, and GTSAM told by its list of those that must not.
         parameters.setRelinearizeThreshold(_ANY)
         self._isam = gtsam.ISAM2(parameters)
         self.theta, self.estimate = gtsam.Values(), gtsam.Values()
         self._delta: dict[int, FloatArray] = {}
 
-    def over(self) -> set[int]:
-        """Variables that are too far from where they were linearised."""
-        return {
-            key for key, delta in self._delta.items() if np.any(np.abs(delta) > self._limit(key, len(delta)))
-        }
-
-    def _limit(self, key: int, n: int) -> FloatArray | float:
-        o, letter = self._options, chr(gtsam.symbolChr(key))
-        if letter == "M":
-            return np.repeat([o.relinearise_rad, o.relinearise_m], 3)
-        return o.relinearise_rad if letter == "A" else o.relinearise_rig
+    @property
+    def moved(self) -> dict[int, FloatArray]:
+        """By how much each variable is from where it was linearised."""
+        return self._delta
 
     def next_theta(self, new: gtsam.Values, moving: Iterable[int]) -> gtsam.Values:
         """The point of linearisation after an update that adds variables and moves some."""
@@ -88,10 +78,6 @@ class Tree:
         delta = self._isam.getDelta()
         self._delta = {key: delta.at(key) for key in self.theta.keys()}  # noqa: SIM118  gtsam.Values
         return list(result.getNewFactorsIndices())
-
-    def delta(self, keys: Iterable[int]) -> FloatArray:
-        """How far variables are from where they were linearised, one after the other."""
-        return np.concatenate([np.zeros(0), *(self._delta[key] for key in keys)])
 
     def covariance(self, keys: Sequence[int]) -> FloatArray:
         """Joint covariance of variables, one after the other, all else marginalised."""
