@@ -30,6 +30,8 @@ from pancam_graph.simulate import RenderOptions as RenderOptions
 from pancam_graph.simulate import SimulationOptions as SimulationOptions
 from pancam_graph.simulate import render as render
 from pancam_graph.simulate import simulate as simulate
+from pancam_graph.smoother import SmootherOptions as SmootherOptions
+from pancam_graph.smoother import TraverseSmoother as TraverseSmoother
 from pancam_graph.solution import Solution as Solution
 from pancam_graph.solve import SolveOptions as SolveOptions
 from pancam_graph.solve import solve as solve

@@ -12,6 +12,8 @@ from pancam_graph.io.rendering import write_rendering as write_rendering
 from pancam_graph.io.rendering import write_truth as write_truth
 from pancam_graph.io.results import check_out as check_out
 from pancam_graph.io.results import save_solution as save_solution
+from pancam_graph.io.smoother_npz import load_smoother as load_smoother
+from pancam_graph.io.smoother_npz import save_smoother as save_smoother
 from pancam_graph.io.solution_json import SolutionFile as SolutionFile
 from pancam_graph.io.solution_json import read_solution_json as read_solution_json
 from pancam_graph.io.traverse_json import read_traverse as read_traverse

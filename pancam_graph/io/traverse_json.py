@@ -24,7 +24,7 @@ from pancam_graph.io.image_files import read_eye_image
 from pancam_graph.io.observations import observations_npz, read_observations
 from pancam_graph.traverse import Frame, Image, Stop, Traverse
 
-__all__ = ["read_traverse", "write_traverse"]
+__all__ = ["read_traverse", "traverse_entries", "traverse_of", "write_traverse"]
 
 _TRAVERSE_JSON = "traverse.json"
 _OBSERVATIONS = "observations.npz"
@@ -47,7 +47,7 @@ def read_traverse(folder: Path | str) -> Traverse:
     entries = validated(TraverseFile, read_json(path, TRAVERSE_FORMAT, VERSION), path)
     # Absurdly large numbers overflow; the constructors refuse what that leaves, in one line and not two.
     with prefixed(path), np.errstate(all="ignore"):
-        traverse = _traverse(entries, folder)
+        traverse = traverse_of(entries, folder)
         files = [
             None if i.file is None else _inside(folder, i.file, f"images[{row}].file")
             for row, i in enumerate(entries.images)
@@ -87,7 +87,7 @@ def write_traverse(traverse: Traverse, folder: Path | str, *, overwrite: bool = 
     copies = _copies(traverse, folder)
     observations = traverse.observations
     with refused_by_schema(path):
-        entries = _entries(traverse)
+        entries = traverse_entries(traverse)
     content = entries.model_dump(exclude={"sharing"})
     if entries.sharing is not None:
         content["sharing"] = entries.sharing.model_dump(exclude_defaults=True)
@@ -104,7 +104,8 @@ def write_traverse(traverse: Traverse, folder: Path | str, *, overwrite: bool = 
         raise InputError(f"{folder}: expected a folder to write to, found: {error}") from error
 
 
-def _traverse(entries: TraverseFile, folder: Path) -> Traverse:
+def traverse_of(entries: TraverseFile, folder: Path) -> Traverse:
+    """The traverse that a file's entries say, without observations."""
     stops = tuple(
         Stop(
             id=s.id,
@@ -125,7 +126,8 @@ def _traverse(entries: TraverseFile, folder: Path) -> Traverse:
     )
 
 
-def _entries(traverse: Traverse) -> TraverseFile:
+def traverse_entries(traverse: Traverse) -> TraverseFile:
+    """A traverse as the entries of its file."""
     stops = [
         StopEntry(
             id=s.id,

@@ -59,7 +59,14 @@ def path(options: DriveOptions, rng: np.random.Generator) -> tuple[FloatArray, F
     heading = np.cumsum(
         np.concatenate([[0.0], options.heading_change_rad * rng.standard_normal(options.stops - 1)])
     )
+    if options.loop:
+        # As many turns as there are stretches, the last one back to the start among them.
+        heading += 2 * np.pi * np.arange(options.stops) / options.stops - heading[-1] * np.linspace(
+            0, 1, options.stops
+        )
     step = options.spacing_m * np.column_stack([np.cos(heading), np.sin(heading)])
+    if options.loop:
+        step -= step.mean(axis=0)
     return np.concatenate([np.zeros((1, 2)), np.cumsum(step, axis=0)[:-1]]), heading
 
 
@@ -142,10 +149,13 @@ def telemetry(
     errors = sigmas * rng.standard_normal((len(world_T_mast), 6))
     errors[0] = 0.0
     pointing = _pointing_sigma_rad(rig, options)
+    said = [pose * gtsam.Pose3.Expmap(error) for pose, error in zip(world_T_mast, errors, strict=True)]
+    if options.odometry:
+        for i in range(1, len(said)):
+            rounded = (said[i - 1] * world_T_mast[i - 1].between(said[i])).matrix()
+            said[i] = gtsam.Pose3(gtsam.Rot3.ClosestTo(rounded[:3, :3]), rounded[:3, 3])
     return TelemetryStart(
-        world_T_mast=tuple(
-            pose * gtsam.Pose3.Expmap(error) for pose, error in zip(world_T_mast, errors, strict=True)
-        ),
+        world_T_mast=tuple(said),
         pan_tilt_rad=pan_tilt_rad + pointing * rng.standard_normal(pan_tilt_rad.shape),
     )
 

@@ -39,6 +39,8 @@ class DriveOptions:
     """Standard deviation of each component of a stop's position, but the first, which is held."""
     sigma_stop_rad: float = 0.01
     """Standard deviation of each component of a stop's rotation, but the first, which is held."""
+    odometry: bool = False
+    """Whether these are of the motion from the stop before, so that errors add up along the drive."""
     focal_error: float = 0.0
     """Standard deviation of the focal length of each eye in the rig that the traverse claims, as a share."""
     mount_error_rad: float = 0.0
@@ -127,6 +129,9 @@ class RenderOptions(DriveOptions):
 class SimulationOptions(DriveOptions):
     """What is driven, seen and measured. Raises InputError naming the option that makes no sense."""
 
+    loop: bool = False
+    """Whether the drive comes back to where it began: its heading turns by a circle in all, beside the random
+    changes, and points found on one side of the joint are looked for on the other."""
     slope_rad: float = 0.05
     """RMS slope of the rolling ground along x and y, and so of the mast's roll and pitch."""
     rocks: float = 0.6

@@ -220,6 +220,10 @@ def _look(
     for stop in range(options.stops):
         low, high = max(0, stop - options.link_stops), min(options.stops, stop + options.link_stops + 1)
         linked = np.arange(first[low], first[high])
+        if options.loop:
+            around = np.arange(stop - options.link_stops, stop + options.link_stops + 1) % options.stops
+            parts = [np.arange(first[s], first[s + 1]) for s in np.unique(around)]
+            linked = np.concatenate(parts)
         images = np.flatnonzero(image_stop == stop)
         near = linked[_within(options, points_m[linked], found_at_m[linked], centre[images])]
         points, lines, found_at = points_m[near], line[near], found_at_m[near]

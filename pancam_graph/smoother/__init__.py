@@ -5,3 +5,4 @@ from pancam_graph.smoother._options import Estimate as Estimate
 from pancam_graph.smoother._options import SmootherOptions as SmootherOptions
 from pancam_graph.smoother._options import Update as Update
 from pancam_graph.smoother._smoother import TraverseSmoother as TraverseSmoother
+from pancam_graph.smoother._state import SmootherState as SmootherState

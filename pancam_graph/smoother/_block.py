@@ -57,7 +57,9 @@ class LandmarkBlock:
         """
         link, stations, system = self.system.linkage, self.patch.stations, self.system
         there = [s.world_T_mast(theta.values) for s in stations]
-        self._common = CommonMotion(there, unit, held=any(s.mast is None or len(s.held_of_mast) for s in stations))
+        self._common = CommonMotion(
+            there, unit, held=any(s.mast is None or len(s.held_of_mast) for s in stations)
+        )
         apart = [a.localCoordinates(s.world_T_mast(estimate)) for a, s in zip(there, stations, strict=True)]
         frame = gtsam.Pose3.Expmap(-self._common.of(np.concatenate(apart))[0])
         moved = carried(
@@ -74,7 +76,9 @@ class LandmarkBlock:
     def apart(self, estimate: gtsam.Values) -> float:
         """How far masts are, beside a common motion, from where they were linearised, in units."""
         stations = self.patch.stations
-        delta = [a.localCoordinates(s.world_T_mast(estimate)) for a, s in zip(self._theta, stations, strict=True)]
+        delta = [
+            a.localCoordinates(s.world_T_mast(estimate)) for a, s in zip(self._theta, stations, strict=True)
+        ]
         twist, largest = self._common.of(np.concatenate(delta))
         self._frame = gtsam.Pose3.Expmap(-twist)
         return largest
@@ -96,7 +100,9 @@ class LandmarkBlock:
         for key, first, dim in zip(link.key, begin, link.dim, strict=True):
             here, there = read_variable(self._here, key), read_variable(estimate.values, key)
             is_pose = isinstance(here, gtsam.Pose3)
-            step[first : first + dim] = here.localCoordinates(self._frame * there) if is_pose else there - here
+            step[first : first + dim] = (
+                here.localCoordinates(self._frame * there) if is_pose else there - here
+            )
         self.cost = float(self.system.try_step(posture, step).sum())
         return self.cost
 

@@ -20,6 +20,8 @@ _RISE = 1e-6
 _UNLIKE = 1.0
 """Blocks whose true cost differs from that of their linear model by more are linearised anew: an observation
 more adds as much."""
+_PIXELS = 100.0
+"""Calibrations are in pixels, of which so many are about what a unit of the other entries is."""
 _LEFT = 0.3
 """A block may be left with some stops moved and others not that are no more than so many units apart."""
 
@@ -119,12 +121,21 @@ class Engine:
             failed = rounds >= self._options.max_rounds or (cost > previous * (1 + _RISE) and not bends)
             if not moving or failed:
                 break
-            previous, touched, removed, factors, new, theta = cost, set(), [], [], gtsam.Values(), gtsam.Values()
+            previous, touched, removed, factors, new, theta = (
+                cost,
+                set(),
+                [],
+                [],
+                gtsam.Values(),
+                gtsam.Values(),
+            )
         fell_back = bool(moving) and not bends
         if fell_back:
             self.restart(solved_anew(self._drive, self._tree.estimate))
             _, cost = self._evaluate(set(self._drive.blocks))
-        return Rounds(rounds=rounds, relinearised=relinearised, blocks=handled, cost=cost, fell_back=fell_back)
+        return Rounds(
+            rounds=rounds, relinearised=relinearised, blocks=handled, cost=cost, fell_back=fell_back
+        )
 
     def _linearise(
         self, touched: set[int], new: gtsam.Values, theta: gtsam.Values, moving: set[int], removed: list[int]
@@ -150,7 +161,7 @@ class Engine:
         And those of their neighbours that would else be left apart from them.
         """
         o, moved, blocks = self._options, self._tree.moved, self._drive.blocks
-        limit = {"A": o.relinearise_rad}
+        limit = {"A": o.relinearise_rad, "K": _PIXELS * o.relinearise_rig}
         far = {
             key
             for key, delta in moved.items()

@@ -22,7 +22,8 @@ class CommonMotion:
 
     def __init__(self, theta: Sequence[gtsam.Pose3], unit: FloatArray, *, held: bool) -> None:
         """`unit` (6,) are the angles and distances that weigh alike. `held`: one of the masts cannot move,
-        and so neither can the world."""
+        and so neither can the world.
+        """
         self._unit = np.tile(unit, len(theta))
         alike = np.concatenate([np.zeros((0, 6)), *(pose.inverse().AdjointMap() for pose in theta)])
         self._alike = (0.0 if held else 1.0) * alike / self._unit[:, None]

@@ -1,11 +1,12 @@
 """What a drive consists of: stations, observations, and landmarks in blocks by the stop that saw them first."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
 
 from pancam_graph.geometry import BoolArray, IntArray
+from pancam_graph.landmarks import Landmarks
 from pancam_graph.smoother._block import LandmarkBlock
 from pancam_graph.smoother._ledger import Fate, Ledger
 from pancam_graph.smoother._placing import Placed, Seen, believed, combined, gathered, placed_anew
@@ -66,6 +67,21 @@ class DriveMap:
             if number in block.patch.place:
                 out |= block.patch.place.keys()
         return out
+
+    def restore(self, track: IntArray, home: IntArray, landmarks: Landmarks) -> None:
+        """Blocks of landmarks (landmarks,) as they were, with all observations that are used."""
+        used, none = self.ledger.all_with(Fate.USED), np.zeros(0, dtype=np.int64)
+        order = np.argsort(track)
+        self._track, self._home = track[order], home[order]
+        of_row = self.home(self.ledger.track[used])
+        for name in np.unique(home).tolist():
+            rows, own = used[of_row == name], home == name
+            numbers = np.unique(self.station_of(rows))
+            patch = Patch([self.stations[i] for i in numbers])
+            placed = gathered(self.ledger, self.image_station, patch, None, rows, none).placed
+            at = np.flatnonzero(own)[np.argsort(track[own])]
+            where = Landmarks(vector=landmarks.vector[at], origin_m=landmarks.origin_m[at])
+            self.blocks[name] = LandmarkBlock(replace(placed, landmarks=where))
 
     def idle(self, track: IntArray, *fates: Fate) -> IntArray:
         """Rows of tracks that have one of these fates."""

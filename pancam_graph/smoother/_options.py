@@ -23,12 +23,14 @@ class SmootherOptions:
     motion's, in the body frame of the later stop."""
     sharing: Sharing | None = None
     """What of the rig is free, and who shares it; None: nothing is. As for `solve` with the model `mast`."""
-    relinearise_rad: float = 3e-4
-    """A rotation or angle that is farther from where its factors were linearised is linearised anew."""
-    relinearise_m: float = 3e-3
-    """The same for a position."""
-    relinearise_rig: float = 1e-4
-    """The same for free entries of the rig, as a share of the sigma that such entries have by default."""
+    relinearise_rad: float = 1e-3
+    """A block of landmarks is linearised anew where an angle, or how its masts are turned against each other,
+    has moved by more."""
+    relinearise_m: float = 1e-2
+    """The same for how its masts stand to each other."""
+    relinearise_rig: float = 1e-3
+    """The same for free entries of the rig: radians, metres, shares of a focal length; a hundred times as much
+    for pixels."""
     outlier_sigma: float | None = 4.0
     """An observation goes where noise would take it less often than a Gaussian beyond this many sigmas; None:
     all are kept."""

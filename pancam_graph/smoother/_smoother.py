@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Sequence
+from pathlib import Path
 
 import gtsam
 import numpy as np
@@ -10,8 +11,10 @@ from pancam_graph._diagnose import listed
 from pancam_graph.cameras import carry_to_pinhole
 from pancam_graph.errors import InputError
 from pancam_graph.geometry import FloatArray, IntArray
+from pancam_graph.landmarks import Landmarks
 from pancam_graph.rigs import Rig
 from pancam_graph.sharing import Sharing
+from pancam_graph.smoother._batch import whole_traverse
 from pancam_graph.smoother._closure import bridge, judged, loops
 from pancam_graph.smoother._engine import Engine, Rounds
 from pancam_graph.smoother._frame import orthonormal
@@ -20,6 +23,7 @@ from pancam_graph.smoother._localise import localise
 from pancam_graph.smoother._map import Change, DriveMap
 from pancam_graph.smoother._options import Closure, Estimate, SmootherOptions, Update
 from pancam_graph.smoother._placing import Seen
+from pancam_graph.smoother._state import SmootherState
 from pancam_graph.smoother._station import Postures, Station, copied
 from pancam_graph.threads import blas_on_one_thread
 from pancam_graph.traverse import Frame, Image, Observations, Stop, Traverse
@@ -146,6 +150,7 @@ class TraverseSmoother:
 
     def _join(self, station: Station, previous: Station) -> None:
         """Odometry from one station to another, if stops are known by that."""
+        station.after = previous.number
         if self.options.telemetry == "absolute":
             return
         stop, other = station.traverse.stops[0], previous.traverse.stops[0]
@@ -434,6 +439,69 @@ class TraverseSmoother:
                 f"observations: row {row}: expected an image to see a track once, found image "
                 f"{self.images[image[row]]!r}, track {track[row]} again"
             )
+
+    # --- what is kept ---
+
+    def state(self) -> SmootherState:
+        """Everything, to go on from later. Raises InputError where no stop was added."""
+        if not self._stop:
+            raise InputError("smoother: expected at least one stop to keep, found none")
+        drive, values, numbers = self._drive, self._engine.estimate, SmootherState.numbers
+        blocks = [(name, block.placed) for name, block in sorted(drive.blocks.items())]
+        keys = list(values.keys())
+        parts = [numbers(values, key) for key in keys]
+        none = np.zeros(0, dtype=np.int64)
+        return SmootherState(
+            traverse=whole_traverse(drive),
+            options=self.options,
+            after=np.array([s.after for s in drive.stations], dtype=np.int64),
+            fate=drive.ledger.fate.astype(np.int64),
+            track=np.concatenate([none, *(placed.track for _, placed in blocks)]),
+            home=np.concatenate([none, *(np.full(len(placed.track), name) for name, placed in blocks)]),
+            vector=np.concatenate([np.zeros((0, 4)), *(placed.landmarks.vector for _, placed in blocks)]),
+            origin_m=np.concatenate([np.zeros((0, 3)), *(placed.landmarks.origin_m for _, placed in blocks)]),
+            key=np.array(keys, dtype=np.int64),
+            width=np.array([len(part) for part in parts], dtype=np.int64),
+            value=np.concatenate([np.zeros(0), *parts]),
+        )
+
+    @staticmethod
+    def of(state: SmootherState) -> "TraverseSmoother":
+        """A smoother that goes on from a state: all is linearised where it was estimated to be."""
+        t = state.traverse
+        smoother = TraverseSmoother(t.rig, state.options)
+        drive = smoother._drive
+        with blas_on_one_thread():
+            for number, stop in enumerate(t.stops):
+                frames = tuple(t.frames[i] for i in np.flatnonzero(t.frame_stop == number))
+                images = tuple(t.images[i] for i in np.flatnonzero(t.image_stop == number))
+                own = Traverse(name="", rig=t.rig, stops=(stop,), frames=frames, images=images)
+                station = Station(number, own, smoother._sharing, len(smoother._image_row))
+                if (after := int(state.after[number])) >= 0:
+                    smoother._join(station, drive.stations[after])
+                smoother._enter(station, None)
+            if t.observations is not None:
+                smoother._append(t.observations, t.observations.image)
+                drive.ledger.fate[:] = state.fate
+            drive.restore(state.track, state.home, Landmarks(vector=state.vector, origin_m=state.origin_m))
+            smoother._engine.restart(state.values())
+        return smoother
+
+    def save(self, path: Path | str) -> None:
+        """Keep everything in a file (`.npz`), to go on from with `load`. An older file stays until it is whole.
+
+        Raises InputError where there is nothing to keep or the file cannot be written.
+        """
+        from pancam_graph.io import save_smoother  # noqa: PLC0415  io imports this module
+
+        save_smoother(self.state(), Path(path))
+
+    @staticmethod
+    def load(path: Path | str) -> "TraverseSmoother":
+        """A smoother as it was saved. Raises InputError for a file of another version or a damaged one."""
+        from pancam_graph.io import load_smoother  # noqa: PLC0415  io imports this module
+
+        return TraverseSmoother.of(load_smoother(Path(path)))
 
 
 def _pairs(image: IntArray, track: IntArray) -> IntArray:

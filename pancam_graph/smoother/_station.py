@@ -33,6 +33,8 @@ class Station:
         """Key of the mast pose; None where it is held."""
         self.angles = int(gtsam.symbol("A", number))
         """Key of its angles, if any is free."""
+        self.after = -1
+        """Number of the station from which odometry led here; -1: from none."""
         self.motion: gtsam.NonlinearFactor | None = None
         """From another station, where that is known in place of the mast's pose."""
         self.own = tuple(

@@ -1,0 +1,58 @@
+"""What a smoother is made of, to be kept and to go on from."""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from pancam_graph.geometry import FloatArray, IntArray
+from pancam_graph.graph import read_variable
+from pancam_graph.smoother._options import SmootherOptions
+from pancam_graph.traverse import Traverse
+
+__all__ = ["SmootherState"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SmootherState:
+    """A drive as far as it went. What iSAM2 has of it follows from this."""
+
+    traverse: Traverse
+    """All stops with all observations, in the order in which they were added."""
+    options: SmootherOptions
+    after: IntArray
+    """(stops,) from which stop odometry led to each; -1: from none"""
+    fate: IntArray
+    """(observations,) what became of each"""
+    track: IntArray
+    """(landmarks,) ascending"""
+    home: IntArray
+    """(landmarks,) stop whose block each is of"""
+    vector: FloatArray
+    """(landmarks, 4)"""
+    origin_m: FloatArray
+    """(landmarks, 3)"""
+    key: IntArray
+    """(variables,) in GTSAM's numbering"""
+    width: IntArray
+    """(variables,) numbers of each"""
+    value: FloatArray
+    """Of all variables one after the other; of a pose the first three rows of its matrix."""
+
+    @staticmethod
+    def numbers(values: gtsam.Values, key: int) -> FloatArray:
+        """A variable as numbers."""
+        value = read_variable(values, key)
+        return value.matrix()[:3].ravel() if isinstance(value, gtsam.Pose3) else np.atleast_1d(value)
+
+    def values(self) -> gtsam.Values:
+        """The variables."""
+        out = gtsam.Values()
+        parts = np.split(self.value, np.cumsum(self.width)[:-1])
+        for key, numbers in zip(self.key.tolist(), parts, strict=True):
+            if chr(gtsam.symbolChr(key)) == "M":
+                matrix = numbers.reshape(3, 4)
+                out.insert(key, gtsam.Pose3(gtsam.Rot3(matrix[:, :3]), matrix[:, 3]))
+            else:
+                out.insert(key, numbers)
+        return out
