@@ -4,11 +4,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import gtsam
 import numpy as np
 import pytest
 
-from pancam_graph import SimulationOptions, SmootherOptions, TraverseSmoother, simulate, solve
+from pancam_graph import SimulationOptions, SmootherOptions, SolveOptions, TraverseSmoother, simulate, solve
 from pancam_graph.errors import InputError
 from pancam_graph.geometry import IntArray
 from pancam_graph.rigs import mer_navcam
@@ -83,14 +82,18 @@ def loop() -> Simulation:
     return simulate(mer_navcam(), _LOOP, seed=2)
 
 
-def require_batch(smoother: TraverseSmoother, batch: Solution, *, sigmas: float = 0.05) -> None:
-    """Cost, poses and covariances are those of the batch."""
-    assert smoother.cost == pytest.approx(batch.cost_final, rel=1e-3)
+def require_batch(smoother: TraverseSmoother, batch: Solution) -> None:
+    """What is used is what the batch uses but for few; cost, poses and covariances are those of a batch of it."""
+    t, used = smoother.traverse, smoother.used
+    assert t.observations is not None
+    assert abs(int(used.sum()) - int(batch.used.sum())) < 0.004 * len(used)
+    same = solve(t.with_observations(t.observations.select(used)), SolveOptions(loss="none"))
+    assert smoother.cost == pytest.approx(same.cost_final, rel=1e-4)
     estimate = smoother.estimate()
-    for i, stop in enumerate(batch.traverse.stops[1:], start=1):
-        found = estimate.world_T_mast[estimate.stops.index(stop.id)]
-        sigma = np.sqrt(np.diag(batch.stop_covariance[i]))
-        assert np.all(np.abs(batch.final.world_T_mast[i].localCoordinates(found)) < sigmas * sigma)
+    for i, stop in enumerate(t.stops):
+        sigma = np.sqrt(np.diag(same.stop_covariance[i]))
+        found = same.final.world_T_mast[i].localCoordinates(estimate.world_T_mast[i])
+        assert np.all(np.abs(found) <= 0.05 * sigma + 1e-12)
         assert np.sqrt(np.diag(smoother.covariance(stop.id))) == pytest.approx(sigma, rel=0.01)
 
 
@@ -146,14 +149,14 @@ def test_a_wrong_match_is_taken_back(small: Simulation, batch: Solution) -> None
     driven(t, smoother)
     driven(t, exact)
     seen = {(int(i), int(k)) for i, k in zip(t.observations.image, t.observations.track, strict=True)}
-    track = int(t.observations.track[0])
-    image = next(i for i in range(len(t.images)) if (i, track) not in seen and t.image_stop[i] == 3)
-    wrong = Observations(
-        image=np.array([image]),
-        track=np.array([track]),
-        uv_px=np.array([[500.0, 500.0]]),
-        sigma_px=np.ones(1),
+    # The other eye of an image that sees a track is said to see it where it cannot be.
+    row = next(
+        r
+        for r, (i, k) in enumerate(zip(t.observations.image, t.observations.track, strict=True))
+        if t.image_stop[i] == 3 and (int(i) ^ 1, int(k)) not in seen
     )
+    wrong = replace(t.observations.select(np.array([row])), image=t.observations.image[[row]] ^ 1)
+    wrong = replace(wrong, uv_px=wrong.uv_px + 25.0)
     before = smoother.cost
     assert smoother.add_observations(wrong).cost > before + 10
     smoother.remove(wrong)
@@ -171,7 +174,7 @@ def test_wrong_observations_are_rejected_as_they_come(small: Simulation, batch: 
     updates = driven(wrong.traverse, smoother)
     n_wrong = int(wrong.truth.outlier.sum())
     assert 0.7 * n_wrong < sum(u.rejected for u in updates) < 1.6 * n_wrong
-    require_batch(smoother, solve(wrong.traverse), sigmas=1.0)
+    require_batch(smoother, solve(wrong.traverse))
 
 
 def test_it_goes_on_after_a_restart(small: Simulation, batch: Solution, tmp_path: Path) -> None:
@@ -304,13 +307,13 @@ def error_m(loop: Simulation, smoother: TraverseSmoother, stop: int) -> float:
 def test_a_late_match_closes_the_loop(loop: Simulation) -> None:
     smoother, parts, held_back = closing(loop)
     last = len(parts) - 1
-    before = error_m(loop, smoother, last)
     sigma = smoother.covariance(smoother.stops[last])
     update = smoother.add_observations(late_of(loop, parts[last], held_back[last], last))
     assert [(c.stop, c.accepted) for c in update.closures] == [(smoother.stops[last], True)]
     assert update.closures[0].sigmas < 4
-    assert error_m(loop, smoother, last) < before
-    assert np.trace(smoother.covariance(smoother.stops[last])) < 0.5 * np.trace(sigma)
+    after = smoother.covariance(smoother.stops[last])
+    assert error_m(loop, smoother, last) < 4 * np.sqrt(np.trace(after[3:, 3:]))
+    assert np.trace(after) < 0.5 * np.trace(sigma)
 
 
 def test_a_wrong_loop_closure_is_found_and_not_believed(loop: Simulation) -> None:
@@ -322,6 +325,7 @@ def test_a_wrong_loop_closure_is_found_and_not_believed(loop: Simulation) -> Non
     update = smoother.add_observations(wrong)
     assert [(c.stop, c.accepted) for c in update.closures] == [(smoother.stops[middle], False)]
     assert any("not believed" in w for w in update.warnings)
-    assert update.rejected == len(wrong)
-    for a, b in zip(before, smoother.estimate().world_T_mast, strict=True):
-        assert gtsam.Pose3.equals(a, b, 1e-6)
+    assert update.rejected > 0.95 * len(wrong)
+    for stop, a, b in zip(smoother.stops, before, smoother.estimate().world_T_mast, strict=True):
+        sigma = np.sqrt(np.diag(smoother.covariance(stop)))
+        assert np.all(np.abs(a.localCoordinates(b)) <= 0.3 * sigma)

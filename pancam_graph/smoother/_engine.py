@@ -132,7 +132,7 @@ class Engine:
         fell_back = bool(moving) and not bends
         if fell_back:
             self.restart(solved_anew(self._drive, self._tree.estimate))
-            _, cost = self._evaluate(set(self._drive.blocks))
+            cost = self.cost
         return Rounds(
             rounds=rounds, relinearised=relinearised, blocks=handled, cost=cost, fell_back=fell_back
         )
@@ -195,6 +195,7 @@ class Engine:
         for factor in factors:
             self._priors.push_back(factor)
         self._update(factors, values, [], set(), set(self._drive.blocks))
+        self._evaluate(set(self._drive.blocks))
 
     def _update(
         self,

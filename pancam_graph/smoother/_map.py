@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 
 from pancam_graph.geometry import BoolArray, IntArray
-from pancam_graph.landmarks import Landmarks
+from pancam_graph.landmarks import Landmarks, residuals
 from pancam_graph.smoother._block import LandmarkBlock
 from pancam_graph.smoother._ledger import Fate, Ledger
 from pancam_graph.smoother._placing import Placed, Seen, believed, combined, gathered, placed_anew
@@ -88,6 +88,11 @@ class DriveMap:
         rows = np.concatenate([self.ledger.all_with(fate) for fate in fates])
         return rows[np.isin(self.ledger.track[rows], track)]
 
+    def near_blocks(self, track: IntArray) -> set[int]:
+        """Stations of the blocks that tracks are of."""
+        home = self.home(track)
+        return {s for name in np.unique(home[home >= 0]).tolist() for s in self.blocks[name].patch.place}
+
     def take_in(self, rows: IntArray, cameras: Postures, change: Change, but: IntArray) -> None:
         """Landmarks get observations, or are born of them; what waited for a second ray takes part too.
 
@@ -96,11 +101,15 @@ class DriveMap:
         ledger = self.ledger
         track = np.unique(ledger.track[rows])
         rows = np.union1d(rows, np.setdiff1d(self.idle(track, Fate.WAITING, Fate.OUTLIER), but))
+        # What was rejected about here may be judged too early: it is looked at again.
+        around = self.near_blocks(track) | set(self.station_of(rows).tolist())
+        out = ledger.all_with(Fate.OUTLIER)
+        rows = np.union1d(rows, out[np.isin(self.station_of(out), list(around))])
+        track = np.unique(ledger.track[rows])
         own, station = np.searchsorted(track, ledger.track[rows]), self.station_of(rows)
         home = self.home(track)
         known = home >= 0
-        fits = ledger.fate[rows] != int(Fate.OUTLIER)
-        enough = np.bincount(own, fits, minlength=len(track)) >= 2
+        enough = np.bincount(own, minlength=len(track)) >= 2
         first = np.full(len(track), len(self.stations))
         np.minimum.at(first, own, station)
         home = np.where(known, home, np.where(enough, first, -1))
@@ -116,6 +125,29 @@ class DriveMap:
         home, home_idle = self.home(ledger.track[rows]), self.home(ledger.track[idle])
         for name in np.unique(home[home >= 0]).tolist():
             self._rebuild(name, idle[home_idle == name], rows[home == name], cameras, change)
+
+    def drop_behind(self, cameras: Postures, change: Change) -> None:
+        """Landmarks lose observations of cameras that they have come to lie behind of."""
+        for name in [name for name, block in self.blocks.items() if block.system.any_behind]:
+            block = self.blocks[name]
+            placed, views = block.placed, block.patch.views(cameras)
+            everywhere = np.ones(len(placed.track), dtype=bool)
+            seen = Seen(
+                placed=placed,
+                touched=everywhere,
+                fresh=~everywhere,
+                accepted=np.ones(len(placed.measurements.row), dtype=bool),
+            )
+            placed = placed_anew(seen, views).placed
+            _, in_front = residuals(placed.landmarks, placed.measurements, views)
+            lost = placed.measurements.row[~in_front]
+            if len(lost):
+                self.ledger.set_fate(lost, Fate.OUTLIER)
+                change.rejected += len(lost)
+                self._rebuild(name, lost[:0], lost, cameras, change)
+            else:  # found in front after all
+                block.replace(placed)
+                change.touched.add(name)
 
     def _rebuild(self, name: int, rows: IntArray, lost: IntArray, cameras: Postures, change: Change) -> None:
         ledger, block = self.ledger, self.blocks.pop(name, None)

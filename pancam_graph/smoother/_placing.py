@@ -210,4 +210,6 @@ def believed(seen: Seen, views: CameraViews, cutoff_sigma: float | None) -> Seen
         beyond_infinity=True,
         only=np.flatnonzero(suspect),
     )
+    _, in_front = residuals(landmarks, m, views)
+    accepted &= in_front | ~suspect[m.landmark]
     return replace(seen, placed=replace(placed, landmarks=landmarks), accepted=accepted)

@@ -10,7 +10,7 @@ import numpy as np
 from pancam_graph._diagnose import listed
 from pancam_graph.cameras import carry_to_pinhole
 from pancam_graph.errors import InputError
-from pancam_graph.geometry import FloatArray, IntArray
+from pancam_graph.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.landmarks import Landmarks
 from pancam_graph.rigs import Rig
 from pancam_graph.sharing import Sharing
@@ -62,6 +62,16 @@ class TraverseSmoother:
     def images(self) -> tuple[str, ...]:
         """Ids of the images, in the order in which they were added."""
         return tuple(self._image_row)
+
+    @property
+    def traverse(self) -> Traverse:
+        """All stops with all observations, in the order in which they were added."""
+        return whole_traverse(self._drive)
+
+    @property
+    def used(self) -> BoolArray:
+        """(observations,) which of the traverse's take part."""
+        return np.asarray(self._drive.ledger.fate == int(Fate.USED))
 
     @property
     def cost(self) -> float:
@@ -227,8 +237,25 @@ class TraverseSmoother:
         change = Change()
         drive.take_in(near, Postures(known), change, far)
         first = drive.stations[0].shared_priors() if station.number == 0 else []
-        done = [engine.advance(change, [*first, *station.factors(firm=False)], station, new)]
+        done = self._advanced(change, [*first, *station.factors(firm=False)], station, new)
         return self._closed(station, rows, far, change, done, begin)
+
+    def _advanced(
+        self,
+        change: Change,
+        factors: Sequence[gtsam.NonlinearFactor] = (),
+        station: Station | None = None,
+        values: gtsam.Values | None = None,
+    ) -> list[Rounds]:
+        """Bring the estimate up to date, and set aside what has come to lie behind its cameras."""
+        drive, engine = self._drive, self._engine
+        done = [engine.advance(change, factors, station, values)]
+        late = Change()
+        drive.drop_behind(Postures(engine.estimate), late)
+        if late.touched or late.slots:
+            change.rejected += late.rejected
+            done.append(engine.advance(late))
+        return done
 
     def _guess(self, station: Station, previous: Station | None) -> gtsam.Pose3:
         """Where odometry from the previous stop leads; without one, where telemetry has it."""
@@ -310,14 +337,20 @@ class TraverseSmoother:
                 done.append(engine.bend(factor))
             change = Change()
             drive.take_in(loop.rows, Postures(engine.estimate), change, np.setdiff1d(far, loop.rows))
-            done.append(engine.advance(change))
+            done += self._advanced(change)
             rejected += change.rejected
         late = ledger.with_fate(np.setdiff1d(far, known), Fate.WAITING)
+        # Pairs of rays across a loop say too little to be judged alone: they share the fate of the others.
+        doubted = {c.stop for c in closures if not c.accepted} - {c.stop for c in closures if c.accepted}
+        of_doubted = np.isin(drive.station_of(late), [self._stop[stop].number for stop in doubted])
+        ledger.set_fate(late[of_doubted], Fate.CLOSURE)
+        rejected += int(of_doubted.sum())
+        late = late[~of_doubted]
         if len(late):
             change = Change()
             drive.take_in(late, Postures(engine.estimate), change, late[:0])
             if change.touched or change.slots:
-                done.append(engine.advance(change))
+                done += self._advanced(change)
             rejected += change.rejected
         return self._update(station, rows, rejected, done, tuple(closures), begin)
 
@@ -360,13 +393,13 @@ class TraverseSmoother:
                 out.append(
                     f"stop {c.stop}: {c.observations} observations of tracks at {c.other} are not believed: {why}"
                 )
-        # A place that is seen twice or more from here, and is never the one that the track had.
-        track, inverse = np.unique(ledger.track[rows], return_inverse=True)
-        lost = np.bincount(inverse, ledger.fate[rows] == int(Fate.OUTLIER), minlength=len(track))
-        total = np.bincount(inverse, minlength=len(track))
-        twice = (lost == total) & (total >= 2) & (drive.home(track) >= 0)
-        if twice.any():
-            names = [str(t) for t in track[twice]]
+        # A place that a stop sees twice or more, and is not the one that the track has elsewhere.
+        astray = drive.idle(np.unique(ledger.track[rows]), Fate.OUTLIER)
+        pairs = np.column_stack([ledger.track[astray], drive.station_of(astray)])
+        pairs, counts = np.unique(pairs, axis=0, return_counts=True)
+        track = np.unique(pairs[counts >= 2, 0])
+        if len(track):
+            names = [str(t) for t in track]
             out.append(
                 f"{listed(names, 'track')}: the number stands for another place than before; the new observations are left out"
             )
@@ -387,7 +420,7 @@ class TraverseSmoother:
             near, far = self._by_nearness(rows, {})
             change = Change()
             self._drive.take_in(near, Postures(self._engine.estimate), change, far)
-            return self._closed(None, rows, far, change, [self._engine.advance(change)], begin)
+            return self._closed(None, rows, far, change, self._advanced(change), begin)
 
     def remove(self, observations: Observations) -> Update:
         """Take back observations: those with the same `image` (row of `images`) and `track`.
@@ -414,7 +447,7 @@ class TraverseSmoother:
             ledger.set_fate(rows, Fate.REMOVED)
             change = Change()
             self._drive.give_up(used, Postures(self._engine.estimate), change)
-            done = [self._engine.advance(change)] if change.touched or change.slots else []
+            done = self._advanced(change) if change.touched or change.slots else []
         return self._update(None, rows, change.rejected, done, (), begin)
 
     def _rows_of_images(self, observations: Observations) -> IntArray:
