@@ -1,7 +1,7 @@
 """One solve, from measurements to solution."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import gtsam
@@ -158,6 +158,15 @@ class Adjustment:
             self._screen_at_start()
             self._screening_rounds()
         self.outcome = self._final_rounds()
+        self.final = _state(self.problem)
+        self.uncertainty = self._uncertainty()
+
+    def take_over(self, values: gtsam.Values, used: BoolArray, costs: Sequence[float], reason: str) -> None:
+        """In place of `solve`: what was solved elsewhere, over the observations (n,) that were used there."""
+        m = self.problem.measurements
+        problem = replace(self.problem, accepted=used[m.row], values=values)
+        self.problem = _triangulated(problem).placed()
+        self.outcome = Outcome(values=values, converged=True, reason=reason, costs=tuple(costs))
         self.final = _state(self.problem)
         self.uncertainty = self._uncertainty()
 

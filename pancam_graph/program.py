@@ -15,6 +15,7 @@ from rich.table import Table
 from pancam_graph._honest import CrossValidation
 from pancam_graph._optimise import Iteration
 from pancam_graph.errors import PancamGraphError
+from pancam_graph.smoother import Update
 from pancam_graph.solution import Solution
 
 __all__ = ["SHARING_HELP", "Parser", "Progress", "print_summary", "run", "show_log"]
@@ -90,6 +91,16 @@ class Progress:
     def iteration(self, iteration: Iteration) -> None:
         """Progress of the solve."""
         self.say(f"{_STAGES[iteration.stage]}: step {iteration.number}, cost {iteration.cost:.6g}")
+
+    def stop(self, update: Update) -> None:
+        """A line for a stop that was added; on standard output, which a terminal or a file shows."""
+        closed = "".join(f", closes a loop to {c.other}" for c in update.closures if c.accepted)
+        line = (
+            f"{update.stop}: {update.observations} observations, cost {update.cost:.6g}, "
+            f"{update.blocks} blocks, {update.relinearised} relinearised, {update.seconds:.3f} s{closed}"
+        )
+        sys.stdout.write(f"{line}\n")
+        sys.stdout.flush()
 
 
 def print_summary(solution: Solution, where: str) -> None:

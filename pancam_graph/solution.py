@@ -19,7 +19,7 @@ from pancam_graph.traverse import Traverse
 if TYPE_CHECKING:
     from pancam_graph.images.mosaic import MosaicOptions
 
-__all__ = ["Refined", "RigCorrection", "Seconds", "Solution", "State", "rms_px"]
+__all__ = ["Incremental", "Refined", "RigCorrection", "Seconds", "Solution", "State", "rms_px"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -115,6 +115,17 @@ def rms_px(residuals_px: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.sum(residuals_px**2, axis=1)))) if len(residuals_px) else 0.0
 
 
+@dataclass(frozen=True, kw_only=True)
+class Incremental:
+    """What each update of a smoother took, in the order of the stops."""
+
+    seconds_per_stop: tuple[float, ...]
+    cost_per_stop: tuple[float, ...]
+    """After each."""
+    relinearised_per_stop: tuple[int, ...]
+    """Variables that moved to another point of linearisation."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solution:
     """The adjusted traverse, with what it was before, how sure it is, and what went wrong."""
@@ -165,6 +176,8 @@ class Solution:
     """How it was solved."""
     cross_validation: CrossValidation | None = None
     """What solutions from halves of the tracks say of the sigmas; where it was asked for."""
+    incremental: "Incremental | None" = None
+    """How it came about, where it was followed stop by stop."""
     warnings: tuple[str, ...] = ()
     seconds: Seconds = field(default_factory=Seconds)
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from pancam_graph import SolveOptions, cross_validate, find_observations, read_input, solve
 from pancam_graph.images.mosaic import MosaicOptions
+from pancam_graph.incremental import solve_incrementally
 from pancam_graph.io import EXPORTS, check_exports, check_out
 from pancam_graph.kernel import must_compile
 from pancam_graph.program import SHARING_HELP, Parser, Progress, print_summary, run, show_log
@@ -62,6 +63,11 @@ def main() -> int:
     )
     parser.add_argument("--sharing", nargs="+", default=(), metavar="WORD", help=SHARING_HELP)
     parser.add_argument(
+        "--incremental",
+        action="store_true",
+        help="add the stops one by one as a rover does, with iSAM2 (model mast), a line for each",
+    )
+    parser.add_argument(
         "--cross-validate",
         action="store_true",
         help="solve halves of the terrain points too, and show honest sigmas beside the formal ones",
@@ -98,7 +104,11 @@ def main() -> int:
         read_s = time.perf_counter() - begin
         if must_compile():
             progress.say(COMPILING)
-        solution = solve(traverse, options, on_iteration=progress.iteration).with_seconds(read=read_s)
+        if arguments.incremental:
+            solution = solve_incrementally(traverse, options, on_stop=progress.stop)
+        else:
+            solution = solve(traverse, options, on_iteration=progress.iteration)
+        solution = solution.with_seconds(read=read_s)
         if arguments.cross_validate:
             found = cross_validate(traverse, options, solution=solution, progress=progress.counted)
             solution = solution.with_cross_validation(found)

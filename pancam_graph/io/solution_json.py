@@ -13,7 +13,7 @@ from pancam_graph.geometry import FloatArray, IntArray
 from pancam_graph.io._cross_validation import CrossValidationEntry
 from pancam_graph.io._json import read_json, validated
 from pancam_graph.io._schema import SOLUTION_FORMAT, VERSION, CameraEntry, Entry, PoseEntry, camera_entry
-from pancam_graph.solution import Solution
+from pancam_graph.solution import Incremental, Solution
 
 __all__ = ["SolutionFile", "read_solution_json", "solution_file", "solution_json"]
 
@@ -86,6 +86,23 @@ class RefinedEntry(Entry):
     prior_sigma: float | None
 
 
+class IncrementalEntry(Entry):
+    """What each stop took, in order."""
+
+    seconds_per_stop: list[float]
+    cost_per_stop: list[float]
+    relinearised_per_stop: list[int]
+
+    @staticmethod
+    def of(found: Incremental) -> "IncrementalEntry":
+        """The entry of what a smoother did."""
+        return IncrementalEntry(
+            seconds_per_stop=[float(s) for s in found.seconds_per_stop],
+            cost_per_stop=[float(c) for c in found.cost_per_stop],
+            relinearised_per_stop=[int(n) for n in found.relinearised_per_stop],
+        )
+
+
 class SolutionFile(Entry):
     """`solution.json`."""
 
@@ -113,6 +130,8 @@ class SolutionFile(Entry):
     warnings: list[str]
     cross_validation: CrossValidationEntry | None = None
     """Where it was asked for; else the key is missing."""
+    incremental: IncrementalEntry | None = None
+    """Where stops were added one by one; else the key is missing."""
 
 
 def read_solution_json(path: Path | str) -> SolutionFile:
@@ -127,6 +146,7 @@ def solution_json(solution: Solution) -> bytes:
         "method": solution.method == "joint",
         "refined": not solution.refined,
         "cross_validation": solution.cross_validation is None,
+        "incremental": solution.incremental is None,
     }
     data = solution_file(solution).model_dump(exclude={name for name, gone in missing.items() if gone})
     return f"{json.dumps(data, indent=1, allow_nan=False, ensure_ascii=False)}\n".encode()
@@ -195,6 +215,7 @@ def solution_file(solution: Solution) -> SolutionFile:
         warnings=list(dict.fromkeys([*traverse.warnings, *solution.warnings])),
         method=solution.method,
         cross_validation=None if validation is None else CrossValidationEntry.of(validation, traverse),
+        incremental=None if solution.incremental is None else IncrementalEntry.of(solution.incremental),
     )
 
 

@@ -63,6 +63,10 @@ class TraverseSmoother:
         """Ids of the images, in the order in which they were added."""
         return tuple(self._image_row)
 
+    def values(self) -> gtsam.Values:
+        """All variables where they are now, under the keys that a batch of the drive has."""
+        return gtsam.Values(self._engine.estimate)
+
     @property
     def traverse(self) -> Traverse:
         """All stops with all observations, in the order in which they were added."""
