@@ -24,6 +24,8 @@ __all__ = ["Placed", "Seen", "believed", "combined", "gathered", "placed_anew"]
 
 _FEW_VIEWS = 4
 """Landmarks with no more observations may hide an outlier in residuals that are all small."""
+_WIDEST = 3.0
+"""Noise is not taken to be more than so many times what observations say of themselves."""
 _HIDDEN = 3.0
 """Others hide none in residuals whose squares are so many times below the limit."""
 
@@ -182,7 +184,8 @@ def believed(seen: Seen, views: CameraViews, cutoff_sigma: float | None) -> Seen
     suspect &= seen.touched
     if not suspect.any():
         return seen
-    judged = seen.touched & (count > 2)
+    # By all landmarks of the block: those touched may be few, and all wrong.
+    judged = count > 2
     scale = float(np.sqrt(np.median(total[judged] / (2 * count[judged] - 3)))) if judged.any() else 1.0
     rows = np.flatnonzero(suspect[m.landmark])
     part = m.part(rows)
@@ -193,7 +196,7 @@ def believed(seen: Seen, views: CameraViews, cutoff_sigma: float | None) -> Seen
         seen.accepted[rows],
         cutoff_sigma=cutoff_sigma,
         min_scale=1.0,
-        scale=max(1.0, scale),
+        scale=float(np.clip(scale, 1.0, _WIDEST)),
     )
     accepted, vector, origin = (
         seen.accepted.copy(),
