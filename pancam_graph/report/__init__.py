@@ -3,10 +3,12 @@
 from pathlib import Path
 
 from pancam_graph.images.mosaic import WrittenMosaics
+from pancam_graph.report._drive import DriveStep
+from pancam_graph.report._drive import write_drive
 from pancam_graph.report._page import make_page
 from pancam_graph.solution import Solution
 
-__all__ = ["write_report"]
+__all__ = ["DriveStep", "write_drive", "write_report"]
 
 
 def write_report(solution: Solution, path: Path | str, mosaics: WrittenMosaics | None = None) -> None:

@@ -1,12 +1,7 @@
 """The page: words, headline figures, and everything put together in one file."""
 
-import base64
-import gzip
 import json
-from functools import lru_cache
 from html import escape
-
-from plotly.offline import get_plotlyjs
 
 from pancam_graph.images.mosaic import WrittenMosaics
 from pancam_graph.report._cross_validation import cross_validation_section
@@ -16,6 +11,7 @@ from pancam_graph.report._look import AFTER, BEFORE, REJECTED, Figure, axis, lay
 from pancam_graph.report._map import make_map
 from pancam_graph.report._mosaics import mosaic_section
 from pancam_graph.report._numbers import Json, fixed, short
+from pancam_graph.report._packed import packed, packed_plotly
 from pancam_graph.report._scene import make_masts, make_scene
 from pancam_graph.report._script import SCRIPT
 from pancam_graph.report._style import STYLE
@@ -72,8 +68,8 @@ def make_page(solution: Solution, mosaics: WrittenMosaics | None = None) -> str:
         images=image_table(solution, table),
         stops=stop_table(solution),
         rig=RIG.format(table=rig_table(solution)) if solution.refined else "",
-        plotly=_packed_plotly(),
-        figures=_packed(json.dumps(data, separators=(",", ":"), allow_nan=False)),
+        plotly=packed_plotly(),
+        figures=packed(json.dumps(data, separators=(",", ":"), allow_nan=False)),
         script=SCRIPT,
     )
 
@@ -209,13 +205,3 @@ def _vector_figure(shown: int, *, seen: int) -> Figure:
         ),
         caption=caption,
     )
-
-
-def _packed(text: str) -> str:
-    """Text compressed and in letters; the same letters for the same text."""
-    return base64.b64encode(gzip.compress(text.encode("utf-8"), 9, mtime=0)).decode("ascii")
-
-
-@lru_cache(maxsize=1)
-def _packed_plotly() -> str:
-    return _packed(get_plotlyjs())
