@@ -229,13 +229,13 @@ def test_bad_input_changes_nothing(small: Simulation) -> None:
     one = Observations(
         image=np.array([0]), track=np.array([10**6]), uv_px=np.array([[1.0, 1.0]]), sigma_px=np.ones(1)
     )
-    with pytest.raises(InputError, match="stop stop0001: .* added already"):
+    with pytest.raises(InputError, match=r"stop stop0001: .* added already"):
         smoother.add_stop(*parts[1])
     with pytest.raises(InputError, match="'frame00000' of another stop"):
         smoother.add_stop(
             replace(parts[2][0]), [replace(f, stop=parts[2][0].id) for f in parts[0][1]], parts[0][2]
         )
-    with pytest.raises(InputError, match="image, row 0: expected a row of the 20 images .* found 20"):
+    with pytest.raises(InputError, match=r"image, row 0: expected a row of the 20 images .* found 20"):
         smoother.add_observations(replace(one, image=np.array([20])))
     with pytest.raises(InputError, match="to see a track once"):
         smoother.add_observations(parts[0][3].select(np.array([0])))

@@ -44,7 +44,8 @@ def save_smoother(state: SmootherState, path: Path) -> None:
         columns = {name: getattr(state.traverse.observations, name) for name in _COLUMNS}
         arrays |= {f"observations_{name}": c for name, c in columns.items() if c is not None}
     content = io.BytesIO()
-    np.savez(content, **arrays)
+    savez: Any = np.savez  # its stub takes every keyword for the flag allow_pickle
+    savez(content, **arrays)
     try:
         whole_file(path, content.getvalue())
     except OSError as error:
@@ -81,7 +82,7 @@ def _state(path: Path, header: dict[str, Any], arrays: dict[str, NDArray[Any]]) 
         options["sharing"] = SharingEntry.model_validate(sharing).sharing()
     traverse = traverse_of(validated(TraverseFile, header["traverse"], path), path.parent)
     if "observations_image" in arrays:
-        columns = {name: arrays[f"observations_{name}"] for name in _COLUMNS[:-1]}
+        columns: dict[str, Any] = {name: arrays[f"observations_{name}"] for name in _COLUMNS[:-1]}
         covariance = arrays.get("observations_covariance_px2")
         traverse = traverse.with_observations(Observations(**columns, covariance_px2=covariance))
         if len(arrays["fate"]) != len(arrays["observations_image"]):

@@ -3,8 +3,7 @@
 from pathlib import Path
 
 from pancam_graph.images.mosaic import WrittenMosaics
-from pancam_graph.report._drive import DriveStep
-from pancam_graph.report._drive import write_drive
+from pancam_graph.report._drive import DriveStep, write_drive
 from pancam_graph.report._page import make_page
 from pancam_graph.solution import Solution
 

@@ -61,13 +61,14 @@ class DriveStep:
         """Errors as shares of the distance."""
         driven = max(self.driven_m, 1e-9)
         return (
-            f"{self.driven_m:.0f} m driven, error {self.error_m:.3f} m ({100 * self.error_m / driven:.3f} %), "
+            f"{self.driven_m:.0f} m driven, error {self.error_m:.3f} m "
+            f"({100 * self.error_m / driven:.3f} %), "
             f"odometry alone {self.odometry_error_m:.2f} m ({100 * self.odometry_error_m / driven:.2f} %)"
         )
 
 
 def write_drive(steps: Sequence[DriveStep], simulation: Simulation, path: Path | str) -> None:
-    """Write the replay as one self-contained HTML file."""
+    """Write the replay as one self-contained HTML file; its folder must exist."""
     Path(path).write_text(_page(steps, simulation), encoding="utf-8", newline="\n")
 
 
@@ -102,8 +103,8 @@ def _page(steps: Sequence[DriveStep], simulation: Simulation) -> str:
             {
                 "type": "scatter",
                 "name": name,
-                "x": list(range(1, len(steps) + 1)),
-                "y": rounded([max(1e-4, getattr(s, what)) for s in steps], 4),
+                "x": list(range(2, len(steps) + 1)),
+                "y": rounded([getattr(s, what) for s in steps[1:]], 4),
                 "mode": "lines+markers",
                 "line": {"color": colour},
             }
@@ -210,7 +211,7 @@ async function unpacked(id) {{
 (async () => {{
   (0, eval)(await unpacked("packed-plotly"));
   const page = JSON.parse(await unpacked("packed-figures"));
-  const config = {{ displaylogo: false, responsive: true }};
+  const config = {{ displaylogo: false, responsive: true, showSendToCloud: false, plotlyServerURL: "" }};
   const at = document.getElementById("at"), note = document.getElementById("note");
   const truth = page.map.data[0];
   const show = () => {{

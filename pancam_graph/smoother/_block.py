@@ -1,11 +1,12 @@
 """A block of landmarks, eliminated: one factor of iSAM2 on the variables of the stops that see them.
 
-The block is linearised at the point of linearisation that iSAM2 has of these variables, and handed over as the
-quadratic that is left there: GTSAM's own container of a linear factor. It is taken out and put in again when
+The block is linearised at the point of linearisation that iSAM2 has of these variables, and handed over as
+the quadratic that is left there: GTSAM's own container of a linear factor. It is taken out and put in again when
 its landmarks are seen again, and when iSAM2 moves a variable of it to another point.
 """
 
 from dataclasses import replace
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -144,7 +145,7 @@ def _quadratic(panels: Panels, system: LandmarkSystem) -> gtsam.HessianFactor:
                 rest += [(w, panel, int(first) + int(column[w])) for w in members[h]]
             for j in range(0, len(rest), 2):
                 pair = rest[j : j + 2]
-                keys = [link.key[v], *(link.key[w] for w, _, _ in pair)]
+                keys: Any = [link.key[v], *(link.key[w] for w, _, _ in pair)]
                 p = [source[a, c : c + dims[w]] for w, source, c in pair]
                 d = [dims[v], *(dims[w] for w, _, _ in pair)]
                 if len(pair) == 2:

@@ -88,7 +88,9 @@ def judged(
     inliers, found = 1.0, here
     square = 0.0
     if station.mast is not None:
-        priors = [gtsam.PriorFactorPose3(station.mast, here, gtsam.noiseModel.Gaussian.Covariance(known))]
+        priors: list[gtsam.NonlinearFactor] = [
+            gtsam.PriorFactorPose3(station.mast, here, gtsam.noiseModel.Gaussian.Covariance(known))
+        ]
         priors += _held(station, values)
         located = localise(station, values, seen, priors, robust=True)
         found = located.values.atPose3(station.mast)
@@ -124,7 +126,7 @@ def _held(station: Station, values: gtsam.Values) -> list[gtsam.NonlinearFactor]
 
 
 def bridge(loop: Loop, values: gtsam.Values, found: gtsam.Pose3) -> gtsam.NonlinearFactor | None:
-    """What joins the station of a believed closure to the anchor while the drive bends; None if nothing need."""
+    """What joins the station of a believed closure to the anchor while the drive bends; None if it is held."""
     noise, mast = gtsam.noiseModel.Diagonal.Sigmas(_BRIDGE_SIGMAS), loop.station.mast
     if mast is None:
         return None

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from pancam_graph.geometry import FloatArray
 from pancam_graph.smoother._batch import solved_anew
 from pancam_graph.smoother._frame import orthonormal
 from pancam_graph.smoother._map import Change, DriveMap
@@ -59,7 +60,7 @@ class Engine:
         """All variables where they were linearised."""
         return self._tree.theta
 
-    def covariance(self, keys: Sequence[int]) -> np.ndarray:  # type: ignore[type-arg]
+    def covariance(self, keys: Sequence[int]) -> FloatArray:
         """Joint covariance of variables."""
         return self._tree.covariance(keys)
 
@@ -206,9 +207,10 @@ class Engine:
         affected: set[int],
     ) -> list[int]:
         """One update of iSAM2, with the factors of these blocks anew; the slots of the other factors."""
-        blocks = [block for b in sorted(affected) if (block := self._drive.blocks[b]).factor is not None]
-        slots = self._tree.update([*factors, *(b.factor for b in blocks)], values, removed, moving)
-        for block, slot in zip(blocks, slots[len(factors) :], strict=True):
+        blocks = [self._drive.blocks[b] for b in sorted(affected)]
+        pairs = [(block, made) for block in blocks if (made := block.factor) is not None]
+        slots = self._tree.update([*factors, *(made for _, made in pairs)], values, removed, moving)
+        for (block, _), slot in zip(pairs, slots[len(factors) :], strict=True):
             block.slot = slot
         return slots[: len(factors)]
 

@@ -1,7 +1,7 @@
 """How stops move together: what they do alike changes nothing that a block of landmarks says.
 
-A block's quadratic, in the body-frame tangents of its mast poses, is exact under a motion of the whole: with
-T_i = exp(xi) theta_i the tangent is Ad(theta_i)^-1 xi, however large xi is. So it is how stops move against each
+A block's quadratic, in the body-frame tangents of its mast poses, is exact under a motion of the whole:
+with T_i = exp(xi) theta_i the tangent is Ad(theta_i)^-1 xi, however large xi is. So it is how stops move against each
 other that a linearisation must be near to, and landmarks are carried along by the common motion.
 """
 
@@ -21,8 +21,9 @@ class CommonMotion:
     """The motion of the world that moves some masts from where they were linearised as they moved."""
 
     def __init__(self, theta: Sequence[gtsam.Pose3], unit: FloatArray, *, held: bool) -> None:
-        """`unit` (6,) are the angles and distances that weigh alike. `held`: one of the masts cannot move,
-        and so neither can the world.
+        """`unit` (6,) are the angles and distances that weigh alike.
+
+        `held`: one of the masts cannot move, and so neither can the world.
         """
         self._unit = np.tile(unit, len(theta))
         alike = np.concatenate([np.zeros((0, 6)), *(pose.inverse().AdjointMap() for pose in theta)])
@@ -30,7 +31,7 @@ class CommonMotion:
         self._solve = np.linalg.pinv(self._alike)
 
     def of(self, delta: FloatArray) -> tuple[FloatArray, float]:
-        """Twist (6,) of the world, and the largest of what masts do beside it in units, from tangents (6n,)."""
+        """Twist (6,) of the world, and the most that masts do beside it in units, from tangents (6n,)."""
         scaled = delta / self._unit
         twist = self._solve @ scaled
         return twist, float(np.abs(scaled - self._alike @ twist).max(initial=0.0))

@@ -43,7 +43,9 @@ class Ledger:
 
     def __init__(self) -> None:
         self._n = 0
-        self._column = {name: np.zeros((1024, *shape), dtype) for name, (shape, dtype) in _COLUMNS.items()}
+        self._column: dict[str, NDArray[Any]] = {
+            name: np.zeros((1024, *shape), dtype) for name, (shape, dtype) in _COLUMNS.items()
+        }
         self.has_covariances = False
 
     def __len__(self) -> int:
@@ -86,27 +88,27 @@ class Ledger:
 
     @property
     def image(self) -> IntArray:
-        """(n,) row among the drive's images"""
+        """(n,) row among the drive's images."""
         return self._all("image")
 
     @property
     def track(self) -> IntArray:
-        """(n,)"""
+        """(n,) number of each one's track."""
         return self._all("track")
 
     @property
     def carried_px(self) -> FloatArray:
-        """(n, 2) pixels of the pinhole of the same camera"""
+        """(n, 2) pixels of the pinhole of the same camera."""
         return self._all("carried_px")
 
     @property
     def whitening(self) -> FloatArray:
-        """(n, 2, 2) takes a residual of the pinhole to raw pixels of unit covariance"""
+        """(n, 2, 2) takes a residual of the pinhole to raw pixels of unit covariance."""
         return self._all("whitening")
 
     @property
     def fate(self) -> NDArray[np.int8]:
-        """(n,) of Fate; may be written to"""
+        """(n,) of Fate; may be written to."""
         return self._all("fate")
 
     @property
@@ -123,7 +125,8 @@ class Ledger:
 
     def with_fate(self, rows: IntArray, fate: Fate) -> IntArray:
         """Which of the rows have this fate."""
-        return rows[self.fate[rows] == int(fate)]
+        found: IntArray = rows[self.fate[rows] == int(fate)]
+        return found
 
     def all_with(self, fate: Fate) -> IntArray:
         """All rows that have this fate."""

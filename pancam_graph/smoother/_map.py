@@ -1,4 +1,4 @@
-"""What a drive consists of: stations, observations, and landmarks in blocks by the stop that saw them first."""
+"""What a drive consists of: stations, observations, landmarks in blocks by the stop that saw them first."""
 
 from dataclasses import dataclass, field, replace
 
@@ -118,7 +118,7 @@ class DriveMap:
             self._rebuild(name, rows[of_row == name], np.zeros(0, dtype=np.int64), cameras, change)
 
     def give_up(self, rows: IntArray, cameras: Postures, change: Change) -> None:
-        """Landmarks lose observations, whose fate has been set; others that these had ruled out may come back."""
+        """Landmarks lose observations, whose fate is set; others that these had ruled out may come back."""
         ledger = self.ledger
         track = np.unique(ledger.track[rows])
         idle = self.idle(track, Fate.OUTLIER)
@@ -211,7 +211,7 @@ class DriveMap:
         return out
 
     def excerpt(self, track: IntArray, rows: IntArray, free: Station) -> Seen:
-        """Some tracks (ascending) with all their observations, and new rows, as if one station alone moved."""
+        """Some tracks (ascending) with all their observations, and new rows, as if one station moved."""
         home = self.home(track)
         parts = []
         for name in np.unique(home[home >= 0]).tolist():

@@ -19,13 +19,13 @@ class SmootherOptions:
 
     telemetry: Literal["absolute", "odometry"] = "absolute"
     """How stops' poses and sigmas are meant: "absolute": each is a prior of its own, as `solve` takes it;
-    "odometry": of all but the first, only the motion from one stop to the next counts, and the sigmas are that
-    motion's, in the body frame of the later stop."""
+    "odometry": of all but the first, only the motion from one stop to the next counts, and the sigmas are
+    that motion's, in the body frame of the later stop."""
     sharing: Sharing | None = None
     """What of the rig is free, and who shares it; None: nothing is. As for `solve` with the model `mast`."""
     relinearise_rad: float = 1e-3
-    """A block of landmarks is linearised anew where an angle, or how its masts are turned against each other,
-    has moved by more."""
+    """A block of landmarks is linearised anew where an angle, or how its masts are turned against each
+    other, has moved by more."""
     relinearise_m: float = 1e-2
     """The same for how its masts stand to each other."""
     relinearise_rig: float = 1e-3
@@ -35,10 +35,10 @@ class SmootherOptions:
     """An observation goes where noise would take it less often than a Gaussian beyond this many sigmas; None:
     all are kept."""
     closure_probability: float = 1e-6
-    """A loop closure is believed unless a right one would contradict the drive so much less often than this."""
+    """A loop closure is believed unless a right one would contradict the drive as much less often than so."""
     max_rounds: int = 8
-    """So many times at most an update is linearised anew; then, or where a step raises the cost, all is solved
-    by Levenberg-Marquardt, as `solve` does."""
+    """So many times at most an update is linearised anew; then, or where a step raises the cost, all is
+    solved by Levenberg-Marquardt, as `solve` does."""
 
     def __post_init__(self) -> None:
         """Check the choices."""

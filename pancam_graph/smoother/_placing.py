@@ -110,7 +110,7 @@ def gathered(
     rows: IntArray,
     lost: IntArray,
 ) -> Seen:
-    """Known landmarks, less rows of the ledger that they lose, and new rows, be they of these tracks or others.
+    """Known landmarks, less rows of the ledger that they lose, and new rows, of these tracks or others.
 
     Rows that are outliers take part as such.
     """
@@ -148,7 +148,7 @@ def gathered(
 
 
 def placed_anew(seen: Seen, views: CameraViews) -> Seen:
-    """Fresh landmarks from their rays, and all that are touched where they fit best with cameras as they are."""
+    """Fresh landmarks from their rays, and all that are touched where they fit best with these cameras."""
     placed = seen.placed
     m, landmarks, weight = placed.measurements, placed.landmarks, seen.accepted.astype(float)
     if seen.fresh.any():

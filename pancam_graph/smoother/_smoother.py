@@ -140,8 +140,8 @@ class TraverseSmoother:
     ) -> Update:
         """Add a stop with all its frames, images and observations.
 
-        `observations.image` are rows of `images`; tracks have the same numbers over the whole drive. `after` is
-        the stop from which odometry leads here; default: the one added last. Raises InputError, and changes
+        `observations.image` are rows of `images`; tracks have the same numbers over the whole drive. `after`
+        is the stop from which odometry leads here; default: the one added last. Raises InputError, and changes
         nothing, where an id or a number makes no sense or was added before.
         """
         begin = time.perf_counter()
@@ -273,11 +273,14 @@ class TraverseSmoother:
         self, station: Station, previous: Station | None, values: gtsam.Values
     ) -> list[gtsam.NonlinearFactor]:
         """Priors of a station's own variables while the others are held."""
-        if station.motion is None or previous is None or previous.mast is None:
+        between = station.motion
+        if previous is None or previous.mast is None or not isinstance(between, gtsam.BetweenFactorPose3):
             return station.factors(firm=True)
+        assert station.mast is not None  # odometry leads to masts that move
+        moved = between.measured()
         own = copied(values, [previous.mast])
         held = gtsam.PriorFactorPose3(
-            station.mast, own.atPose3(previous.mast) * station.motion.measured(), station.motion.noiseModel()
+            station.mast, orthonormal(own.atPose3(previous.mast) * moved), between.noiseModel()
         )
         return [held, *station.other_priors(firm=True)]
 
@@ -305,7 +308,7 @@ class TraverseSmoother:
         return rows[is_near], rows[~is_near]
 
     def _sample(self, station: Station, rows: IntArray) -> Seen | None:
-        """Tracks enough to say where a station is: those with a place, and those that it sees twice itself."""
+        """Tracks enough to say where a station is: with a place, or seen from there twice."""
         drive, track = self._drive, self._drive.ledger.track[rows]
         names, own, count = np.unique(track, return_inverse=True, return_counts=True)
         names = names[(count >= 2) | (drive.home(names) >= 0)]
@@ -392,10 +395,12 @@ class TraverseSmoother:
                 why = (
                     f"only {c.inliers:.0%} of them agree on one pose"
                     if c.inliers < 1 and c.sigmas < 4
-                    else f"they contradict the drive by {c.sigmas:.1f} sigma ({c.shift_m:.2f} m), {c.inliers:.0%} agree"
+                    else f"they contradict the drive by {c.sigmas:.1f} sigma ({c.shift_m:.2f} m), "
+                    f"{c.inliers:.0%} agree"
                 )
                 out.append(
-                    f"stop {c.stop}: {c.observations} observations of tracks at {c.other} are not believed: {why}"
+                    f"stop {c.stop}: {c.observations} observations of tracks at {c.other} are not believed: "
+                    f"{why}"
                 )
         # A place that a stop sees twice or more, and is not the one that the track has elsewhere.
         astray = drive.idle(np.unique(ledger.track[rows]), Fate.OUTLIER)
@@ -405,7 +410,8 @@ class TraverseSmoother:
         if len(track):
             names = [str(t) for t in track]
             out.append(
-                f"{listed(names, 'track')}: the number stands for another place than before; the new observations are left out"
+                f"{listed(names, 'track')}: seen where other "
+                "observations of the number have another place; left out"
             )
         return out
 
@@ -525,7 +531,7 @@ class TraverseSmoother:
         return smoother
 
     def save(self, path: Path | str) -> None:
-        """Keep everything in a file (`.npz`), to go on from with `load`. An older file stays until it is whole.
+        """Keep everything in a file (`.npz`), to go on from with `load`; an older one stays until it is whole.
 
         Raises InputError where there is nothing to keep or the file cannot be written.
         """

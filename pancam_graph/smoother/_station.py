@@ -77,7 +77,7 @@ class Station:
         return out
 
     def start(self, world_T_mast: gtsam.Pose3) -> gtsam.Values:
-        """Its own variables with the mast at a pose, angles as telemetry has them, the rig as it is said to be."""
+        """Its own variables with the mast at a pose, angles and rig as they are said to be."""
         t = self.traverse
         rotation, centre = t.camera_poses([world_T_mast])
         state = State(
