@@ -10,7 +10,11 @@ import pytest
 from pancam_graph import SimulationOptions, SmootherOptions, SolveOptions, TraverseSmoother, simulate, solve
 from pancam_graph.errors import InputError
 from pancam_graph.geometry import IntArray
+from pancam_graph.incremental import solve_incrementally, stops_of
+from pancam_graph.io import read_solution_json
+from pancam_graph.report import DriveStep, write_drive
 from pancam_graph.rigs import mer_navcam
+from pancam_graph.sharing import Freedom, Sharing
 from pancam_graph.simulate import Simulation
 from pancam_graph.smoother import Update
 from pancam_graph.solution import Solution
@@ -83,7 +87,7 @@ def loop() -> Simulation:
 
 
 def require_batch(smoother: TraverseSmoother, batch: Solution) -> None:
-    """What is used is what the batch uses but for few; cost, poses and covariances are those of a batch of it."""
+    """What is used is what the batch uses but for few; all else is as a batch of it has it."""
     t, used = smoother.traverse, smoother.used
     assert t.observations is not None
     assert abs(int(used.sum()) - int(batch.used.sum())) < 0.004 * len(used)
@@ -329,3 +333,46 @@ def test_a_wrong_loop_closure_is_found_and_not_believed(loop: Simulation) -> Non
     for stop, a, b in zip(smoother.stops, before, smoother.estimate().world_T_mast, strict=True):
         sigma = np.sqrt(np.diag(smoother.covariance(stop)))
         assert np.all(np.abs(a.localCoordinates(b)) <= 0.3 * sigma)
+
+
+def test_a_shared_mount_is_estimated_along_the_way() -> None:
+    wrong = simulate(mer_navcam(), replace(_SMALL, mount_error_rad=2e-3, stops=3), seed=5)
+    sharing = Sharing(mounts=Freedom(scope="eye", free=("rx_rad", "ry_rad", "rz_rad")))
+    t = replace(wrong.traverse, sharing=sharing)
+    smoother = TraverseSmoother(t.rig, SmootherOptions(sharing=sharing, outlier_sigma=None))
+    driven(t, smoother)
+    batch = solve(t, SolveOptions(loss="none"))
+    assert smoother.cost == pytest.approx(batch.cost_final, rel=1e-3)
+    for i in (1, 2):
+        sigma = np.sqrt(np.diag(batch.stop_covariance[i]))
+        found = batch.final.world_T_mast[i].localCoordinates(smoother.estimate().world_T_mast[i])
+        assert np.all(np.abs(found) < 0.05 * sigma)
+        assert np.sqrt(np.diag(smoother.covariance(smoother.stops[i]))) == pytest.approx(sigma, rel=0.01)
+
+
+def test_a_traverse_is_solved_stop_by_stop(small: Simulation, batch: Solution, tmp_path: Path) -> None:
+    heard: list[Update] = []
+    solution = solve_incrementally(small.traverse, on_stop=heard.append)
+    assert solution.incremental is not None
+    assert solution.cost_final == pytest.approx(batch.cost_final, rel=1e-3)
+    assert solution.incremental.cost_per_stop[-1] == pytest.approx(solution.cost_final, rel=1e-6)
+    assert solution.incremental.seconds_per_stop == tuple(u.seconds for u in heard)
+    solution.save(tmp_path / "out", report=False)
+    entry = read_solution_json(tmp_path / "out" / "solution.json").incremental
+    assert entry is not None
+    assert len(entry.seconds_per_stop) == len(entry.relinearised_per_stop) == 4
+    assert entry.cost_per_stop == list(solution.incremental.cost_per_stop)
+    with pytest.raises(InputError, match="incremental: model: expected mast, found circle"):
+        solve_incrementally(small.traverse, SolveOptions(model="circle"))
+
+
+def test_the_replay_has_a_frame_for_each_stop(small: Simulation, tmp_path: Path) -> None:
+    smoother, steps = TraverseSmoother(small.traverse.rig), list[DriveStep]()
+    for part in stops_of(small.traverse):
+        steps.append(DriveStep.of(smoother, smoother.add_stop(*part), small))
+    write_drive(steps, small, tmp_path / "drive.html")
+    page = (tmp_path / "drive.html").read_text()
+    assert 'max="4"' in page
+    assert "9 m driven" in page
+    assert "http://" not in page.split("packed-plotly")[0]
+    assert steps[-1].error_m < steps[-1].odometry_error_m

@@ -8,3 +8,4 @@ from pancam_graph.elimination._panels import Panels as Panels
 from pancam_graph.elimination._panels import Root as Root
 from pancam_graph.elimination._panels import pattern as pattern
 from pancam_graph.elimination._system import LandmarkSystem as LandmarkSystem
+from pancam_graph.elimination._system import Room as Room

@@ -26,7 +26,7 @@ from pancam_graph.landmarks import (
 from pancam_graph.losses import SQUARED, Loss
 from pancam_graph.threads import in_parallel
 
-__all__ = ["LandmarkSystem"]
+__all__ = ["LandmarkSystem", "Room"]
 
 _T = TypeVar("_T", bound=np.generic)
 
@@ -59,6 +59,13 @@ class _Chunk:
     end: int
 
 
+class Room:
+    """Memory that systems linearised in turn may share: to get it anew takes as long as to fill it."""
+
+    def __init__(self) -> None:
+        self.numbers = np.empty(0)
+
+
 _Wave = list[_Chunk]
 _Systems = list[tuple[FloatArray, FloatArray]]
 """(S, s) of each chunk of a wave, over the columns of its block; S in tiles, see kernel.gather."""
@@ -81,6 +88,7 @@ class LandmarkSystem:
         *,
         cliques: Iterable[Iterable[int]] = (),
         refined: bool = False,
+        room: Room | None = None,
     ) -> None:
         """Arrange observations and landmarks; `cliques` are groups that other factors join.
 
@@ -109,7 +117,7 @@ class LandmarkSystem:
         )
         self.regained = 0.0
         """By how much placing strays anew lowered the cost where the last step led."""
-        self._memory = np.empty(0)
+        self._memory = room or Room()
         self._moved, self._moved_cost = np.empty_like(self.vector), np.zeros(n)
         self._has_moved = False
 
@@ -291,11 +299,12 @@ class LandmarkSystem:
         """A dense system (S, s) for each chunk of a wave, in memory that is used again."""
         dims = [len(self.blocks[chunk.block].row) for chunk in wave]
         need = sum(n * n + n for n in dims)
-        if len(self._memory) < need:
-            self._memory = np.empty(need)
+        memory = self._memory.numbers
+        if len(memory) < need:
+            memory = self._memory.numbers = np.empty(need)
         out, begin = [], 0
         for n in dims:
-            out.append((self._memory[begin : begin + n * n], self._memory[begin + n * n :][:n]))
+            out.append((memory[begin : begin + n * n], memory[begin + n * n :][:n]))
             begin += n * n + n
         return out
 

@@ -129,8 +129,8 @@ def _page(steps: Sequence[DriveStep], simulation: Simulation) -> str:
         style=STYLE + "\n#map { height: 600px; } #errors { height: 600px; } #at { width: 420px; }",
         lead=escape(f"At the end: {last.summary}. Loop closures: {closed}."),
         caption=escape(
-            f"Ellipses: {_SIGMAS:g} sigma of each stop's position, {enlarged:g} times enlarged. The estimate lies "
-            "on the truth where its line covers the grey one."
+            f"Ellipses: {_SIGMAS:g} sigma of each stop's position, {enlarged:g} times enlarged. The estimate "
+            "lies on the truth where its line covers the grey one."
         ),
         n=len(steps),
         plotly=packed_plotly(),
@@ -196,8 +196,8 @@ script-src 'unsafe-inline' 'unsafe-eval'; img-src data: blob:; connect-src data:
 <div class="pair">
 <section><h2>Map</h2><div class="plot" id="map"></div><p class="caption">{caption}</p></section>
 <section><h2>Error against truth</h2><div class="plot" id="errors"></div>
-<p class="caption">Of the newest stop, after its own update. Where the loop closes, odometry has drifted and the
-estimate has not.</p></section>
+<p class="caption">Of the newest stop, after its own update. Where the loop closes, odometry has drifted and
+the estimate has not.</p></section>
 </div>
 <script type="text/plain" id="packed-plotly">{plotly}</script>
 <script type="text/plain" id="packed-figures">{figures}</script>

@@ -1,17 +1,16 @@
 """A block of landmarks, eliminated: one factor of iSAM2 on the variables of the stops that see them.
 
 The block is linearised at the point of linearisation that iSAM2 has of these variables, and handed over as
-the quadratic that is left there: GTSAM's own container of a linear factor. It is taken out and put in again when
-its landmarks are seen again, and when iSAM2 moves a variable of it to another point.
+the quadratic that is left there: GTSAM's own container of a linear factor. It is taken out and put in again
+when its landmarks are seen again, and when iSAM2 moves a variable of it to another point.
 """
 
 from dataclasses import replace
-from typing import Any
 
 import gtsam
 import numpy as np
 
-from pancam_graph.elimination import LandmarkSystem, Panels
+from pancam_graph.elimination import LandmarkSystem, Panels, Room
 from pancam_graph.geometry import FloatArray
 from pancam_graph.graph import read_variable
 from pancam_graph.landmarks import Landmarks
@@ -25,8 +24,9 @@ __all__ = ["LandmarkBlock"]
 class LandmarkBlock:
     """Landmarks, where they are at the point of linearisation, and what is left of them there."""
 
-    def __init__(self, placed: Placed) -> None:
-        """Landmarks placed where the estimate has the cameras."""
+    def __init__(self, placed: Placed, room: Room) -> None:
+        """Landmarks placed where the estimate has the cameras; `room` is for all blocks."""
+        self._room = room
         self.patch = placed.patch
         self.slot = -1
         """Of its factor in iSAM2."""
@@ -38,7 +38,9 @@ class LandmarkBlock:
     def replace(self, placed: Placed) -> None:
         """Put its landmarks elsewhere; the block must then be linearised anew."""
         self._placed = placed
-        self.system = LandmarkSystem(self.patch.linkage, placed.measurements, placed.landmarks)
+        self.system = LandmarkSystem(
+            self.patch.linkage, placed.measurements, placed.landmarks, room=self._room
+        )
         self._frame = gtsam.Pose3()
 
     @property
@@ -85,7 +87,7 @@ class LandmarkBlock:
         return largest
 
     def left_apart(self, theta: gtsam.Values, estimate: gtsam.Values, moving: set[int]) -> float:
-        """As `apart`, if stops whose mast is among these variables moved to the estimate and others did not."""
+        """As `apart`, if masts among these variables moved to the estimate and others did not."""
         stations = self.patch.stations
         there = [s.world_T_mast(estimate if s.mast in moving else theta) for s in stations]
         delta = [a.localCoordinates(s.world_T_mast(estimate)) for a, s in zip(there, stations, strict=True)]
@@ -144,30 +146,20 @@ def _quadratic(panels: Panels, system: LandmarkSystem) -> gtsam.HessianFactor:
             for h, first in zip(after[1:], begin[1:-1], strict=True):
                 rest += [(w, panel, int(first) + int(column[w])) for w in members[h]]
             for j in range(0, len(rest), 2):
-                pair = rest[j : j + 2]
-                keys: Any = [link.key[v], *(link.key[w] for w, _, _ in pair)]
-                p = [source[a, c : c + dims[w]] for w, source, c in pair]
-                d = [dims[v], *(dims[w] for w, _, _ in pair)]
-                if len(pair) == 2:
-                    graph.push_back(
-                        gtsam.HessianFactor(
-                            *keys,
-                            zeros[d[0], d[0]],
-                            p[0],
-                            p[1],
-                            zero[d[0]],
-                            zeros[d[1], d[1]],
-                            zeros[d[1], d[2]],
-                            zero[d[1]],
-                            zeros[d[2], d[2]],
-                            zero[d[2]],
-                            0.0,
-                        )
-                    )
+                w, source, c = rest[j]
+                own_zero, right = zeros[dims[v], dims[v]], zero[dims[v]]
+                one, keys = source[a, c : c + dims[w]], (link.key[v], link.key[w])
+                a1 = dims[w]
+                if j + 1 == len(rest):
+                    part = gtsam.HessianFactor(*keys, own_zero, one, right, zeros[a1, a1], zero[a1], 0.0)
                 else:
-                    graph.push_back(
-                        gtsam.HessianFactor(
-                            *keys, zeros[d[0], d[0]], p[0], zero[d[0]], zeros[d[1], d[1]], zero[d[1]], 0.0
-                        )
+                    x, source, c = rest[j + 1]
+                    a2 = dims[x]
+                    two = source[a, c : c + a2]
+                    part = gtsam.HessianFactor(
+                        *(*keys, link.key[x]),
+                        *(own_zero, one, two, right),
+                        *(zeros[a1, a1], zeros[a1, a2], zero[a1], zeros[a2, a2], zero[a2], 0.0),
                     )
+                graph.push_back(part)
     return gtsam.HessianFactor(graph)

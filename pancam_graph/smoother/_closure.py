@@ -126,7 +126,7 @@ def _held(station: Station, values: gtsam.Values) -> list[gtsam.NonlinearFactor]
 
 
 def bridge(loop: Loop, values: gtsam.Values, found: gtsam.Pose3) -> gtsam.NonlinearFactor | None:
-    """What joins the station of a believed closure to the anchor while the drive bends; None if it is held."""
+    """What joins the station of a believed closure to the anchor while the drive bends; None if held."""
     noise, mast = gtsam.noiseModel.Diagonal.Sigmas(_BRIDGE_SIGMAS), loop.station.mast
     if mast is None:
         return None

@@ -83,7 +83,7 @@ class Engine:
         return self._settle(change, factors, new, new, bends=False)
 
     def _frame_at(self, world_T_mast: gtsam.Pose3) -> gtsam.Pose3:
-        """How the world about a place has moved since it was linearised, undone; as the nearest stop has it."""
+        """How the world about a place moved since it was linearised, undone; as the nearest stop has it."""
         stations = [s for s in self._drive.stations if s.mast is not None and self.theta.exists(s.mast)]
         if not stations:
             return gtsam.Pose3()

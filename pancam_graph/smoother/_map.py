@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 import gtsam
 import numpy as np
 
+from pancam_graph.elimination import Room
 from pancam_graph.geometry import BoolArray, IntArray
 from pancam_graph.landmarks import Landmarks, residuals
 from pancam_graph.smoother._block import LandmarkBlock
@@ -30,7 +31,7 @@ class DriveMap:
     """Stations, observations and blocks. A block is named by the number of the station that saw it first."""
 
     def __init__(self, outlier_sigma: float | None) -> None:
-        self._outlier_sigma = outlier_sigma
+        self._outlier_sigma, self._room = outlier_sigma, Room()
         self.stations: list[Station] = []
         self.ledger = Ledger()
         self.blocks: dict[int, LandmarkBlock] = {}
@@ -81,7 +82,7 @@ class DriveMap:
             placed = gathered(self.ledger, self.image_station, patch, None, rows, none).placed
             at = np.flatnonzero(own)[np.argsort(track[own])]
             where = Landmarks(vector=landmarks.vector[at], origin_m=landmarks.origin_m[at])
-            self.blocks[name] = LandmarkBlock(replace(placed, landmarks=where))
+            self.blocks[name] = LandmarkBlock(replace(placed, landmarks=where), self._room)
 
     def idle(self, track: IntArray, *fates: Fate) -> IntArray:
         """Rows of tracks that have one of these fates."""
@@ -182,7 +183,7 @@ class DriveMap:
         self._set_home(placed.track[~stays], -1)
         self._set_home(placed.track[stays], name)
         if stays.any():
-            self.blocks[name] = LandmarkBlock(placed.part(stays, used))
+            self.blocks[name] = LandmarkBlock(placed.part(stays, used), self._room)
 
     def _set_home(self, track: IntArray, name: int) -> None:
         at = np.searchsorted(self._track, track)

@@ -29,8 +29,8 @@ class SmootherOptions:
     relinearise_m: float = 1e-2
     """The same for how its masts stand to each other."""
     relinearise_rig: float = 1e-3
-    """The same for free entries of the rig: radians, metres, shares of a focal length; a hundred times as much
-    for pixels."""
+    """The same for free entries of the rig: radians, metres, shares of a focal length; a hundred times as
+    much for pixels."""
     outlier_sigma: float | None = 4.0
     """An observation goes where noise would take it less often than a Gaussian beyond this many sigmas; None:
     all are kept."""

@@ -141,8 +141,8 @@ class TraverseSmoother:
         """Add a stop with all its frames, images and observations.
 
         `observations.image` are rows of `images`; tracks have the same numbers over the whole drive. `after`
-        is the stop from which odometry leads here; default: the one added last. Raises InputError, and changes
-        nothing, where an id or a number makes no sense or was added before.
+        is the stop from which odometry leads here; default: the one added last. Raises InputError, and
+        changes nothing, where an id or a number makes no sense or was added before.
         """
         begin = time.perf_counter()
         entries = Traverse(
@@ -531,7 +531,7 @@ class TraverseSmoother:
         return smoother
 
     def save(self, path: Path | str) -> None:
-        """Keep everything in a file (`.npz`), to go on from with `load`; an older one stays until it is whole.
+        """Keep everything in a file (`.npz`), to go on from with `load`; an older one stays till it is whole.
 
         Raises InputError where there is nothing to keep or the file cannot be written.
         """
