@@ -21,6 +21,9 @@ class DriveOptions:
     """Number of places where the mast stands."""
     spacing_m: float = 4.0
     """Distance driven from stop to stop."""
+    loop: bool = False
+    """Whether the drive comes back to where it began: its heading turns by a circle in all, beside the random
+    changes. Points found on one side of the joint are looked for on the other."""
     heading_change_rad: float = 0.25
     """Standard deviation of the change of heading from stop to stop."""
     sweep_rad: float | None = 2 * np.pi
@@ -129,9 +132,6 @@ class RenderOptions(DriveOptions):
 class SimulationOptions(DriveOptions):
     """What is driven, seen and measured. Raises InputError naming the option that makes no sense."""
 
-    loop: bool = False
-    """Whether the drive comes back to where it began: its heading turns by a circle in all, beside the random
-    changes, and points found on one side of the joint are looked for on the other."""
     slope_rad: float = 0.05
     """RMS slope of the rolling ground along x and y, and so of the mast's roll and pitch."""
     rocks: float = 0.6
