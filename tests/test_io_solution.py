@@ -25,7 +25,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 @pytest.fixture(autouse=True)
 def small_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    def write_report(solution: Solution, path: Path) -> None:
+    def write_report(solution: Solution, path: Path, mosaics: None) -> None:
         path.write_text(f"<html>{solution.model}</html>")
 
     monkeypatch.setattr(pancam_graph.report, "write_report", write_report, raising=False)
@@ -277,7 +277,7 @@ def test_an_older_folder_stays_whole_if_the_report_fails(
         save_solution(io_samples.solution(), out)
     before = contents(tmp_path)
 
-    def fail(solution: Solution, path: Path) -> None:
+    def fail(solution: Solution, path: Path, mosaics: None) -> None:
         path.write_text("half a rep")
         raise error
 
