@@ -15,6 +15,7 @@ import gtsam
 import numpy as np
 
 from pancam_graph._eliminated import EliminatedSolver
+from pancam_graph._joint import all_columns, retracted
 from pancam_graph._optimise import Iteration, Outcome, is_short
 from pancam_graph._problem import Problem, system_of
 from pancam_graph._reduced import add_factors, held_columns
@@ -69,9 +70,7 @@ class _Point:
         self.system, self.rows = system_of(problem, loss)
         self.n_observations = int(problem.kept.sum())
         self.held = held_columns(self.template)
-        begin = self.template.linkage.group_column
-        columns = [begin[g] + own for g, own in self.held.items()]
-        self.held_columns = np.concatenate([np.zeros(0, dtype=np.int64), *columns])
+        self.held_columns = all_columns(self.template.linkage, self.held)
         """The same among all columns"""
         self.cost = self.system.cost_at(self.posture(self.values)) + self.factors.error(self.values)
         self.n_steps = 0
@@ -90,11 +89,7 @@ class _Point:
     def moved(self, step: FloatArray) -> gtsam.Values:
         """Values after a step of all columns; what telemetry holds stays as it is, bit for bit."""
         step[self.held_columns] = 0.0
-        link, vector = self.template.linkage, gtsam.VectorValues()
-        for key, group in zip(link.key, link.group, strict=True):
-            own, begin = link.columns_of(key), int(link.group_column[group])
-            vector.insert(key, step[begin + own.start : begin + own.stop])
-        return self.values.retract(vector)
+        return retracted(self.template.linkage, self.values, step)
 
 
 @dataclass(kw_only=True)

@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 
 import gtsam
 
-from pancam_graph._optimise import InOrder, Iteration, Outcome, optimise
+from pancam_graph._joint import JointSystem, OnLastGroup
+from pancam_graph._optimise import InOrder, Iteration, OnGraph, Outcome, optimise, parameters_of
 from pancam_graph._problem import Problem, Solver, system_of
 from pancam_graph._reduced import ReducedSystem, joint_root
 from pancam_graph.elimination import LandmarkSystem, Root
@@ -75,6 +76,36 @@ class EliminatedSolver(Solver):
         if not template.linkage.touched.any():
             return _only_landmarks(problem, loss)
         system, rows = system_of(problem, loss)
+        minimise = self._by_groups if isinstance(template, SoftTemplate) else self._by_blocks
+        outcome, joint = minimise(problem, system, rule, stage)
+        return self._ended(problem, outcome, system, rows, joint), outcome
+
+    def _by_groups(
+        self, problem: Problem, system: LandmarkSystem, rule: StopRule, stage: str
+    ) -> tuple[Outcome, Root | None]:
+        """Where each image has a variable of its own."""
+        joint = JointSystem(problem, system)
+
+        def gain_ahead(_values: gtsam.Values) -> float | None:
+            if system.regained > _FOLLOWING * system.moved_cost:
+                return None
+            return joint.root().gain() + system.gain_alone
+
+        outcome = optimise(
+            lambda: OnLastGroup(joint, rule),
+            rule,
+            n_observations=int(problem.kept.sum()),
+            stage=stage,
+            on_iteration=self.on_iteration,
+            gain_ahead=gain_ahead,
+        )
+        return outcome, joint.known_root
+
+    def _by_blocks(
+        self, problem: Problem, system: LandmarkSystem, rule: StopRule, stage: str
+    ) -> tuple[Outcome, Root | None]:
+        """Where few variables move many images."""
+        template = problem.template
         blocks = LandmarkBlocks(system, read_variable, template.posture)
         graph = gtsam.NonlinearFactorGraph(problem.factors)
         for factor in blocks.factors():
@@ -89,20 +120,18 @@ class EliminatedSolver(Solver):
             joint = joint_root(template, problem.factors, values, blocks.panels(values))
             return joint.gain() + system.gain_alone
 
+        parameters = parameters_of(rule, InOrder(blocks.ordering()))
         outcome = optimise(
-            graph,
-            problem.values,
+            lambda: OnGraph(graph, problem.values, parameters, template.held_columns()),
             rule,
-            InOrder(blocks.ordering()),
             n_observations=int(problem.kept.sum()),
-            held=template.held_columns(),
             stage=stage,
             on_iteration=self.on_iteration,
             gain_ahead=gain_ahead,
         )
         if blocks.settle(outcome.values):
             joint = None  # it was that of another point
-        return self._ended(problem, outcome, system, rows, joint), outcome
+        return outcome, joint
 
     def _ended(
         self,

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from pancam_graph._optimise import Elimination, Iteration, Outcome, optimise
+from pancam_graph._optimise import Elimination, Iteration, OnGraph, Outcome, optimise, parameters_of
 from pancam_graph._problem import Problem, Solver
 from pancam_graph.errors import SolveError
 from pancam_graph.geometry import BoolArray, FloatArray
@@ -127,13 +127,12 @@ class ExplicitSolver(Solver):
         graph.push_back(explicit.proximal_factors(points, weak.prior_m, weak.needs_prior))
         values = explicit.with_landmarks(problem.values, points, present)
         elimination = Elimination(graph, values, by_qr=bool(weak.stretched.any()))
+        held = explicit.calibrations.held(template.held_columns())
+        parameters = parameters_of(rule, elimination)
         outcome = optimise(
-            graph,
-            values,
+            lambda: OnGraph(graph, values, parameters, held),
             rule,
-            elimination,
             n_observations=int(problem.kept.sum()),
-            held=explicit.calibrations.held(template.held_columns()),
             on_iteration=self.on_iteration,
         )
         points = np.where(present[:, None], explicit.points_m(outcome.values, present), points)

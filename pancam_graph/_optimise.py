@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import gtsam
 import numpy as np
@@ -12,9 +13,22 @@ from pancam_graph.geometry import IntArray
 from pancam_graph.graph import read_variable
 from pancam_graph.stopping import StopRule
 
-__all__ = ["Elimination", "InOrder", "Iteration", "Outcome", "is_short", "optimise"]
+__all__ = [
+    "MOST_DAMPING",
+    "Elimination",
+    "InOrder",
+    "Iteration",
+    "OnGraph",
+    "Optimiser",
+    "Outcome",
+    "is_short",
+    "optimise",
+    "parameters_of",
+]
 
 _LOG = logging.getLogger(__name__)
+MOST_DAMPING = 1e10
+"""No step is sought with more."""
 _INDETERMINATE = "ndeterminate"
 """Part of GTSAM's message for a system without a unique solution."""
 _FAR = 100.0
@@ -42,83 +56,124 @@ class Outcome:
     """After each iteration, the start first."""
 
 
+class Optimiser(Protocol):
+    """GTSAM's Levenberg-Marquardt on the variables of some graph."""
+
+    def iterate(self) -> None:
+        """Take the next step that lowers the cost."""
+
+    def error(self) -> float:
+        """The cost where it stands."""
+
+    def damping(self) -> float:
+        """Lambda of the next step."""
+
+    def values(self) -> gtsam.Values:
+        """Where it stands; gone once it has moved on."""
+
+    def gradient(self) -> float:
+        """Largest component of the gradient there, but for what telemetry holds."""
+
+
+class OnGraph:
+    """Optimises the variables of a graph as they are."""
+
+    def __init__(
+        self,
+        graph: gtsam.NonlinearFactorGraph,
+        values: gtsam.Values,
+        parameters: gtsam.LevenbergMarquardtParams,
+        held: Mapping[int, IntArray],
+    ) -> None:
+        """`held` are, by key, tangent components that the graph's factors hold."""
+        self._graph, self._held = graph, held
+        self._optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
+        self.iterate = self._optimizer.iterate
+        self.error = self._optimizer.error
+        self.values = self._optimizer.values
+        self.damping = self._optimizer.lambda_
+
+    def gradient(self) -> float:
+        """Landmark blocks linearise here as they would in the next step, and not again then.
+
+        What this costs is handing their rows over a second time.
+        """
+        values = self.values()
+        gradient = self._graph.linearize(values).gradientAtZero()
+        largest = 0.0
+        for key in values.keys():  # noqa: SIM118  gtsam.Values is not a dictionary
+            free = np.delete(gradient.at(key), self._held.get(key, []))
+            largest = max(largest, float(np.abs(free).max(initial=0.0)))
+        return largest
+
+
+def parameters_of(
+    rule: StopRule, elimination: "Elimination | InOrder"
+) -> gtsam.LevenbergMarquardtParams:
+    """GTSAM's options for a rule and an order of elimination."""
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setlambdaUpperBound(MOST_DAMPING)
+    # A step that raises the cost by less than this share ends GTSAM's search for one that lowers it.
+    parameters.setRelativeErrorTol(min(parameters.getRelativeErrorTol(), rule.relative_decrease))
+    elimination.set_up(parameters)
+    return parameters
+
+
 def optimise(
-    graph: gtsam.NonlinearFactorGraph,
-    values: gtsam.Values,
+    start: Callable[[], Optimiser],
     rule: StopRule,
-    elimination: "Elimination | InOrder",
     *,
     n_observations: int,
-    held: Mapping[int, IntArray],
     stage: str = "solve",
     on_iteration: Callable[[Iteration], None] | None = None,
     gain_ahead: Callable[[gtsam.Values], float | None] | None = None,
 ) -> Outcome:
-    """Minimise the graph's error from the given values.
+    """Iterate until a rule says so. `start` makes the optimiser, with `parameters_of` the rule.
 
-    `held` are, by key, tangent components that the graph's factors hold. `gain_ahead` may tell by how much
-    the next step from some values would lower the cost; None: not known, and judged by the gains so far.
+    `gain_ahead` may tell by how much the next step from some values would lower the cost; None: not known,
+    and judged by the gains so far.
 
     Raises SolveError where the linear system cannot be factorised however much it is damped; an exception
     from inside a custom factor reaches the caller as it is.
     """
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setlambdaUpperBound(1e10)
-    # A step that raises the cost by less than this share ends GTSAM's search for one that lowers it.
-    parameters.setRelativeErrorTol(min(parameters.getRelativeErrorTol(), rule.relative_decrease))
-    elimination.set_up(parameters)
     no_cost = n_observations * rule.residual_sigmas**2 / 2
     try:
-        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
-        costs = [optimizer.error()]
+        optimiser = start()
+        costs = [optimiser.error()]
 
         def vanished() -> str | None:
             if rule.residual_sigmas and costs[-1] <= no_cost:
                 return f"residuals below {rule.residual_sigmas:g} sigma"
-            if rule.max_gradient and _gradient(graph, optimizer.values(), held) <= rule.max_gradient:
+            if rule.max_gradient and optimiser.gradient() <= rule.max_gradient:
                 return f"gradient below {rule.max_gradient:g}"
             return None
 
         reason = vanished()
         while reason is None and len(costs) <= rule.max_iterations:
             # A copy: what the optimiser shows is gone once it has moved on.
-            before = gtsam.Values(optimizer.values()) if rule.relative_step else None
-            optimizer.iterate()
-            costs.append(optimizer.error())
+            before = gtsam.Values(optimiser.values()) if rule.relative_step else None
+            optimiser.iterate()
+            costs.append(optimiser.error())
             number = len(costs) - 1
-            _LOG.debug("iteration %d: cost %.9g, lambda %.1e", number, costs[-1], optimizer.lambda_())
+            _LOG.debug("iteration %d: cost %.9g, lambda %.1e", number, costs[-1], optimiser.damping())
             if on_iteration is not None:
                 on_iteration(Iteration(stage=stage, number=number, cost=costs[-1]))
-            if optimizer.lambda_() >= parameters.getlambdaUpperBound():
+            if optimiser.damping() >= MOST_DAMPING:
                 reason = "no step lowers the cost"
-            elif costs[-1] < costs[-2] and is_short(before, optimizer.values(), rule.relative_step):
+            elif costs[-1] < costs[-2] and is_short(before, optimiser.values(), rule.relative_step):
                 reason = f"relative step below {rule.relative_step:g}"
-            elif rule.relative_decrease and _is_settled(costs, rule.relative_decrease, gain_ahead, optimizer):
+            elif rule.relative_decrease and _is_settled(costs, rule.relative_decrease, gain_ahead, optimiser):
                 reason = f"relative decrease below {rule.relative_decrease:g}"
             else:
                 reason = vanished()
     except RuntimeError as error:
         raise _explained(error) from error
     return Outcome(
-        values=optimizer.values(),
+        values=optimiser.values(),
         converged=reason is not None,
         reason=reason or f"iteration limit of {rule.max_iterations}",
         costs=tuple(costs),
     )
-
-
-def _gradient(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, held: Mapping[int, IntArray]) -> float:
-    """Largest component of the gradient of the graph's error in the variables' tangents, but for held ones.
-
-    Landmark blocks linearise here as they would in the next step, and not again then: what this costs is
-    handing their rows over a second time.
-    """
-    gradient = graph.linearize(values).gradientAtZero()
-    largest = 0.0
-    for key in values.keys():  # noqa: SIM118  gtsam.Values is not a dictionary
-        free = np.delete(gradient.at(key), held.get(key, []))
-        largest = max(largest, float(np.abs(free).max(initial=0.0)))
-    return largest
 
 
 def is_short(before: gtsam.Values | None, after: gtsam.Values, share: float) -> bool:
@@ -139,7 +194,7 @@ def _is_settled(
     costs: list[float],
     share: float,
     gain_ahead: Callable[[gtsam.Values], float | None] | None,
-    optimizer: gtsam.NonlinearOptimizer,
+    optimiser: Optimiser,
 ) -> bool:
     """Whether the iterations to come would lower the cost by no more than a share of it.
 
@@ -152,7 +207,7 @@ def _is_settled(
         return gain <= least
     if shrinking and gain > _FAR * least:
         return False
-    ahead = gain_ahead(optimizer.values())
+    ahead = gain_ahead(optimiser.values())
     return ahead is not None and ahead <= least
 
 

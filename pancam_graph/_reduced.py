@@ -10,7 +10,7 @@ from pancam_graph.elimination import LandmarkSystem, Linkage, Panels, Root
 from pancam_graph.geometry import IntArray
 from pancam_graph.graph import FactorTemplate
 
-__all__ = ["ReducedSystem", "add_factors", "held_columns", "joint_root", "loosened_root"]
+__all__ = ["ReducedSystem", "add_factors", "held_columns", "joint_panels", "joint_root", "loosened_root"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,9 +39,16 @@ def joint_root(
     template: FactorTemplate, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, panels: Panels
 ) -> Root:
     """Square root of what is left of the landmarks, with priors and ties added. Destroys the panels."""
+    return joint_panels(template, factors, values, panels).root()
+
+
+def joint_panels(
+    template: FactorTemplate, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, panels: Panels
+) -> Panels:
+    """What is left of the landmarks, with priors and ties added in place."""
     add_factors(panels, template.linkage, factors.linearize(values))
     panels.hold(held_columns(template))
-    return panels.root()
+    return panels
 
 
 def loosened_root(problem: Problem, system: LandmarkSystem, factor: float) -> Root:

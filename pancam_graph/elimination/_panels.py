@@ -1,6 +1,6 @@
 """Symmetric block-sparse systems: order of elimination, square root, and entries of the inverse."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 
@@ -236,15 +236,18 @@ class Root:
         """By how much the step that solves the system lowers the cost, as far as it is linear: |e|^2 / 2."""
         return 0.5 * sum(float(rows[:, -1] @ rows[:, -1]) for rows in self.rows)
 
-    def step(self) -> FloatArray:
+    def step(self, known: Mapping[int, FloatArray] | None = None) -> FloatArray:
         """The x (columns,) that solves S x = -s, by back substitution in R x = -e; group by group.
 
-        Where a group's rows leave directions free, the shortest one for what the later groups do.
+        Groups whose x is `known` keep it, and those before follow. Where a group's rows leave directions free, the shortest one for what the later groups do.
         """
         st = self.structure
         begin = np.concatenate([[0], np.cumsum(st.dim)])
         x = np.zeros(int(begin[-1]))
         for g in reversed(st.order):
+            if known is not None and g in known:
+                x[begin[g] : begin[g + 1]] = known[g]
+                continue
             n, rows = int(st.dim[g]), self.rows[g]
             rest = np.concatenate([np.zeros(0), *(x[begin[h] : begin[h + 1]] for h in st.after[g][1:])])
             right = -rows[:, -1] - rows[:, n:-1] @ rest
