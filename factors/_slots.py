@@ -6,12 +6,12 @@ bit what it was, and costs the solver nothing.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import gtsam
 import numpy as np
 
-from pancam_graph.geometry import FloatArray, corrected_poses, correction_twists
+from pancam_graph.geometry import FloatArray, IntArray, corrected_poses, correction_twists, pose_arrays
 
 __all__ = ["Corrected", "Fixed", "Key", "PoseSlot", "Slot", "custom_factor"]
 
@@ -50,39 +50,94 @@ class Corrected:
 
 Slot = Key | Fixed
 PoseSlot = Key | Fixed | Corrected
+Kind = Literal["pose", "vector", "number"]
+"""What a slot holds: a gtsam.Pose3, a vector, a number."""
 
 Residual = Callable[..., tuple[FloatArray, tuple[FloatArray, ...]]]
-"""Takes one value per slot, returns the residual (m,) and one Jacobian (m, tangent) per slot."""
+"""Takes the values of each slot at n sites (poses as rotations (n, 3, 3) and translations (n, 3), vectors (n, k),
+numbers (n,)); returns residuals (n, m) and one Jacobian (n, m, tangent) per slot."""
 
 
 def custom_factor(
     noise: gtsam.noiseModel.Base,
-    slots: Sequence[tuple[PoseSlot, Callable[[gtsam.Values, int], Any]]],
+    slots: Sequence[tuple[PoseSlot | Sequence[PoseSlot], Kind]],
     residual: Residual,
 ) -> gtsam.CustomFactor:
     """A GTSAM factor from a pure residual, over those of its slots that are variables.
 
-    `slots` pairs each slot with the reader of its value from gtsam.Values, which a corrected pose does not
-    need. An exception in the residual reaches the caller of the optimiser with its own type and message.
+    Each slot comes with what it holds. One factor may stand for many sites (the images of a stop), each slot is
+    then a sequence of so many: that is evaluated in one go, and its rows are those of one site after the other.
+    An exception in the residual reaches the caller of the optimiser with its own type and message.
     """
-    variable = [(i, slot.key) for i, (slot, _) in enumerate(slots) if not isinstance(slot, Fixed)]
+    readers = [
+        _Reader([slot] if isinstance(slot, Key | Fixed | Corrected) else slot, kind) for slot, kind in slots
+    ]
+    # By key, which reader's sites have it.
+    places: dict[int, list[tuple[int, int, IntArray]]] = {}
+    for i, reader in enumerate(readers):
+        for j, slot in enumerate(reader.distinct):
+            if not isinstance(slot, Fixed):
+                places.setdefault(slot.key, []).append((i, j, np.flatnonzero(reader.place == j)))
 
     def evaluate(
         _this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
     ) -> FloatArray:
-        arguments: list[Any] = []
-        twists: dict[int, FloatArray] = {}
-        for i, (slot, read) in enumerate(slots):
-            if isinstance(slot, Corrected):
-                pose, twists[i] = slot.pose(values)
-                arguments.append(pose)
-            else:
-                arguments.append(read(values, slot.key) if isinstance(slot, Key) else slot.value)
-        error, derivatives = residual(*arguments)
+        error, derivatives = residual(*(reader.read(values) for reader in readers))
         if jacobians is not None:
-            for j, (i, _) in enumerate(variable):
-                derivative = derivatives[i] @ twists[i] if i in twists else derivatives[i]
-                jacobians[j] = np.asfortranarray(derivative)
-        return error
+            for k, found in enumerate(places.values()):
+                block: FloatArray | None = None
+                for i, j, sites in found:
+                    part = derivatives[i][sites]
+                    if (twist := readers[i].twist(j)) is not None:
+                        part = part @ twist
+                    if block is None:
+                        block = np.zeros((*error.shape, part.shape[2]))
+                    block[sites] += part
+                assert block is not None
+                jacobians[k] = np.asfortranarray(block.reshape(error.size, -1))
+        return np.asarray(error).ravel()
 
-    return gtsam.CustomFactor(noise, [key for _, key in variable], evaluate)
+    return gtsam.CustomFactor(noise, list(places), evaluate)
+
+
+class _Reader:
+    """The values of one slot at all sites; what several sites share is read once."""
+
+    def __init__(self, slots: Sequence[PoseSlot], kind: Kind) -> None:
+        index: dict[tuple[int, int], int] = {}
+        self.distinct: list[PoseSlot] = []
+        place = []
+        for slot in slots:
+            name = (-1, id(slot.value)) if isinstance(slot, Fixed) else (slot.key, 0)
+            if isinstance(slot, Corrected):
+                name = slot.key, id(slot.nominal)  # eyes that share a correction have mounts of their own
+            if name not in index:
+                index[name] = len(self.distinct)
+                self.distinct.append(slot)
+            place.append(index[name])
+        self.place = np.array(place, dtype=np.int64)
+        self._read = {
+            "pose": gtsam.Values.atPose3,
+            "vector": gtsam.Values.atVector,
+            "number": gtsam.Values.atDouble,
+        }[kind]
+        self._is_pose = kind == "pose"
+        self._twist: dict[int, FloatArray] = {}
+
+    def read(self, values: gtsam.Values) -> Any:
+        """Rotations and translations, or vectors, or numbers, of all sites."""
+        found: list[Any] = []
+        for j, slot in enumerate(self.distinct):
+            if isinstance(slot, Corrected):
+                pose, self._twist[j] = slot.pose(values)
+                found.append(pose)
+            else:
+                found.append(self._read(values, slot.key) if isinstance(slot, Key) else slot.value)
+        if not self._is_pose:
+            return np.array(found)[self.place]
+        rotations, translations = pose_arrays(found)
+        return rotations[self.place], translations[self.place]
+
+    def twist(self, distinct: int) -> FloatArray | None:
+        """Of a corrected pose that was read: its body-frame twist by the variable (6, n)."""
+        return self._twist.get(distinct)

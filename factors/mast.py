@@ -6,90 +6,100 @@ The residual is what is left of it: the rotation vector, radians, then the shift
 camera as seen from where the chain puts it. Its sigma stands for the flex of the mast.
 """
 
+from collections.abc import Sequence
+
 import gtsam
 import numpy as np
 
 from pancam_graph.factors._slots import PoseSlot, Slot, custom_factor
-from pancam_graph.geometry import FloatArray, ry, rz, skew, so3_right_jacobian_inverse
+from pancam_graph.geometry import (
+    FloatArray,
+    compose,
+    pan_tilt_rotation,
+    skew,
+    so3_log,
+    so3_right_jacobian_inverse,
+)
 
 __all__ = ["mast_factor", "mast_residual"]
 
 Pose = tuple[FloatArray, FloatArray]
-"""Rotation (3, 3) and translation (3,)."""
+"""Rotations (..., 3, 3) and translations (..., 3)."""
+
+
+def _transposed(matrices: FloatArray) -> FloatArray:
+    return np.swapaxes(matrices, -1, -2)
 
 
 def _adjoint_of_inverse(rotation: FloatArray, translation: FloatArray) -> FloatArray:
-    """Takes a body twist of `a_T_b` to that of `a_T_b * b_T_c`, given `b_T_c`, (6, 6)."""
-    out = np.zeros((6, 6))
-    out[:3, :3] = out[3:, 3:] = rotation.T
-    out[3:, :3] = -rotation.T @ skew(translation)
+    """Takes a body twist of `a_T_b` to that of `a_T_b * b_T_c`, given `b_T_c`, (..., 6, 6)."""
+    back = _transposed(rotation)
+    out = np.zeros((*rotation.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = back
+    out[..., 3:, :3] = -back @ skew(translation)
     return out
 
 
 def mast_residual(
     world_T_camera: Pose, world_T_mast: Pose, pan_tilt_rad: FloatArray, head_T_camera: Pose, pan_T_tilt: Pose
 ) -> tuple[FloatArray, tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]]:
-    """Residual (6,) and its Jacobians by camera, mast (6, 6 each), pan-tilt (6, 2), mount, tilt axis (6, 6).
+    """Residuals (..., 6), Jacobians by camera, mast (..., 6, 6), pan-tilt (..., 6, 2), mount, axis (..., 6, 6).
 
-    Poses are pairs of rotation and translation; Jacobians are by body-frame tangents, rotation first.
+    Poses are pairs of rotations and translations; Jacobians are by body-frame tangents, rotation first.
     Defined where camera and chain differ by less than half a turn.
     """
     camera_R, camera_t = world_T_camera
-    mast_R, mast_t = world_T_mast
-    mount_R, mount_t = head_T_camera
-    axis_R, axis_t = pan_T_tilt
-    pan_R, tilt_R = rz(pan_tilt_rad[0]), ry(-pan_tilt_rad[1])
+    pan, tilt = pan_tilt_rad[..., 0], pan_tilt_rad[..., 1]
+    none = np.zeros(3)
 
     # The chain from each joint outwards to the camera.
-    tilt_to_camera = tilt_R @ mount_R, tilt_R @ mount_t
-    pan_to_camera = axis_R @ tilt_to_camera[0], axis_R @ tilt_to_camera[1] + axis_t
-    mast_to_camera = pan_R @ pan_to_camera[0], pan_R @ pan_to_camera[1]
-    chain_R, chain_t = mast_R @ mast_to_camera[0], mast_R @ mast_to_camera[1] + mast_t
+    tilt_to_camera = compose(pan_tilt_rotation(0.0 * tilt, tilt), none, *head_T_camera)
+    pan_to_camera = compose(*pan_T_tilt, *tilt_to_camera)
+    mast_to_camera = compose(pan_tilt_rotation(pan, 0.0 * pan), none, *pan_to_camera)
+    chain_R, chain_t = compose(*world_T_mast, *mast_to_camera)
 
-    turn = chain_R.T @ camera_R
-    rotation = gtsam.Rot3.Logmap(gtsam.Rot3(turn))
-    shift = chain_R.T @ (camera_t - chain_t)
+    back = _transposed(chain_R)
+    turn = back @ camera_R
+    rotation = so3_log(turn)
+    shift = (back @ (camera_t - chain_t)[..., None])[..., 0]
     right_inverse = so3_right_jacobian_inverse(rotation)
 
-    d_camera = np.zeros((6, 6))
-    d_camera[:3, :3] = right_inverse
-    d_camera[3:, 3:] = turn
-    d_chain = np.zeros((6, 6))
-    d_chain[:3, :3] = -right_inverse @ turn.T
-    d_chain[3:, :3] = skew(shift)
-    d_chain[3:, 3:] = -np.eye(3)
+    d_camera = np.zeros((*turn.shape[:-2], 6, 6))
+    d_camera[..., :3, :3] = right_inverse
+    d_camera[..., 3:, 3:] = turn
+    d_chain = np.zeros_like(d_camera)
+    d_chain[..., :3, :3] = -right_inverse @ _transposed(turn)
+    d_chain[..., 3:, :3] = skew(shift)
+    d_chain[..., 3:, 3:] = -np.eye(3)
 
     d_mast = d_chain @ _adjoint_of_inverse(*mast_to_camera)
-    d_pan = d_chain @ _adjoint_of_inverse(*pan_to_camera)[:, 2]
-    d_tilt = -d_chain @ _adjoint_of_inverse(mount_R, mount_t)[:, 1]
+    d_pan = d_chain @ _adjoint_of_inverse(*pan_to_camera)[..., 2:3]
+    d_tilt = -d_chain @ _adjoint_of_inverse(*head_T_camera)[..., 1:2]
     d_axis = d_chain @ _adjoint_of_inverse(*tilt_to_camera)
-    d_pan_tilt = np.column_stack([d_pan, d_tilt])
-    return np.concatenate([rotation, shift]), (d_camera, d_mast, d_pan_tilt, d_chain, d_axis)
+    d_pan_tilt = np.concatenate([d_pan, d_tilt], axis=-1)
+    return np.concatenate([rotation, shift], axis=-1), (d_camera, d_mast, d_pan_tilt, d_chain, d_axis)
 
 
 def mast_factor(
     noise: gtsam.noiseModel.Base,
-    world_T_camera: Slot,
-    world_T_mast: Slot,
-    pan_tilt_rad: Slot,
-    head_T_camera: PoseSlot,
-    pan_T_tilt: PoseSlot,
+    world_T_camera: Slot | Sequence[Slot],
+    world_T_mast: Slot | Sequence[Slot],
+    pan_tilt_rad: Slot | Sequence[Slot],
+    head_T_camera: PoseSlot | Sequence[PoseSlot],
+    pan_T_tilt: PoseSlot | Sequence[PoseSlot],
 ) -> gtsam.CustomFactor:
-    """The factor of `mast_residual`: slots of Pose3, Pose3, vector of 2, Pose3, Pose3; noise of 6 rows."""
+    """The factor of `mast_residual`: slots of Pose3, Pose3, vector of 2, Pose3, Pose3; noise of 6 rows.
 
-    def residual(
-        camera: gtsam.Pose3, mast: gtsam.Pose3, pan_tilt: FloatArray, mount: gtsam.Pose3, axis: gtsam.Pose3
-    ) -> tuple[FloatArray, tuple[FloatArray, ...]]:
-        camera_pose, mast_pose, mount_pose, axis_pose = (
-            (p.rotation().matrix(), p.translation()) for p in (camera, mast, mount, axis)
-        )
-        return mast_residual(camera_pose, mast_pose, pan_tilt, mount_pose, axis_pose)
-
-    slots = (
-        (world_T_camera, gtsam.Values.atPose3),
-        (world_T_mast, gtsam.Values.atPose3),
-        (pan_tilt_rad, gtsam.Values.atVector),
-        (head_T_camera, gtsam.Values.atPose3),
-        (pan_T_tilt, gtsam.Values.atPose3),
+    For n images at once each slot is a sequence of n, and the noise has 6 n rows.
+    """
+    return custom_factor(
+        noise,
+        (
+            (world_T_camera, "pose"),
+            (world_T_mast, "pose"),
+            (pan_tilt_rad, "vector"),
+            (head_T_camera, "pose"),
+            (pan_T_tilt, "pose"),
+        ),
+        mast_residual,
     )
-    return custom_factor(noise, slots, residual)

@@ -378,7 +378,7 @@ class Adjustment:
         # Radii of circles are free unasked: what holds them is then no news.
         asked = (self.options.sharing or t.sharing) is not None
         try:
-            found = uncertainty(problem, self.final, self._reduced(problem), landmarks=wanted, unseen=asked)
+            found = uncertainty(problem, self.final, self.reduced(problem), landmarks=wanted, unseen=asked)
         except SolveError as error:
             self.warnings.append(f"no uncertainties: {error}")
             n = len(self.landmark_track)
@@ -413,7 +413,7 @@ class Adjustment:
             return problem.on(HardTemplate(self.traverse, self.sharing))
         return problem
 
-    def _reduced(self, problem: Problem) -> ReducedSystem:
+    def reduced(self, problem: Problem) -> ReducedSystem:
         """The problem with landmarks eliminated; that of the last fit where this was one of it."""
         known = isinstance(self.solver, EliminatedSolver) and self.solver.reduced(problem)
         return known or ReducedSystem.of(problem)

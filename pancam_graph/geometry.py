@@ -35,6 +35,7 @@ __all__ = [
     "skew",
     "so3_exp",
     "so3_right_jacobian",
+    "so3_log",
     "so3_right_jacobian_inverse",
     "twists_in_parent",
     "wrap_angle",
@@ -78,21 +79,35 @@ def skew(v: FloatArray) -> FloatArray:
     return out
 
 
+def so3_log(rotations: FloatArray) -> FloatArray:
+    """Rotation vectors (..., 3) of rotation matrices (..., 3, 3) of less than half a turn.
+
+    Towards half a turn, where the axis changes sign, digits are lost as in the sine of the angle.
+    """
+    r = rotations
+    sine = 0.5 * np.stack(
+        [r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]], axis=-1
+    )
+    length = np.sqrt(np.sum(sine * sine, axis=-1))
+    angle = np.arctan2(length, 0.5 * (r[..., 0, 0] + r[..., 1, 1] + r[..., 2, 2] - 1.0))
+    scale = np.where(length < 1e-150, 1.0, angle / np.where(length < 1e-150, 1.0, length))
+    return np.asarray(sine * scale[..., None])
+
+
 def so3_right_jacobian_inverse(w: FloatArray) -> FloatArray:
-    """Inverse right Jacobian of SO(3) at the rotation vector w, (3,) to (3, 3).
+    """Inverse right Jacobians of SO(3) at rotation vectors, (..., 3) to (..., 3, 3).
 
     `Log(R Exp(d)) = Log(R) + Jr^-1(Log R) d` to first order. Defined for |w| < pi; at pi the
     logarithm itself jumps. Source: Chirikjian, Stochastic Models, Information Theory, and Lie Groups
     2, section 10.8.6.
     """
-    theta2 = float(w @ w)
+    theta2 = np.sum(w * w, axis=-1)[..., None, None]
     k = skew(w)
-    if theta2 < 1e-8:
-        c = 1 / 12 + theta2 / 720
-    else:
-        theta = np.sqrt(theta2)
-        c = 1 / theta2 - (1 + np.cos(theta)) / (2 * theta * np.sin(theta))
-    return np.asarray(np.eye(3) + 0.5 * k + c * k @ k)
+    small = theta2 < 1e-8
+    safe = np.where(small, 1.0, theta2)
+    theta = np.sqrt(safe)
+    c = np.where(small, 1 / 12 + theta2 / 720, 1 / safe - (1 + np.cos(theta)) / (2 * theta * np.sin(theta)))
+    return np.asarray(np.eye(3) + 0.5 * k + c * (k @ k))
 
 
 def so3_exp(w: FloatArray) -> FloatArray:

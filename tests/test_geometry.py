@@ -26,6 +26,7 @@ from pancam_graph.geometry import (
     skew,
     so3_exp,
     so3_right_jacobian,
+    so3_log,
     so3_right_jacobian_inverse,
     twists_in_parent,
     wrap_angle,
@@ -150,6 +151,12 @@ def test_skew_is_the_cross_product_in_batches() -> None:
     rng = np.random.default_rng(1)
     a, b = rng.normal(size=(2, 4, 5, 3))
     assert (skew(a) @ b[..., None])[..., 0] == pytest.approx(np.cross(a, b), abs=1e-15)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-160, 1e-12, 1e-7, 1e-3, 1.0, 3.0, np.pi - 1e-4])
+def test_logarithm_inverts_the_exponential(angle) -> None:
+    w = angle * np.array([[2.0, -1.0, 2.0], [0.0, 0.0, 3.0]]) / 3
+    assert so3_log(so3_exp(w)) == pytest.approx(w, rel=1e-11, abs=1e-170)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 0.99e-4, 1.01e-4, 1e-2, 1.0, 3.0, np.pi - 1e-4])

@@ -134,7 +134,7 @@ def test_conditioning_is_thesis_5_2_and_undone_exactly() -> None:
         U = np.diag([1 / length] * 3 + [1])
         expected = T @ projections[i] @ np.linalg.inv(U) / length
         assert entries[i].reshape(3, 4) == pytest.approx(expected, rel=1e-12, abs=1e-12)
-        one = c.of(i)
+        one = c.of(np.array([i]))
         assert np.array_equal(one.condition(projections[i : i + 1])[0], entries[i])
         assert np.array_equal(one.d_undo[0], c.d_undo[i])
     assert c.undo(entries) == pytest.approx(projections, rel=1e-12, abs=1e-12)
@@ -224,11 +224,16 @@ def test_jacobians_of_the_tie(name: str) -> None:
 
 
 def test_a_matrix_without_a_camera_costs_much_and_raises_nothing() -> None:
-    pose = np.eye(3), np.zeros(3)
-    residual, jacobians = projective_residual(np.zeros((3, 4)), pose, np.zeros(2), pose, pose, K)
-    assert np.all(residual >= 1e6)
-    assert [j.shape for j in jacobians] == [(12, 12), (12, 6), (12, 2), (12, 6), (12, 6)]
-    assert not any(j.any() for j in jacobians)
+    """And leaves a camera beside it alone."""
+    pose = np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3))
+    projections = np.stack([np.zeros((3, 4)), K @ np.eye(3, 4)])
+    calibration = np.stack([K, K])
+    residual, jacobians = projective_residual(projections, pose, np.zeros((2, 2)), pose, pose, calibration)
+    assert np.all(residual[0] >= 1e6)
+    assert residual[1] == pytest.approx(np.zeros(12), abs=1e-9)
+    assert [j.shape for j in jacobians] == [(2, 12, k) for k in (12, 6, 2, 6, 6)]
+    assert not any(j[0].any() for j in jacobians)
+    assert all(j[1].any() for j in jacobians)
 
 
 def test_slots_that_are_fixed_are_no_variables() -> None:

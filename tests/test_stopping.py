@@ -10,7 +10,7 @@ import pytest
 
 from pancam_graph import SimulationOptions, SolveOptions, StopRule, Traverse, simulate
 from pancam_graph._adjustment import Adjustment
-from pancam_graph._optimise import _gradient, _is_settled
+from pancam_graph._optimise import OnGraph, _is_settled
 from pancam_graph._problem import Problem
 from pancam_graph.errors import InputError
 from pancam_graph.geometry import FloatArray, IntArray
@@ -161,9 +161,10 @@ def test_the_gradient_of_explicit_landmarks_is_that_of_gtsams_error() -> None:
     graph.push_back(explicit.factors(problem.kept))
     values = explicit.with_landmarks(problem.values, problem.points_m(), problem.present)
     held = problem.template.held_columns()
-    found = _gradient(graph, values, held)
+    parameters = gtsam.LevenbergMarquardtParams()
+    found = OnGraph(graph, values, parameters, held).gradient()
     assert found == pytest.approx(largest_slope(graph.error, values, held, 1e-6), rel=1e-3)
-    assert _gradient(graph, values, {}) > 1.1 * found
+    assert OnGraph(graph, values, parameters, {}).gradient() > 1.1 * found
 
 
 def numbers(values: gtsam.Values, key: int) -> FloatArray:

@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pancam_graph.geometry import FloatArray
+from pancam_graph.geometry import FloatArray, IntArray
 
 __all__ = ["Conditioning"]
 
@@ -41,14 +41,13 @@ class Conditioning:
             extent_m=np.ones(n),
         )
 
-    def of(self, image: int) -> "Conditioning":
-        """That of one image."""
-        one = slice(image, image + 1)
+    def of(self, images: IntArray) -> "Conditioning":
+        """Those of some images."""
         return Conditioning(
-            centre_px=self.centre_px[one],
-            extent_px=self.extent_px[one],
-            origin_m=self.origin_m[one],
-            extent_m=self.extent_m[one],
+            centre_px=self.centre_px[images],
+            extent_px=self.extent_px[images],
+            origin_m=self.origin_m[images],
+            extent_m=self.extent_m[images],
         )
 
     def condition(self, projections: FloatArray) -> FloatArray:

@@ -81,22 +81,24 @@ class ProjectiveTemplate(SoftTemplate):
             chain=tangents[:, :11],
         )
 
-    def image_factors(self, image: int) -> Factors:
-        """The tie of an image's matrix to its mast and to the rig's calibration."""
+    def tie_factors(self, stop: int) -> Factors:
+        """The tie of each matrix of a stop to its mast and to the rig's calibration, as one factor."""
         t, flex = self.traverse, self.flex
-        frame, eye = int(t.image_frame[image]), int(t.image_eye[image])
+        images = np.flatnonzero(t.image_stop == stop)
+        if len(images) == 0:
+            return []
         pose = np.repeat([flex.rotation_rad, flex.translation_m], 3)
-        numbers = self._calibration_sigma_px(image)
+        sigmas = [np.concatenate([pose, self._calibration_sigma_px(int(i)), [_FACTOR_SIGMA]]) for i in images]
         return [
             projective_factor(
-                diagonal_noise(np.concatenate([pose, numbers, [_FACTOR_SIGMA]])),
-                Key(self.camera_key(image)),
-                self.mast(int(t.frame_stop[frame])),
-                self.pan_tilt(frame),
-                Fixed(t.rig.eyes[eye].head_T_camera),
-                Fixed(t.rig.pan_T_tilt),
-                t.calibration[image],
-                self.conditioning.of(image),
+                diagonal_noise(np.concatenate(sigmas)),
+                [Key(self.camera_key(int(i))) for i in images],
+                [self.mast(stop)] * len(images),
+                [self.pan_tilt(int(f)) for f in t.image_frame[images]],
+                [Fixed(t.rig.eyes[int(e)].head_T_camera) for e in t.image_eye[images]],
+                [Fixed(t.rig.pan_T_tilt)] * len(images),
+                t.calibration[images],
+                self.conditioning.of(images),
             )
         ]
 

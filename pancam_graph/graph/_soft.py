@@ -111,30 +111,44 @@ class SoftTemplate(FactorTemplate):
         sigmas = np.array([entry.sigma_pan_rad, entry.sigma_tilt_rad])
         return [gtsam.PriorFactorVector(slot.key, self.traverse.pan_tilt_rad[frame], diagonal_noise(sigmas))]
 
-    def image_factors(self, image: int) -> Factors:
-        """The tie of an image's camera pose to its mast, and to its circle where the model says so."""
-        traverse = self.traverse
-        frame, eye = int(traverse.image_frame[image]), int(traverse.image_eye[image])
-        stop, free, flex = int(traverse.frame_stop[frame]), self.rig_variables, self.flex
-        camera, mast, angles = Key(self.camera_key(image)), self.mast(stop), self.pan_tilt(frame)
-        mount, axis = free.mount_slot(image), free.axis_slot(stop)
+    def tie_factors(self, stop: int) -> Factors:
+        """The tie of each camera pose of a stop to its mast, and to its circle where the model says so.
+
+        One factor for all images of the stop: evaluated one by one they would take most of a solve.
+        """
+        t, free, flex = self.traverse, self.rig_variables, self.flex
+        images = np.flatnonzero(t.image_stop == stop)
+        if len(images) == 0:
+            return []
+        cameras = [Key(self.camera_key(int(i))) for i in images]
+        angles = [self.pan_tilt(int(f)) for f in t.image_frame[images]]
+        mast = [self.mast(stop)] * len(images)
+        chain = (cameras, mast, angles, [free.mount_slot(int(i)) for i in images])
+        axis = [free.axis_slot(stop)] * len(images)
         if self.model != "circle":
             sigmas = np.repeat([flex.rotation_rad, flex.translation_m], 3)
-            return [mast_factor(diagonal_noise(sigmas), camera, mast, angles, mount, axis)]
+            return [mast_factor(diagonal_noise(np.tile(sigmas, len(images))), *chain, axis)]
 
         # The chain ties the rotation, loosely; the circle alone ties the centre.
-        entry = traverse.frames[frame]
-        radius, phase, height = traverse.rig.circle(eye, entry.tilt_rad)
-        slot, reference = free.radius_slot(image)
-        offset = CircleOffset(height_m=height, phase_rad=phase, radius_m=radius - reference)
+        tilts = [t.frames[int(f)].tilt_rad for f in t.image_frame[images]]
+        circles = np.array(
+            [t.rig.circle(int(e), tilt) for e, tilt in zip(t.image_eye[images], tilts, strict=True)]
+        )
+        radii = [free.radius_slot(int(i)) for i in images]
+        offset = CircleOffset(
+            height_m=circles[:, 2],
+            phase_rad=circles[:, 1],
+            radius_m=circles[:, 0] - [reference for _, reference in radii],
+        )
         # The measured tilt places the circle; its error moves the centre by the eye's arm.
-        arm = float(np.linalg.norm(traverse.rig.eyes[eye].head_T_camera.translation()[[0, 2]]))
-        sigma = float(np.hypot(flex.translation_m, arm * entry.sigma_tilt_rad))
-        loose = diagonal_noise(np.repeat([flex.rotation_rad, 1e3], 3))
-        on_circle = gtsam.noiseModel.Isotropic.Sigma(3, sigma)
+        arms = [float(np.linalg.norm(e.head_T_camera.translation()[[0, 2]])) for e in t.rig.eyes]
+        sigma_tilt = np.array([t.frames[int(f)].sigma_tilt_rad for f in t.image_frame[images]])
+        sigma = np.hypot(flex.translation_m, np.array(arms)[t.image_eye[images]] * sigma_tilt)
+        loose = diagonal_noise(np.tile(np.repeat([flex.rotation_rad, 1e3], 3), len(images)))
+        on_circle = gtsam.noiseModel.Diagonal.Sigmas(np.repeat(sigma, 3))
         return [
-            mast_factor(loose, camera, mast, angles, mount, axis),
-            circle_factor(on_circle, camera, mast, slot, angles, offset),
+            mast_factor(loose, *chain, axis),
+            circle_factor(on_circle, cameras, mast, [slot for slot, _ in radii], angles, offset),
         ]
 
     def factors(self) -> gtsam.NonlinearFactorGraph:
@@ -144,7 +158,7 @@ class SoftTemplate(FactorTemplate):
         groups = [
             *(self.stop_factors(i) for i in range(len(t.stops))),
             *(self.frame_factors(i) for i in range(len(t.frames))),
-            *(self.image_factors(i) for i in range(len(t.images))),
+            *(self.tie_factors(i) for i in range(len(t.stops))),
             *(self.rig_variables.prior_factors(i) for i in (*range(len(t.stops)), None)),
         ]
         for group in groups:

@@ -11,11 +11,11 @@ from itertools import combinations
 
 import numpy as np
 
-from pancam_graph import Solution
+from pancam_graph import Solution, Traverse
 from pancam_graph.geometry import FloatArray
 from pancam_graph.simulate import Simulation
 
-__all__ = ["NEAR_M", "Similarity", "errors_of", "mean_rotation", "umeyama"]
+__all__ = ["NEAR_M", "Similarity", "aligned_centres", "distances_percent", "errors_of", "mean_rotation", "places_m", "umeyama"]
 
 NEAR_M = 5.0
 """Landmarks nearer than this to the mast nearest to them are near ones."""
@@ -95,12 +95,18 @@ def errors_of(solution: Solution, simulation: Simulation) -> dict[str, float]:
     }
     if len(t.stops) > 1:
         stop = t.image_stop
-        places, true_places = (
-            np.array([c[stop == s].mean(axis=0) for s in range(len(t.stops))])
-            for c in (final.world_t_camera, true_t)
+        places, true_places = places_m(t, final.world_t_camera), places_m(t, true_t)
+        by_itself = np.concatenate(
+            [
+                aligned_centres(final.world_t_camera[stop == s], true_t[stop == s]) - true_t[stop == s]
+                for s in range(len(t.stops))
+            ]
         )
-        found["distance_aligned_percent"] = _distances_percent(aligned.points(places), true_places)
-        found["distance_percent"] = _distances_percent(places, true_places)
+        found["centre_within_mm"] = 1e3 * _rms(by_itself)
+        found["distance_aligned_percent"] = distances_percent(
+            t, aligned.points(final.world_t_camera), true_t
+        )
+        found["distance_percent"] = distances_percent(t, final.world_t_camera, true_t)
         first = stop == 0
         rotation = mean_rotation(true_R[first] @ final.world_R_camera[first].transpose(0, 2, 1))
         ahead = (places[-1] - places[0]) @ rotation.T - (true_places[-1] - true_places[0])
@@ -124,8 +130,20 @@ def _focal_percent(solution: Solution, simulation: Simulation) -> float:
     return 100 * float(np.sqrt(np.mean((ratio - 1) ** 2)))
 
 
-def _distances_percent(places: FloatArray, true_places: FloatArray) -> float:
-    """RMS over pairs of stops of the relative error of their distance."""
+def aligned_centres(centre_m: FloatArray, true_m: FloatArray) -> FloatArray:
+    """Centres (n, 3) after the similarity that takes them nearest to the true ones."""
+    return umeyama(centre_m, true_m).points(centre_m)
+
+
+def places_m(traverse: Traverse, centre_m: FloatArray) -> FloatArray:
+    """Mean (stops, 3) of the centres (images, 3) of each stop."""
+    stop = traverse.image_stop
+    return np.array([centre_m[stop == s].mean(axis=0) for s in range(len(traverse.stops))])
+
+
+def distances_percent(traverse: Traverse, centre_m: FloatArray, true_m: FloatArray) -> float:
+    """RMS over pairs of stops of the relative error of the distance of their places."""
+    places, true_places = places_m(traverse, centre_m), places_m(traverse, true_m)
     pairs = np.array(list(combinations(range(len(places)), 2)))
     found, true = (np.linalg.norm(p[pairs[:, 1]] - p[pairs[:, 0]], axis=1) for p in (places, true_places))
     return 100 * float(np.sqrt(np.mean((found / true - 1) ** 2)))

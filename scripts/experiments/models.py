@@ -3,9 +3,11 @@
 from dataclasses import dataclass, field
 
 from experiments.errors import errors_of
+from experiments.predicted import predicted_errors
 from experiments.running import Sample, attempt
 from experiments.scenarios import Scenario
-from pancam_graph import Solution, SolveOptions, solve
+from pancam_graph import Solution, SolveOptions
+from pancam_graph._adjustment import Adjustment
 from pancam_graph.errors import SolveError
 from pancam_graph.graph import Flex, Model
 from pancam_graph.sharing import Freedom, Sharing
@@ -81,7 +83,7 @@ class ClusterTask:
         simulation = self.scenario.simulate(self.noise_px, self.seed)
         samples = []
         for v in self.variants:
-            metrics, failure = attempt(lambda v=v: _measured(simulation, v.options))  # type: ignore[misc]  # bound now
+            metrics, failure = attempt(lambda v=v: _measured(simulation, v.options, self.seed))  # type: ignore[misc]  # bound now
             samples.append(
                 Sample(
                     experiment=self.scenario.name,
@@ -96,10 +98,12 @@ class ClusterTask:
         return samples
 
 
-def _measured(simulation: Simulation, options: SolveOptions) -> dict[str, float]:
-    solution = solve(simulation.traverse, options)
+def _measured(simulation: Simulation, options: SolveOptions, seed: int) -> dict[str, float]:
+    adjustment = Adjustment(simulation.traverse, options, None, None)
+    adjustment.solve()
+    solution = adjustment.solution()
     _require_whole(solution)
-    return errors_of(solution, simulation)
+    return errors_of(solution, simulation) | predicted_errors(adjustment, seed)
 
 
 def _require_whole(solution: Solution) -> None:
