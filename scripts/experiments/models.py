@@ -12,6 +12,7 @@ from pancam_graph.errors import SolveError
 from pancam_graph.graph import Flex, Model
 from pancam_graph.sharing import Freedom, Sharing
 from pancam_graph.simulate import Simulation
+from pancam_graph.threads import blas_on_one_thread
 
 __all__ = ["FREE_FLEX", "KNOWN_RIG", "RIG_OFF", "ClusterTask", "Variant", "variant"]
 
@@ -100,10 +101,11 @@ class ClusterTask:
 
 def _measured(simulation: Simulation, options: SolveOptions, seed: int) -> dict[str, float]:
     adjustment = Adjustment(simulation.traverse, options, None, None)
-    adjustment.solve()
-    solution = adjustment.solution()
-    _require_whole(solution)
-    return errors_of(solution, simulation) | predicted_errors(adjustment, seed)
+    with blas_on_one_thread():  # as `solve`, of which this is the inside: its covariance is wanted whole
+        adjustment.solve()
+        solution = adjustment.solution()
+        _require_whole(solution)
+        return errors_of(solution, simulation) | predicted_errors(adjustment, seed)
 
 
 def _require_whole(solution: Solution) -> None:

@@ -2,6 +2,7 @@
 
 import math
 import multiprocessing
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -83,8 +84,13 @@ def _results(tasks: Sequence[Task], processes: int) -> Iterator[list[Sample]]:
         yield from map(_run, tasks)
         return
     # Fresh processes: threads of the compiled kernel do not survive a fork.
-    with multiprocessing.get_context("spawn").Pool(processes) as pool:
+    with multiprocessing.get_context("spawn").Pool(processes, _work_alone) as pool:
         yield from pool.imap(_run, tasks)
+
+
+def _work_alone() -> None:
+    """In a process beside others: one thread each, whose number changes no bit of a result."""
+    os.environ.setdefault("PANCAM_GRAPH_THREADS", "1")
 
 
 def _run(task: Task) -> list[Sample]:
