@@ -54,8 +54,8 @@ Kind = Literal["pose", "vector", "number"]
 """What a slot holds: a gtsam.Pose3, a vector, a number."""
 
 Residual = Callable[..., tuple[FloatArray, tuple[FloatArray, ...]]]
-"""Takes the values of each slot at n sites (poses as rotations (n, 3, 3) and translations (n, 3), vectors (n, k),
-numbers (n,)); returns residuals (n, m) and one Jacobian (n, m, tangent) per slot."""
+"""Takes the values of each slot at n sites (poses as rotations (n, 3, 3) and translations (n, 3), vectors
+(n, k), numbers (n,)); returns residuals (n, m) and one Jacobian (n, m, tangent) per slot."""
 
 
 def custom_factor(
@@ -65,9 +65,9 @@ def custom_factor(
 ) -> gtsam.CustomFactor:
     """A GTSAM factor from a pure residual, over those of its slots that are variables.
 
-    Each slot comes with what it holds. One factor may stand for many sites (the images of a stop), each slot is
-    then a sequence of so many: that is evaluated in one go, and its rows are those of one site after the other.
-    An exception in the residual reaches the caller of the optimiser with its own type and message.
+    Each slot comes with what it holds. One factor may stand for many sites (the images of a stop), each slot
+    is then a sequence of so many: that is evaluated in one go, and its rows are those of one site after the
+    other. An exception in the residual reaches the caller of the optimiser with its own type and message.
     """
     readers = [
         _Reader([slot] if isinstance(slot, Key | Fixed | Corrected) else slot, kind) for slot, kind in slots

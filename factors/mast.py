@@ -43,9 +43,10 @@ def _adjoint_of_inverse(rotation: FloatArray, translation: FloatArray) -> FloatA
 def mast_residual(
     world_T_camera: Pose, world_T_mast: Pose, pan_tilt_rad: FloatArray, head_T_camera: Pose, pan_T_tilt: Pose
 ) -> tuple[FloatArray, tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]]:
-    """Residuals (..., 6), Jacobians by camera, mast (..., 6, 6), pan-tilt (..., 6, 2), mount, axis (..., 6, 6).
+    """Residuals (..., 6), and Jacobians by camera, mast, pan-tilt, mount and tilt axis.
 
-    Poses are pairs of rotations and translations; Jacobians are by body-frame tangents, rotation first.
+    Poses are pairs of rotations and translations; Jacobians (..., 6, 6), by pan-tilt (..., 6, 2), are by
+    body-frame tangents, rotation first.
     Defined where camera and chain differ by less than half a turn.
     """
     camera_R, camera_t = world_T_camera

@@ -88,10 +88,22 @@ class OnGraph:
         """`held` are, by key, tangent components that the graph's factors hold."""
         self._graph, self._held = graph, held
         self._optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
-        self.iterate = self._optimizer.iterate
-        self.error = self._optimizer.error
-        self.values = self._optimizer.values
-        self.damping = self._optimizer.lambda_
+
+    def iterate(self) -> None:
+        """Take the next step that lowers the cost."""
+        self._optimizer.iterate()
+
+    def error(self) -> float:
+        """The cost where it stands."""
+        return float(self._optimizer.error())
+
+    def damping(self) -> float:
+        """Lambda of the next step."""
+        return float(self._optimizer.lambda_())
+
+    def values(self) -> gtsam.Values:
+        """Where it stands; gone once it has moved on."""
+        return self._optimizer.values()
 
     def gradient(self) -> float:
         """Landmark blocks linearise here as they would in the next step, and not again then.
@@ -107,9 +119,7 @@ class OnGraph:
         return largest
 
 
-def parameters_of(
-    rule: StopRule, elimination: "Elimination | InOrder"
-) -> gtsam.LevenbergMarquardtParams:
+def parameters_of(rule: StopRule, elimination: "Elimination | InOrder") -> gtsam.LevenbergMarquardtParams:
     """GTSAM's options for a rule and an order of elimination."""
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setlambdaUpperBound(MOST_DAMPING)

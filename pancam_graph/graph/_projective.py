@@ -40,14 +40,16 @@ class ProjectiveTemplate(SoftTemplate):
     """Projection matrices of their own, tied to the mast: by flex their poses, loosely their calibrations.
 
     The tie is what holds the 15 directions in which a projective reconstruction is free, and the surplus
-    factor of each matrix. A projective transformation of the world changes no pixel, so nothing but the tie keeps
-    steps short, and landmarks must be refined after each (Hong et al., Projective bundle adjustment from
-    arbitrary initialization using the variable projection method, 2016). Without `normalise` the variables are the entries of P in pixels and metres, about
-    the world's origin: for comparison, the optimum is the same.
+    factor of each matrix. A projective transformation of the world changes no pixel, so nothing but the tie
+    keeps steps short, and landmarks must be refined after each (Hong et al., Projective bundle adjustment
+    from arbitrary initialization using the variable projection method, 2016). Without `normalise` the
+    variables are the entries of P in pixels and metres, about the world's origin: for comparison, the
+    optimum is the same.
     """
 
     _camera_letter = "P"
     _poses = False
+
     def __init__(self, traverse: Traverse, flex: Flex, *, normalise: bool = True) -> None:
         super().__init__(traverse, "projective", flex)
         n = len(traverse.images)

@@ -32,8 +32,9 @@ class SoftTemplate(FactorTemplate):
     _poses = True
     """Whether a camera's variable is its own pose"""
     refines_landmarks = True
-    """Cameras that are free to move far along what images hardly tell take landmarks with them; there the linear
-    step of a landmark is off by more than noise. Three clusters of one eye took 81 steps without, and take 7."""
+    """Cameras that are free to move far along what images hardly tell take landmarks with them, and far along
+    the linear step of a landmark is off by more than noise. Three clusters of one eye took up to 81 steps
+    without, and take 7."""
 
     def __init__(self, traverse: Traverse, model: Model, flex: Flex, sharing: Sharing | None = None) -> None:
         super().__init__(traverse, model, sharing)

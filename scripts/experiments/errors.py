@@ -15,7 +15,16 @@ from pancam_graph import Solution, Traverse
 from pancam_graph.geometry import FloatArray
 from pancam_graph.simulate import Simulation
 
-__all__ = ["NEAR_M", "Similarity", "aligned_centres", "distances_percent", "errors_of", "mean_rotation", "places_m", "umeyama"]
+__all__ = [
+    "NEAR_M",
+    "Similarity",
+    "aligned_centres",
+    "distances_percent",
+    "errors_of",
+    "mean_rotation",
+    "places_m",
+    "umeyama",
+]
 
 NEAR_M = 5.0
 """Landmarks nearer than this to the mast nearest to them are near ones."""
@@ -103,9 +112,7 @@ def errors_of(solution: Solution, simulation: Simulation) -> dict[str, float]:
             ]
         )
         found["centre_within_mm"] = 1e3 * _rms(by_itself)
-        found["distance_aligned_percent"] = distances_percent(
-            t, aligned.points(final.world_t_camera), true_t
-        )
+        found["distance_aligned_percent"] = distances_percent(t, aligned.points(final.world_t_camera), true_t)
         found["distance_percent"] = distances_percent(t, final.world_t_camera, true_t)
         first = stop == 0
         rotation = mean_rotation(true_R[first] @ final.world_R_camera[first].transpose(0, 2, 1))

@@ -73,7 +73,8 @@ def plan(*, seeds: int, quick: bool, families: Sequence[str] = FAMILIES) -> Plan
         tasks += [validation.ValidationTask(noise_px=0.5, seed=seed) for seed in range(min(seeds, 10))]
     if "clusters" in families:
         for scenario in CLUSTERS:
-            tasks += _over_seeds([scenario], (0.5, 2.0) if quick else NOISES_PX, seeds, KNOWN_RIG)
+            noises = (0.5, 2.0) if quick else NOISES_PX if scenario.stops == 1 else (0.1, 0.5, 1.0, 2.0)
+            tasks += _over_seeds([scenario], noises, seeds, KNOWN_RIG)
         tasks += _over_seeds([DENSE], _MIDDLE_PX, seeds, KNOWN_RIG)
         tasks += _over_seeds(RIG_OFF_CLUSTERS, _MIDDLE_PX, seeds, RIG_OFF)
     if "alternation" in families:
