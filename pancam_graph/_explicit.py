@@ -60,7 +60,7 @@ class ExplicitSolver(Solver):
         problem = _placed(problem, loss)
         template = _soft(problem)
         explicit, present = ExplicitLandmarks(template, problem.measurements), problem.present
-        observed = explicit.calibrations.in_place(problem.factors)
+        observed = explicit.calibrations.in_place(template.factors(apart=True))
         observed.push_back(explicit.factors(problem.kept, loss))
 
         def values_of(p: Problem) -> gtsam.Values:
@@ -122,7 +122,7 @@ class ExplicitSolver(Solver):
             _weak(problem),
         )
         points = problem.points_m()
-        graph = explicit.calibrations.in_place(problem.factors)
+        graph = explicit.calibrations.in_place(template.factors(apart=True))
         graph.push_back(explicit.factors(problem.kept))
         graph.push_back(explicit.proximal_factors(points, weak.prior_m, weak.needs_prior))
         values = explicit.with_landmarks(problem.values, points, present)

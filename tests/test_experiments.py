@@ -283,7 +283,7 @@ def test_results_are_complete(tmp_path: Path) -> None:
     )
     samples.append(replace(samples[0], metrics={}, failure="it did not want to", seed=9))
     found = write_results(samples, ["an experiment: not here"], tmp_path / "out")
-    assert [v.expectation[:6] for v in found] == ["The jo", "Camera"]
+    assert [v.expectation[:6] for v in found] == ["The jo", "Camera", "Errors"]
     entries = json.loads((tmp_path / "out/results.json").read_text(encoding="utf-8"))
     assert all(list(entry) == KEYS for entry in entries)
     assert {e["failed"] for e in entries} == {0, 1}

@@ -155,6 +155,7 @@ def test_error_elsewhere_is_the_true_cost_of_the_landmarks_that_followed(
     model: str, loss: LossName, size: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("pancam_graph.elimination._system._STRAY", np.inf)  # nothing is refined after it
+    monkeypatch.setattr("pancam_graph.graph.SoftTemplate.refines_landmarks", False)
     problem, chosen = problem_of(model), loss_of(loss)
     expected, link = dense(problem, chosen), problem.template.linkage
     blocks, graph = blocks_of(problem, chosen)

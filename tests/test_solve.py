@@ -140,7 +140,7 @@ def test_covariances_agree_with_gtsam_marginals() -> None:
     problem = adjustment.problem
     assert isinstance(problem.template, SoftTemplate)
     explicit = ExplicitLandmarks(problem.template, problem.measurements)
-    graph = gtsam.NonlinearFactorGraph(problem.factors)
+    graph = problem.template.factors(apart=True)
     graph.push_back(explicit.factors(problem.kept))
     values = explicit.with_landmarks(problem.values, problem.points_m(), problem.present)
     marginals = gtsam.Marginals(graph, values)

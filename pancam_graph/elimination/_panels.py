@@ -239,8 +239,8 @@ class Root:
     def step(self, known: Mapping[int, FloatArray] | None = None) -> FloatArray:
         """The x (columns,) that solves S x = -s, by back substitution in R x = -e; group by group.
 
-        Groups whose x is `known` keep it, and those before follow. Where a group's rows leave directions free,
-        the shortest one for what the later groups do.
+        Groups whose x is `known` keep it, and those before follow. Where a group's rows leave directions
+        free, the shortest one for what the later groups do.
         """
         st = self.structure
         begin = np.concatenate([[0], np.cumsum(st.dim)])

@@ -17,7 +17,7 @@ from pancam_graph.cameras import (
 )
 from pancam_graph.elimination import Covariance, Posture
 from pancam_graph.factors import Fixed, Key, projective_factor
-from pancam_graph.geometry import FloatArray, pose_arrays
+from pancam_graph.geometry import FloatArray, IntArray, pose_arrays
 from pancam_graph.graph._options import Flex
 from pancam_graph.graph._soft import SoftTemplate
 from pancam_graph.graph._template import Factors, diagonal_noise
@@ -83,19 +83,16 @@ class ProjectiveTemplate(SoftTemplate):
             chain=tangents[:, :11],
         )
 
-    def tie_factors(self, stop: int) -> Factors:
-        """The tie of each matrix of a stop to its mast and to the rig's calibration, as one factor."""
+    def tie_factors(self, images: IntArray) -> Factors:
+        """The ties of some images' matrices to the mast and to the rig's calibration, as one factor."""
         t, flex = self.traverse, self.flex
-        images = np.flatnonzero(t.image_stop == stop)
-        if len(images) == 0:
-            return []
         pose = np.repeat([flex.rotation_rad, flex.translation_m], 3)
         sigmas = [np.concatenate([pose, self._calibration_sigma_px(int(i)), [_FACTOR_SIGMA]]) for i in images]
         return [
             projective_factor(
                 diagonal_noise(np.concatenate(sigmas)),
                 [Key(self.camera_key(int(i))) for i in images],
-                [self.mast(stop)] * len(images),
+                [self.mast(int(s)) for s in t.image_stop[images]],
                 [self.pan_tilt(int(f)) for f in t.image_frame[images]],
                 [Fixed(t.rig.eyes[int(e)].head_T_camera) for e in t.image_eye[images]],
                 [Fixed(t.rig.pan_T_tilt)] * len(images),

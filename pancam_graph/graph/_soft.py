@@ -112,20 +112,17 @@ class SoftTemplate(FactorTemplate):
         sigmas = np.array([entry.sigma_pan_rad, entry.sigma_tilt_rad])
         return [gtsam.PriorFactorVector(slot.key, self.traverse.pan_tilt_rad[frame], diagonal_noise(sigmas))]
 
-    def tie_factors(self, stop: int) -> Factors:
-        """The tie of each camera pose of a stop to its mast, and to its circle where the model says so.
+    def tie_factors(self, images: IntArray) -> Factors:
+        """The ties of some images' camera poses to the mast, and to their circles where the model says so.
 
-        One factor for all images of the stop: evaluated one by one they would take most of a solve.
+        One factor for all of them: evaluated one by one they would take most of a solve.
         """
         t, free, flex = self.traverse, self.rig_variables, self.flex
-        images = np.flatnonzero(t.image_stop == stop)
-        if len(images) == 0:
-            return []
         cameras = [Key(self.camera_key(int(i))) for i in images]
         angles = [self.pan_tilt(int(f)) for f in t.image_frame[images]]
-        mast = [self.mast(stop)] * len(images)
+        mast = [self.mast(int(s)) for s in t.image_stop[images]]
         chain = (cameras, mast, angles, [free.mount_slot(int(i)) for i in images])
-        axis = [free.axis_slot(stop)] * len(images)
+        axis = [free.axis_slot(int(s)) for s in t.image_stop[images]]
         if self.model != "circle":
             sigmas = np.repeat([flex.rotation_rad, flex.translation_m], 3)
             return [mast_factor(diagonal_noise(np.tile(sigmas, len(images))), *chain, axis)]
@@ -152,14 +149,20 @@ class SoftTemplate(FactorTemplate):
             circle_factor(on_circle, cameras, mast, [slot for slot, _ in radii], angles, offset),
         ]
 
-    def factors(self) -> gtsam.NonlinearFactorGraph:
-        """All factors but those of landmarks."""
+    def factors(self, *, apart: bool = False) -> gtsam.NonlinearFactorGraph:
+        """All factors but those of landmarks; ties stop by stop, or each `apart`.
+
+        Apart they leave a graph as sparse as it is, for those who have GTSAM eliminate all of it.
+        """
         graph = gtsam.NonlinearFactorGraph()
         t = self.traverse
+        tied = range(len(t.images)) if apart else range(len(t.stops))
+        owner = np.arange(len(t.images)) if apart else t.image_stop
+        ties = [images for i in tied if len(images := np.flatnonzero(owner == i))]
         groups = [
             *(self.stop_factors(i) for i in range(len(t.stops))),
             *(self.frame_factors(i) for i in range(len(t.frames))),
-            *(self.tie_factors(i) for i in range(len(t.stops))),
+            *(self.tie_factors(images) for images in ties),
             *(self.rig_variables.prior_factors(i) for i in (*range(len(t.stops)), None)),
         ]
         for group in groups:

@@ -15,6 +15,8 @@ _METRICS = {
     "stop_m": "second stop (m)",
     "landmark_relative": "landmarks, relative",
     "centre_mm": "centres (mm)",
+    "centre_predicted_mm": "centres, as predicted (mm)",
+    "centre_within_mm": "centres within a cluster (mm)",
     "rotation_mrad": "rotations (mrad)",
     "landmark_m": "landmarks (m)",
     "landmark_median_m": "their median (m)",
@@ -23,6 +25,7 @@ _METRICS = {
     "focal_percent": "focal length (%)",
     "distance_aligned_percent": "distances, aligned (%)",
     "distance_percent": "distances (%)",
+    "distance_predicted_percent": "distances, as predicted (%)",
     "localisation_percent": "last stop (% of the way)",
     "reprojection_px": "residual (px)",
     **{f"excess_after_{n}_steps": f"cost above the best after {n} steps, relative" for n in STEPS},
@@ -59,6 +62,8 @@ the thesis's own figures have not survived, so there is nothing to compare with,
   clusters (means of their centres) after the similarity, "distances" before it: the scale is the solution's
   own. "Last stop" is its error after the first stop's cameras were laid on the true ones without scaling, in
   % of the way driven. Landmarks are near within 5 m of a mast.
+- **As predicted:** the same errors of draws from the solution's own covariance about it (median of 25), so
+  what the information allows. "Within a cluster": each cluster's centres after a similarity of their own.
 - **Failed:** the solve raised an error, did not converge within 200 steps, or lost an observation's landmark.
   A failed run is infinitely wrong in every metric and stays in the median and the interval (∞; null in
   results.json). Points beyond infinity are no failure; they count where they lie, which makes RMS errors
