@@ -126,6 +126,22 @@ def test_the_truth_has_no_error() -> None:
     assert errors == pytest.approx(dict.fromkeys(errors, 0.0), abs=1e-9)
 
 
+# --- what a solution predicts ---
+
+
+def test_errors_of_the_mast_are_those_its_covariance_predicts() -> None:
+    """Over seeds: their medians, which 12 of them tell to a third."""
+    scenario = replace(TINY, stops=2, spacing_m=3.0)
+    task = [ClusterTask(scenario=scenario, noise_px=0.5, seed=i, variants=KNOWN_RIG[:1]) for i in range(12)]
+    found = [sample.metrics for one in task for sample in one.run()]
+    for name, predicted in (
+        ("centre_mm", "centre_predicted_mm"),
+        ("distance_percent", "distance_predicted_percent"),
+    ):
+        measured, expected = (np.median([m[key] for m in found]) for key in (name, predicted))
+        assert 0.5 < measured / expected < 2.0
+
+
 # --- failures ---
 
 

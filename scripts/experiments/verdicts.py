@@ -116,10 +116,10 @@ def _order(results: Results) -> Verdict:
     return Verdict(
         expectation="Camera centres: mast < circle < free <= projective at half a pixel and more",
         found=tuple(found),
-        explanation="In brackets: what each solution's own covariance predicts. Of three clusters, millimetres "
-        "are those of where the clusters are to each other. That is told by tracks that two of them see, to "
-        "all models alike: there `mast` and `circle` are apart by less than seeds are. Within each cluster, "
-        "aligned by itself (in the tables), the order is that of one cluster.",
+        explanation="In brackets: what each solution's own covariance predicts. Of three clusters, "
+        "millimetres are those of where the clusters are to each other. That is told by tracks that two of "
+        "them see, to all models alike: there `mast` and `circle` are apart by less than seeds are. Within "
+        "each cluster, aligned by itself (in the tables), the order is that of one cluster.",
     )
 
 
@@ -156,11 +156,11 @@ def _distance(results: Results) -> Verdict:
     return Verdict(
         expectation="Distance of two panoramas with the mast model: off by less than 0.5 % at half a pixel",
         found=tuple(found),
-        explanation="The scale is that of the mast: with one eye 0.14 m from its axis, with both 0.2 m between "
-        "them besides. The error is what the covariance predicts, so no solver gets below it with the same "
-        "observations. It grows with the noise, with more than the distance (the farther the stops, the "
-        "farther the points that both see, and the less of its own scale a stop sees in them), and falls with "
-        "the root of the number of tracks.",
+        explanation="The scale is that of the mast: with one eye 0.14 m from its axis, with both 0.2 m "
+        "between them besides. The error is what the covariance predicts, so no solver gets below it with "
+        "the same observations. It grows with the noise, with more than the distance (the farther the stops, "
+        "the farther the points that both see, and the less of its own scale a stop sees in them), and falls "
+        "with the root of the number of tracks.",
     )
 
 
