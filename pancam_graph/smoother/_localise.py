@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from pancam_graph._optimise import InOrder, optimise
+from pancam_graph._optimise import InOrder, OnGraph, optimise, parameters_of
 from pancam_graph.elimination import LandmarkSystem, Posture
 from pancam_graph.factors import LandmarkBlocks
 from pancam_graph.geometry import FloatArray
@@ -57,13 +57,11 @@ def localise(
     graph = gtsam.NonlinearFactorGraph()
     for factor in (*priors, *blocks.factors()):
         graph.push_back(factor)
+    parameters = parameters_of(_RULE, InOrder(blocks.ordering()))
     outcome = optimise(
-        graph,
-        copied(values, station.own),
+        lambda: OnGraph(graph, copied(values, station.own), parameters, {}),
         _RULE,
-        InOrder(blocks.ordering()),
         n_observations=len(placed.measurements.row),
-        held={},
     )
     blocks.settle(outcome.values)
     views = patch.views(postures.moved(station, outcome.values))
