@@ -2,9 +2,11 @@
 
 import argparse
 import logging
+import shutil
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
@@ -15,12 +17,14 @@ from rich.table import Table
 from pancam_graph._honest import CrossValidation
 from pancam_graph._optimise import Iteration
 from pancam_graph.errors import PancamGraphError
+from pancam_graph.io.cache_folder import cache_folder, is_cache
 from pancam_graph.smoother import Update
 from pancam_graph.solution import Solution
 
-__all__ = ["SHARING_HELP", "Parser", "Progress", "print_summary", "run", "show_log"]
+__all__ = ["SHARING_HELP", "Parser", "Progress", "print_summary", "resumable", "run", "show_log"]
 
 BAD_INPUT = 2
+INTERRUPTED = 130
 SHARING_HELP = (
     "what of the rig is estimated, and who shares it: QUANTITY=SCOPE[:ENTRY[~SIGMA],...] with quantities "
     "calibration (fx_px fy_px skew_px cx_px cy_px, or focal), mounts and pan_T_tilt (rx_rad ry_rad rz_rad "
@@ -50,9 +54,31 @@ def run(main: Callable[[], int]) -> NoReturn:
     except (PancamGraphError, OSError) as error:
         sys.stderr.write(f"{str(error).strip()}\n")
         sys.exit(BAD_INPUT)
+    except KeyboardInterrupt as interrupt:
+        sys.stderr.write(f"{str(interrupt) or 'interrupted; nothing was written'}\n")
+        sys.exit(INTERRUPTED)
+
+
+@contextmanager
+def resumable(out: Path) -> Iterator[None]:
+    """While the block runs, what it keeps in the cache of the folder `out` outlives an interrupt.
+
+    The interrupt then says how to go on. Bad input leaves nothing behind that was not there before.
+    """
+    before = [path for path in (out, cache_folder(out)) if path.exists()]
+    try:
+        yield
     except KeyboardInterrupt:
-        sys.stderr.write("interrupted; nothing was written\n")
-        sys.exit(130)
+        if is_cache(cache_folder(out)):
+            raise KeyboardInterrupt(
+                f"interrupted; no results were written; what was found in the images so far is in "
+                f"{cache_folder(out)}: run the same command again to go on from there"
+            ) from None
+        raise
+    except PancamGraphError:
+        if is_cache(cache_folder(out)) and cache_folder(out) not in before:
+            shutil.rmtree(cache_folder(out) if out in before else out, ignore_errors=True)
+        raise
 
 
 def show_log(*, verbose: bool) -> None:

@@ -71,6 +71,8 @@ class Image:
     """Name of the eye."""
     file: str | None = None
     """Path of the image file relative to the traverse folder, if there is one."""
+    mask: str | None = None
+    """Path of a mask relative to the traverse folder: white where the image may be used, black where not."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

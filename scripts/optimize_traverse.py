@@ -3,8 +3,11 @@
 TRAVERSE is a folder with traverse.json, or a folder of rover images with PDS labels (MER, MSL,
 Mars 2020). OUT gets solution.json, points.ply, residuals.csv and report.html, and with
 --mosaic a folder of mosaics; an older OUT is replaced once the new results are complete.
+OUT/cache keeps what was found in images: the same command goes on after an interrupt, and again
+only with what has changed.
 
-Exit status: 0 solved, 1 not converged (results are written), 2 bad input (nothing is written).
+Exit status: 0 solved, 1 not converged (results are written), 2 bad input (nothing is written),
+130 interrupted.
 """
 
 import time
@@ -14,9 +17,9 @@ from pathlib import Path
 from pancam_graph import SolveOptions, cross_validate, find_observations, read_input, solve
 from pancam_graph.images.mosaic import MosaicOptions
 from pancam_graph.incremental import solve_incrementally
-from pancam_graph.io import EXPORTS, check_exports, check_out
+from pancam_graph.io import EXPORTS, cache_folder, check_exports, check_out
 from pancam_graph.kernel import must_compile
-from pancam_graph.program import SHARING_HELP, Parser, Progress, print_summary, run, show_log
+from pancam_graph.program import SHARING_HELP, Parser, Progress, print_summary, resumable, run, show_log
 from pancam_graph.sharing import parse_sharing
 from pancam_graph.solve import COMPILING
 from pancam_graph.stopping import criteria
@@ -94,13 +97,15 @@ def main() -> int:
     progress = Progress()
 
     begin = time.perf_counter()
-    with progress.shown(f"reading {arguments.traverse}"):
-        check_out(arguments.out)
+    check_out(arguments.out)
+    with progress.shown(f"reading {arguments.traverse}"), resumable(arguments.out):
         traverse = read_input(arguments.traverse)
         check_exports(traverse, arguments.export)
         options = replace(options, sharing=parse_sharing(arguments.sharing, traverse.sharing))
         if traverse.observations is None:
-            traverse = find_observations(traverse, progress=progress.counted)
+            traverse = find_observations(
+                traverse, progress=progress.counted, cache=cache_folder(arguments.out)
+            )
         read_s = time.perf_counter() - begin
         if must_compile():
             progress.say(COMPILING)

@@ -384,10 +384,10 @@ def test_images_without_content_or_file_are_warned_of(tmp_path: Path) -> None:
     )
     assert found.warnings == (
         "images s0-f1-left and s0-f2-left: no matches, although they overlap by pointing",
-        "image s0-f2-left: no observations were found in it",
+        "image s0-f2-left (s0-f2-left.png): no observations were found in it",
         "image s0-f3-left: it has no file",
     )
-    assert set(seen) == {"overlaps", "features", "matches"}
+    assert set(seen) == {"images", "overlaps", "masks", "features", "matches", "refinement"}
     for counts in seen.values():
         assert counts == [(k + 1, len(counts)) for k in range(len(counts))]
 

@@ -1,4 +1,7 @@
 """From image files to observations: reading, features, matching, tracks."""
 
+from pancam_graph.images._front_end import find_masks as find_masks
 from pancam_graph.images._front_end import find_observations as find_observations
+from pancam_graph.images._masks import ImageMask as ImageMask
+from pancam_graph.images._masks import Reason as Reason
 from pancam_graph.images._options import FrontEndOptions as FrontEndOptions

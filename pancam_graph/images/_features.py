@@ -44,13 +44,24 @@ class Features:
         """Number of features."""
         return len(self.uv_px)
 
+    def select(self, rows: BoolArray | IntArray) -> "Features":
+        """Some of the features."""
+        return Features(uv_px=self.uv_px[rows], size_px=self.size_px[rows], descriptor=self.descriptor[rows])
+
 
 def find_features(
-    image: NDArray[Any], wanted: BoolArray, camera: Camera, camera_up: FloatArray, options: FrontEndOptions
+    image: NDArray[Any],
+    wanted: BoolArray,
+    camera: Camera,
+    camera_up: FloatArray,
+    options: FrontEndOptions,
+    *,
+    usable: BoolArray | None = None,
 ) -> Features:
     """Features of an image (height, width) that `camera` took, in the pieces of it that are `wanted`.
 
-    `wanted` is a grid over the image, by row and column.
+    `wanted` is a grid over the image, by row and column; `usable` (height, width) leaves out pixels, by
+    default those without data.
     `camera_up` is the world's vertical as a unit vector (3,) in the camera frame. Descriptors are turned
     to its image instead of the local gradient's direction: a mast never rolls, so this compares like with
     like and saves one unknown. Returns no features, never an error, for an image without texture.
@@ -61,7 +72,7 @@ def find_features(
         nfeatures=0, contrastThreshold=options.contrast_threshold, enable_precise_upscale=True
     )
     wanted_mask = cv2.resize(wanted.astype(np.uint8), grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
-    usable = usable_mask(image) & (wanted_mask > 0)
+    usable = (usable_mask(image) if usable is None else usable) & (wanted_mask > 0)
     found = sift.detect(grey, None)
     table = np.array([(k.pt[1], k.pt[0], k.size, k.response) for k in found]).reshape(-1, 4)
     rows = _choose(table, usable, options.max_features)

@@ -1,34 +1,27 @@
-"""From image files to observations: features, pairs, matches, tracks."""
+"""From image files to observations: masks, features, pairs, matches, tracks."""
 
 import logging
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from pancam_graph.errors import InputError
-from pancam_graph.geometry import BoolArray
-from pancam_graph.images._features import Features, find_features
+from pancam_graph.images._cache import Cache
+from pancam_graph.images._masks import ImageMask
 from pancam_graph.images._match import Matches
-from pancam_graph.images._match_pair import match_pair
 from pancam_graph.images._options import FrontEndOptions
-from pancam_graph.images._overlap import overlap_cells, overlapping_pairs
 from pancam_graph.images._pairs import PairGeometry
-from pancam_graph.images._refine import refine_tracks
+from pancam_graph.images._read import image_name, listed
+from pancam_graph.images._steps import Progress, Steps
 from pancam_graph.images._tracks import Links, join_tracks
-from pancam_graph.io.image_files import GreyImage, read_eye_image
 from pancam_graph.traverse import Observations, Traverse
 
-__all__ = ["find_observations"]
+__all__ = ["find_masks", "find_observations"]
 
 _LOG = logging.getLogger(__name__)
 _SURE_OVERLAP = 0.1
 _SURE_DEPTH_M = 3.0
-_WORLD_UP = np.array([0.0, 0.0, 1.0])
-
-Progress = Callable[[str, int, int], None]
 
 
 def find_observations(
@@ -36,6 +29,7 @@ def find_observations(
     options: FrontEndOptions = FrontEndOptions(),  # noqa: B008  frozen
     *,
     progress: Progress | None = None,
+    cache: Path | None = None,
 ) -> Traverse:
     """Find the same terrain points in the image files of a traverse.
 
@@ -45,28 +39,27 @@ def find_observations(
     windows, and what is far from its epipolar line is left out. The same files give the same observations
     to the last bit.
 
-    Between stops, matches that stand still relative to the mast are left out, for that is how the rover
-    sees its own deck; at one stop, where the deck stands still, they are kept.
+    Left out are what the user's masks cover, missing and saturated pixels, and sky (see `find_masks`).
+    Between stops, so is the rover itself, and matches that stand still relative to the mast are dropped; at
+    one stop, where the deck stands still, both are kept.
 
-    `progress` is called with a stage, how many of its parts are done, and how many there are.
+    `progress` is called with a stage, how many of its parts are done, and how many there are. `cache` is a
+    folder to keep each part in: what has not changed since an earlier run, also one that was interrupted, is
+    taken from there, and the result is the same to the last bit.
 
     Returns the traverse with observations of origin "images", in place of any that it had, and with
-    warnings for images without observations and for pairs that overlap but give no matches.
+    warnings for images without observations or over-exposed or there twice, and for pairs that overlap but
+    give no matches.
 
     Raises InputError if no image has a file or nothing is found, ImageError naming the file for
-    one that cannot be read or has another size than its camera.
+    one that cannot be read or has another size than its camera, and for such a mask.
     """
-    images = _read_images(traverse)
-    pairs = [
-        pair
-        for pair in overlapping_pairs(traverse, options, _staged("overlaps", progress))
-        if images[pair.a] is not None and images[pair.b] is not None
-    ]
-    features = _all_features(traverse, images, overlap_cells(traverse, pairs, options), options, progress)
-    parts, warnings = [], []
+    work = Steps(traverse, options, progress, Cache(cache))
+    warnings = [*work.pictures.warnings, *work.over_exposed()]
+    parts: list[Links] = []
     far = replace(options, min_depth_m=max(options.min_depth_m, _SURE_DEPTH_M))
-    for k, pair in enumerate(pairs):
-        matches = match_pair(pair, features[pair.a], features[pair.b], options)
+    for k, pair in enumerate(work.pairs):
+        matches = work.matches(pair)
         names = traverse.images[pair.a].id, traverse.images[pair.b].id
         _LOG.info("%s, %s: %d matches", *names, len(matches))
         if len(matches):
@@ -75,26 +68,27 @@ def find_observations(
             warnings.append(
                 f"images {names[0]} and {names[1]}: no matches, although they overlap by pointing"
             )
-        if progress is not None:
-            progress("matches", k + 1, len(pairs))
+        work.tell("matches", k + 1, len(work.pairs))
     image, feature, track = join_tracks(Links.concatenate(parts))
+    unseen = [i for i in range(len(traverse.images)) if i not in set(image.tolist())]
     if not len(track):
+        why = [f"{image_name(traverse, i)}{work.why_nothing(i)}" for i in unseen]
         raise InputError(
             f"images of {traverse.name}: expected features that several images share, found none "
-            f"({len(pairs)} pairs overlap by pointing)"
+            f"({len(work.pairs)} pairs overlap by pointing): {listed(why)}"
         )
-    seen = np.unique(image)
     warnings += [
-        f"image {im.id}: {'no observations were found in it' if im.file is not None else 'it has no file'}"
-        for i, im in enumerate(traverse.images)
-        if i not in seen
+        f"image {image_name(traverse, i)}: no observations were found in it{work.why_nothing(i)}"
+        if traverse.images[i].file is not None
+        else f"image {traverse.images[i].id}: it has no file"
+        for i in unseen
     ]
     uv_px, size_px = np.empty((len(image), 2)), np.empty(len(image))
-    for i in seen:
+    for i in np.unique(image):
         rows = image == i
-        uv_px[rows] = features[i].uv_px[feature[rows]]
-        size_px[rows] = features[i].size_px[feature[rows]]
-    uv_px, refined = refine_tracks(traverse, images, image, track, uv_px, options)
+        uv_px[rows] = work.features[i].uv_px[feature[rows]]
+        size_px[rows] = work.features[i].size_px[feature[rows]]
+    uv_px, refined = work.refined(image, track, uv_px)
     as_found = np.hypot(options.sigma_px, options.sigma_per_size * size_px)
     observations = Observations(
         image=image,
@@ -103,48 +97,24 @@ def find_observations(
         sigma_px=np.where(refined, options.refined_sigma_px, as_found),
         origin="images",
     )
+    work.cache.forget_others()
     return traverse.with_observations(observations, warnings)
 
 
-def _staged(stage: str, progress: Progress | None) -> Callable[[int, int], None] | None:
-    return None if progress is None else partial(progress, stage)
-
-
-def _read_images(traverse: Traverse) -> list[GreyImage | None]:
-    """Images as arrays; None for one without a file."""
-    if all(image.file is None for image in traverse.images):
-        raise InputError(f"traverse {traverse.name}: expected observations or image files, found neither")
-    folder = traverse.folder or Path()
-    found: list[GreyImage | None] = []
-    for entry, eye in zip(traverse.images, traverse.image_eye, strict=True):
-        if entry.file is None:
-            found.append(None)
-            continue
-        found.append(read_eye_image(folder / entry.file, traverse.rig, int(eye)))
-    return found
-
-
-def _all_features(
+def find_masks(
     traverse: Traverse,
-    images: list[GreyImage | None],
-    wanted: BoolArray,
-    options: FrontEndOptions,
-    progress: Progress | None,
-) -> list[Features]:
-    """Features of every image where it overlaps others; none for an image without a file."""
-    world_R_camera, _ = traverse.camera_poses()
-    features = []
-    for i, (image, eye) in enumerate(zip(images, traverse.image_eye, strict=True)):
-        if image is None:
-            features.append(Features.none())
-        else:
-            camera_up = world_R_camera[i].T @ _WORLD_UP
-            camera = traverse.rig.eyes[eye].camera
-            features.append(find_features(image, wanted[i], camera, camera_up, options))
-        _LOG.info("%s: %d features", traverse.images[i].id, len(features[i]))
-        if progress is not None:
-            progress("features", i + 1, len(images))
-    return features
+    options: FrontEndOptions = FrontEndOptions(),  # noqa: B008  frozen
+    *,
+    progress: Progress | None = None,
+    cache: Path | None = None,
+) -> tuple[ImageMask | None, ...]:
+    """What of each image is left out, and why; None for an image without a file, or that is there twice.
+
+    Sky, saturated pixels and the rover are found in the images, unless `options.masks` is "user". The rover
+    is what stands still relative to the mast between stops, in images in which an eye looks the same way at
+    both. Raises as `find_observations` does.
+    """
+    return tuple(Steps(traverse, options, progress, Cache(cache)).masks)
 
 
 def _links(pair: PairGeometry, matches: Matches) -> Links:

@@ -1,6 +1,7 @@
 """Options of the image front end."""
 
 from dataclasses import dataclass, fields
+from typing import Literal
 
 from pancam_graph.errors import InputError
 
@@ -55,11 +56,16 @@ class FrontEndOptions:
     refined_sigma_px: float = 0.12
     """Standard deviation of positions that least-squares matching refined."""
 
+    masks: Literal["automatic", "user"] = "automatic"
+    """Whether sky, saturated pixels and the rover are left out too, or only what the user's masks cover."""
+
     def __post_init__(self) -> None:
         """Check the ranges."""
+        if self.masks not in {"automatic", "user"}:
+            raise InputError(f"FrontEndOptions: masks: expected automatic or user, found {self.masks!r}")
         for entry in fields(self):
             value = getattr(self, entry.name)
-            if not value > 0:
+            if not isinstance(value, str) and not value > 0:
                 raise InputError(f"FrontEndOptions: {entry.name}: expected a number above 0, found {value}")
         if self.ratio >= 1:
             raise InputError(f"FrontEndOptions: ratio: expected a number below 1, found {self.ratio}")

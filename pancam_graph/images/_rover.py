@@ -95,29 +95,29 @@ def find_rover(
     for partner in partners:
         other = images[partner]
         if other is not None:
-            found |= _standing_still(PairGeometry(traverse, row, partner, options.mount_sigma_rad), image, other, options)
+            found |= _standing_still(
+                PairGeometry(traverse, row, partner, options.mount_sigma_rad), image, other, options
+            )
     return found
 
 
 def _standing_still(
     pair: PairGeometry, image_a: NDArray[Any], image_b: NDArray[Any], options: FrontEndOptions
 ) -> BoolArray:
-    decided, reach_px, map_px = _prediction(pair, image_a.shape, options)
+    decided, reach_px, map_u, map_v = _prediction(pair, image_a.shape, options)
     if not decided.any():
         return np.zeros(image_a.shape, dtype=bool)
     scale = min(1.0, _WORKING_PX / max(image_a.shape))
-    laid_over = cv2.remap(image_b.astype(np.float32), map_px, None, cv2.INTER_LINEAR, borderValue=0.0)
+    laid_over = cv2.remap(image_b.astype(np.float32), map_u, map_v, cv2.INTER_LINEAR)
     size = (round(scale * image_a.shape[1]), round(scale * image_a.shape[0]))
-    greys = [
-        cv2.resize(x.astype(np.float32), size, interpolation=cv2.INTER_AREA) for x in (image_a, laid_over)
-    ]
+    greys = [_resized(x.astype(np.float32), size) for x in (image_a, laid_over)]
     there = cv2.resize(decided.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
     # The pointing's error moves the rover as a whole: its shift is sought on small images, then refined.
-    small = tuple(max(1, n // _COARSER) for n in size)
-    coarse = [_Windows.of(cv2.resize(x, small, interpolation=cv2.INTER_AREA)) for x in greys]
+    small = (max(1, size[0] // _COARSER), max(1, size[1] // _COARSER))
+    coarse_a, coarse_b = (_Windows.of(_resized(x, small)) for x in greys)
     there_small = cv2.resize(there.astype(np.uint8), small, interpolation=cv2.INTER_NEAREST) > 0
     radius = int(np.ceil(reach_px * scale / _COARSER))
-    shift = _best_shift(*coarse, there_small, (0, 0), radius)
+    shift = _best_shift(coarse_a, coarse_b, there_small, (0, 0), radius)
     a, b = (_Windows.of(x) for x in greys)
     shift = _best_shift(a, b, there, (_COARSER * shift[0], _COARSER * shift[1]), _COARSER)
     alike = np.zeros(there.shape, dtype=bool)
@@ -131,22 +131,27 @@ def _standing_still(
 
 def _prediction(
     pair: PairGeometry, shape: tuple[int, ...], options: FrontEndOptions
-) -> tuple[BoolArray, float, NDArray[np.float32]]:
+) -> tuple[BoolArray, float, NDArray[np.float32], NDArray[np.float32]]:
     """Where standing still can be told, how far the pointing may err in pixels, and where b shows the deck.
 
-    The map (height, width, 2) has the pixel of b for each pixel of a.
+    The two maps (height, width) have the pixel of b for each pixel of a: u, v.
     """
     height, width = shape
     v, u = np.meshgrid(np.linspace(0, height - 1, _GRID), np.linspace(0, width - 1, _GRID), indexing="ij")
     uv_px = np.column_stack([u.ravel(), v.ravel()])
     rays = pair.camera_a.unproject(uv_px)
     fixed = replace(pair, rover_fixed=True)
-    b_T_a, d_b_T_a = fixed.b_T_a(fixed.no_correction), fixed.d_b_T_a(fixed.no_correction, np.diag(fixed.sigma))
+    b_T_a, d_b_T_a = (
+        fixed.b_T_a(fixed.no_correction),
+        fixed.d_b_T_a(fixed.no_correction, np.diag(fixed.sigma)),
+    )
     deck = rays.origin_m + _DECK_DISTANCE_M * rays.direction
     on_b, _ = fixed.transfer(deck, b_T_a)
     spread = _spread_px(fixed, deck, b_T_a, d_b_T_a)
     reach_px = options.search_sigmas * float(np.median(spread)) + 1.0
-    pixel_rad = float(np.median(_angle_rad(pair.camera_a.unproject(uv_px + [1.0, 0.0]).direction, rays.direction)))
+    pixel_rad = float(
+        np.median(_angle_rad(pair.camera_a.unproject(uv_px + np.array([1.0, 0.0])).direction, rays.direction))
+    )
 
     down = -pair.elevation_rad(uv_px)
     decided = rays.valid & (down > _LOWEST_HORIZON_RAD)
@@ -167,8 +172,8 @@ def _prediction(
         nodes = values.reshape(_GRID, _GRID).astype(np.float32)
         return np.asarray(cv2.remap(nodes, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
-    map_px = np.dstack([spread_out(on_b[:, 0]), spread_out(on_b[:, 1])])
-    return spread_out(decided.astype(float)) > 1 - 1e-3, reach_px, map_px
+    map_u, map_v = spread_out(on_b[:, 0]), spread_out(on_b[:, 1])
+    return spread_out(decided.astype(float)) > 1 - 1e-3, reach_px, map_u, map_v
 
 
 def _spread_px(pair: PairGeometry, points_m: FloatArray, b_T_a: Relative, d_b_T_a: _Moves) -> FloatArray:
@@ -188,6 +193,10 @@ def _spread_rad(points_m: FloatArray, from_b: FloatArray, d_b_T_a: _Moves) -> Fl
 def _angle_rad(a: FloatArray, b: FloatArray) -> FloatArray:
     cross, dot = np.linalg.norm(np.cross(a, b), axis=1), np.einsum("ni,ni->n", a, b)
     return np.asarray(np.arctan2(cross, dot))
+
+
+def _resized(grey: NDArray[Any], size: tuple[int, int]) -> NDArray[np.float32]:
+    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
 def _best_shift(
@@ -220,7 +229,7 @@ def _noise(grey: NDArray[np.float32]) -> float:
 def _tidied(region: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Without what chance may make, bridged where the rover is smooth, holes filled, and a little wider."""
     bridge = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_BRIDGED_PX, _BRIDGED_PX))
-    padded = cv2.copyMakeBorder(region, *[_BRIDGED_PX] * 4, cv2.BORDER_REPLICATE)
+    padded = np.pad(region, _BRIDGED_PX, mode="edge")
     closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, bridge)
     closed = np.ascontiguousarray(closed[_BRIDGED_PX:-_BRIDGED_PX, _BRIDGED_PX:-_BRIDGED_PX])
     count, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=4)

@@ -54,7 +54,7 @@ def find_sky(image: NDArray[Any], elevation_rad: FloatArray) -> BoolArray:
 
 
 def _seeds(grey: NDArray[np.float32], elevation_rad: FloatArray) -> tuple[BoolArray, float]:
-    """Pixels in blocks above the horizontal without structure, and the gradient there after the blur for edges."""
+    """Pixels of blocks above the horizontal without structure, and the gradient there, blurred for edges."""
     change = np.abs(np.diff(grey, axis=1, append=grey[:, -2:-1]))
     noise = np.maximum(_blocks(change).mean(axis=2) / 1.128, _HALF_STEP)
     du, dv = (_blocks(g) for g in _gradient(grey, _SEED_BLUR_PX))
@@ -67,7 +67,7 @@ def _seeds(grey: NDArray[np.float32], elevation_rad: FloatArray) -> tuple[BoolAr
     if not quiet.any():
         return np.zeros(grey.shape, dtype=bool), 0.0
     gradient = np.median(_blocks(np.hypot(*_gradient(grey, _EDGE_BLUR_PX))), axis=2)
-    level = float(np.quantile(gradient[quiet], 0.5))
+    level = float(np.median(gradient[quiet]))
     seeds = np.zeros(grey.shape, dtype=bool)
     whole = np.kron(quiet, np.ones((_BLOCK_PX, _BLOCK_PX), dtype=bool))[: grey.shape[0], : grey.shape[1]]
     seeds[: whole.shape[0], : whole.shape[1]] = whole

@@ -1,5 +1,6 @@
 """Readers and writers, one file format a module."""
 
+from pancam_graph.io.cache_folder import cache_folder as cache_folder
 from pancam_graph.io.cahvor import read_cahvor as read_cahvor
 from pancam_graph.io.camera_models import write_cameras as write_cameras
 from pancam_graph.io.colmap import write_colmap as write_colmap

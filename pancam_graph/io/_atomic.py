@@ -20,11 +20,12 @@ def whole_file(path: Path, content: bytes) -> None:
 
 
 @contextmanager
-def whole_folder(path: Path) -> Iterator[Path]:
+def whole_folder(path: Path, *, keep: str | None = None) -> Iterator[Path]:
     """A new folder beside `path` to write into, renamed to `path` when the block ends.
 
-    What was at `path` is moved aside just before and deleted just after. If the block raises, or the renaming
-    fails, the new folder is deleted and what was at `path` is there as before. Missing parents are made.
+    What was at `path` is moved aside just before and deleted just after, but for what it has by the name
+    `keep`, which moves into the new folder. If the block raises, or the renaming fails, the new folder is
+    deleted and what was at `path` is there as before. Missing parents are made.
     """
     path = path.resolve()  # through links: what they lead to is replaced, not the link
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -34,8 +35,12 @@ def whole_folder(path: Path) -> Iterator[Path]:
         yield partial
         if path.exists():
             path.rename(older)
+            if keep is not None and (older / keep).exists():
+                (older / keep).rename(partial / keep)
         partial.rename(path)
     except BaseException:  # an interrupt from the keyboard too
+        if keep is not None and older.exists() and (partial / keep).exists():
+            (partial / keep).rename(older / keep)
         if older.exists() and not path.exists():
             older.rename(path)
         shutil.rmtree(partial, ignore_errors=True)

@@ -241,6 +241,7 @@ class ImageEntry(Entry):
     frame: Label
     camera: Label
     file: Label | None = None
+    mask: Label | None = None
 
 
 class FreedomEntry(Entry):

@@ -13,6 +13,7 @@ from pancam_graph.io._brightness import brightness_of
 from pancam_graph.io._exported import require_export
 from pancam_graph.io._json import read_json, refused_by_schema
 from pancam_graph.io._schema import MOSAIC_FORMAT, SOLUTION_FORMAT, VERSION
+from pancam_graph.io.cache_folder import CACHE, is_cache
 from pancam_graph.io.exports import EXPORTS, Export, check_exports, fill_exports
 from pancam_graph.io.ply import points_ply
 from pancam_graph.io.residuals_csv import residuals_csv
@@ -35,8 +36,8 @@ MOSAIC_INDEX = "mosaics.json"
 def check_out(out: Path | str) -> None:
     """Make sure that results can go to `out`, without writing anything; for before a long solve.
 
-    Raises InputError unless `out` is new, an empty folder, or a folder with nothing but older results, and
-    its place can be written to.
+    Raises InputError unless `out` is new, an empty folder, or a folder with nothing but older results and
+    the cache of a run, interrupted or not, and its place can be written to.
     """
     out = Path(out)
     expected = f"{out}: expected a new folder or one of older results"
@@ -87,7 +88,7 @@ def save_solution(
     exports = check_exports(solution.traverse, exports)
     started = time.perf_counter()
     try:
-        with whole_folder(out) as folder, refused_by_schema(out):
+        with whole_folder(out, keep=CACHE) as folder, refused_by_schema(out):
             brightness = brightness_of(solution)
             (folder / "points.ply").write_bytes(points_ply(solution, brightness.grey))
             fill_exports(solution, exports, folder, brightness)
@@ -127,7 +128,7 @@ def _no_mosaics(folder: Path) -> list[str]:
 
 def _require_results(folder: Path, expected: str) -> None:
     """Raise InputError unless a folder is empty or holds nothing but results."""
-    found = sorted(p.name for p in folder.iterdir())
+    found = sorted(p.name for p in folder.iterdir() if p.name != CACHE or not is_cache(p))
     exports = [n for n in found if n in EXPORTS and (folder / n).is_dir()]
     strangers = [
         n for n in found if n not in exports and (n not in RESULT_FILES or not (folder / n).is_file())

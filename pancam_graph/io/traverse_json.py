@@ -20,7 +20,8 @@ from pancam_graph.io._schema import (
     TraverseFile,
     rig_entry,
 )
-from pancam_graph.io.image_files import read_eye_image
+from pancam_graph.io.image_files import read_eye_content
+from pancam_graph.io.mask_files import mask_file, read_mask
 from pancam_graph.io.observations import observations_npz, read_observations
 from pancam_graph.traverse import Frame, Image, Stop, Traverse
 
@@ -33,8 +34,9 @@ _OBSERVATIONS = "observations.npz"
 def read_traverse(folder: Path | str) -> Traverse:
     """Read a traverse folder: `traverse.json`, the observations and image files that it names.
 
-    Every image file is decoded once, to know that it is there, whole, and of its camera's size; nothing is
-    kept of it. `observations` is None where the file says null: they are then to be found in the images.
+    Every image file and mask is decoded once, to know that it is there, whole, of its camera's size and,
+    where labels tell, of the same rover; nothing is kept of it. `observations` is None where the file says
+    null: they are then to be found in the images.
 
     Raises InputError (ImageError for an image) with one sentence naming file, entry, what was expected and
     what was found.
@@ -56,6 +58,9 @@ def read_traverse(folder: Path | str) -> Traverse:
             raise InputError(
                 "observations: expected a file, or image files to find them in; found null and no image file"
             )
+        for row, image in enumerate(entries.images):
+            if image.mask is not None:
+                _inside(folder, image.mask, f"images[{row}].mask")
         source = None
         if entries.observations is not None:
             source = _inside(folder, entries.observations, "observations")
@@ -65,9 +70,7 @@ def read_traverse(folder: Path | str) -> Traverse:
             traverse = traverse.with_observations(observations)
         except InputError as error:
             raise InputError(f"{source}: {str(error).removeprefix('observations: ')}") from error
-    for row, file in enumerate(files):
-        if file is not None:
-            _require_image(file, traverse, row)
+    _require_images(files, traverse)
     return traverse
 
 
@@ -89,6 +92,9 @@ def write_traverse(traverse: Traverse, folder: Path | str, *, overwrite: bool = 
     with refused_by_schema(path):
         entries = traverse_entries(traverse)
     content = entries.model_dump(exclude={"sharing"})
+    for image in content["images"]:
+        if image["mask"] is None:
+            del image["mask"]
     if entries.sharing is not None:
         content["sharing"] = entries.sharing.model_dump(exclude_defaults=True)
     text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
@@ -153,7 +159,10 @@ def traverse_entries(traverse: Traverse) -> TraverseFile:
         rig=rig_entry(traverse.rig),
         stops=stops,
         frames=frames,
-        images=[ImageEntry(id=i.id, frame=i.frame, camera=i.camera, file=i.file) for i in traverse.images],
+        images=[
+            ImageEntry(id=i.id, frame=i.frame, camera=i.camera, file=i.file, mask=i.mask)
+            for i in traverse.images
+        ],
         observations=None if traverse.observations is None else _OBSERVATIONS,
         sharing=None if traverse.sharing is None else SharingEntry.of(traverse.sharing),
     )
@@ -175,23 +184,50 @@ def _inside(folder: Path, name: str, entry: str) -> Path:
     return folder / name
 
 
-def _require_image(file: Path, traverse: Traverse, row: int) -> None:
-    try:
-        read_eye_image(file, traverse.rig, int(traverse.image_eye[row]))
-    except ImageError as error:
-        entry = f"images[{row}] ({traverse.images[row].id})"
-        raise ImageError(f"{traverse.folder}/{_TRAVERSE_JSON}: {entry}: {error}") from error
+def _require_images(files: list[Path | None], traverse: Traverse) -> None:
+    """Raise ImageError for an image or a mask that cannot be used, InputError for images of two rovers."""
+    hosts: dict[str, Path] = {}
+    masks: set[tuple[Path, int, int]] = set()
+    for row, file in enumerate(files):
+        if file is None:
+            continue
+        eye = int(traverse.image_eye[row])
+        camera = traverse.rig.eyes[eye].camera
+        mask = mask_file(traverse, row)
+        try:
+            content = read_eye_content(file, traverse.rig, eye)
+            # One mask most often serves many images.
+            if mask is not None and (mask, camera.width_px, camera.height_px) not in masks:
+                read_mask(mask, camera.width_px, camera.height_px, file.name)
+                masks.add((mask, camera.width_px, camera.height_px))
+        except ImageError as error:
+            entry = f"images[{row}] ({traverse.images[row].id})"
+            raise ImageError(f"{traverse.folder}/{_TRAVERSE_JSON}: {entry}: {error}") from error
+        if content.host is not None:
+            hosts.setdefault(content.host, file)
+            first = next(iter(hosts))
+            if content.host != first:
+                raise InputError(
+                    f"{file}: INSTRUMENT_HOST_ID: expected {first} as in {hosts[first].name}, "
+                    f"found {content.host}: images of two rovers"
+                )
 
 
 def _copies(traverse: Traverse, folder: Path) -> list[tuple[Path, Path]]:
     if traverse.folder is None or traverse.folder.resolve() == folder.resolve():
         return []
-    files = [
-        (_inside(traverse.folder, i.file, f"images[{row}].file"), folder / i.file)
+    named = [
+        (f"images[{row}].{kind}", name)
         for row, i in enumerate(traverse.images)
-        if i.file is not None
+        for kind, name in (("file", i.file), ("mask", i.mask))
+        if name is not None
     ]
-    for source, _ in files:
+    files = {folder / name: _inside(traverse.folder, name, entry) for entry, name in named}
+    for row in range(len(traverse.images)):
+        mask = mask_file(traverse, row)  # it may be known by its name alone
+        if mask is not None:
+            files[folder / mask.relative_to(traverse.folder)] = mask
+    for source in files.values():
         if not source.is_file():
             raise ImageError(f"{source}: expected an image file to copy along, found none")
-    return files
+    return [(source, target) for target, source in files.items()]

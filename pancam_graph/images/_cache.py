@@ -1,0 +1,146 @@
+"""What the front end has found, kept in files and found again by all that it depends on."""
+
+import hashlib
+import json
+import logging
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from functools import cache
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import cv2
+import gtsam
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from pancam_graph.io._atomic import whole_file
+from pancam_graph.io.cache_folder import begin_cache
+
+__all__ = ["Cache", "digest"]
+
+_LOG = logging.getLogger(__name__)
+_SUFFIX = ".npz"
+_KEY = "key"
+
+Arrays = dict[str, NDArray[Any]]
+
+
+class Cache:
+    """Named arrays by kind and key. A key is a digest of everything that the arrays depend on.
+
+    So nothing here can be out of date: what depends on a changed image, rig, option, on another version of
+    the code, of OpenCV, NumPy or SciPy, or on another kind of processor is asked for by another key. Files
+    that cannot be read are logged and made anew.
+    """
+
+    def __init__(self, folder: Path | None) -> None:
+        """Keep files in `folder`, which is made with the first; None: keep nothing."""
+        self._folder = folder
+        self._used: set[Path] = set()
+        self._begun = False
+
+    def recall(self, kind: str, key: str, make: Callable[[], Mapping[str, NDArray[Any]]]) -> Arrays:
+        """The arrays that were kept, or those that `make` returns, which are kept from then on."""
+        if self._folder is None:
+            return dict(make())
+        path = self._folder / f"{kind}-{key[:40]}{_SUFFIX}"
+        self._used.add(path)
+        found = _read(path, key)
+        if found is None:
+            found = dict(make())
+            self._write(path, key, found)
+        return found
+
+    def forget_others(self) -> None:
+        """Delete files of ours that nobody asked for since this object was made."""
+        if self._folder is not None and self._folder.is_dir():
+            for path in self._folder.glob(f"*-*{_SUFFIX}"):
+                if path not in self._used:
+                    path.unlink(missing_ok=True)
+
+    def _write(self, path: Path, key: str, arrays: Arrays) -> None:
+        assert self._folder is not None  # the caller has looked
+        content = BytesIO()
+        np.savez(content, **{_KEY: np.array(key)}, **arrays)  # type: ignore[arg-type]  # names of ours, none of its options
+        try:
+            if not self._begun:
+                begin_cache(self._folder)
+                self._begun = True
+            whole_file(path, content.getvalue())
+        except OSError as error:  # a full disk must not end what would work without
+            _LOG.warning("%s: not kept: %s", path, error)
+
+
+def _read(path: Path, key: str) -> Arrays | None:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, NotImplementedError) as error:
+        _LOG.warning("%s: cannot be read and is made anew: %s", path, error)
+        return None
+    stored = arrays.pop(_KEY, None)
+    if stored is None or str(stored) != key:
+        _LOG.warning("%s: belongs to something else and is made anew", path)
+        return None
+    return arrays
+
+
+def digest(*parts: Any) -> str:
+    """A digest of values of any depth, and of the code: hexadecimal, 64 characters.
+
+    Takes arrays, numbers, text, None, poses, dataclasses, and lists and dictionaries of them; all bits count.
+    """
+    running = hashlib.sha256(_code().encode())
+    _feed(running, parts)
+    return running.hexdigest()
+
+
+def _feed(running: Any, value: Any) -> None:
+    def put(tag: str, content: bytes = b"") -> None:
+        running.update(f"{tag}:{len(content)}:".encode())
+        running.update(content)
+
+    if value is None or isinstance(value, bool | int | float | str | complex):
+        put(type(value).__name__, repr(value).encode())
+    elif isinstance(value, bytes):
+        put("bytes", value)
+    elif isinstance(value, np.ndarray | np.generic):
+        array = np.ascontiguousarray(value)
+        put(f"array {array.dtype.str} {array.shape}", array.tobytes())
+    elif isinstance(value, gtsam.Pose3):
+        put("pose", np.ascontiguousarray(value.matrix()).tobytes())
+    elif is_dataclass(value) and not isinstance(value, type):
+        put(type(value).__qualname__)
+        for field in fields(value):
+            put("field", field.name.encode())
+            _feed(running, getattr(value, field.name))
+    elif isinstance(value, Mapping):
+        put("mapping", str(len(value)).encode())
+        for name, entry in value.items():
+            _feed(running, name)
+            _feed(running, entry)
+    elif isinstance(value, Sequence):
+        put("sequence", str(len(value)).encode())
+        for entry in value:
+            _feed(running, entry)
+    else:
+        raise TypeError(f"no digest of {type(value).__name__}")
+
+
+@cache
+def _code() -> str:
+    """A digest of this package's modules, of the libraries' versions and of what the processor can do."""
+    running = hashlib.sha256()
+    root = Path(__file__).resolve().parents[1]
+    for path in sorted(root.rglob("*.py")):
+        running.update(f"{path.relative_to(root).as_posix()}\n".encode())
+        running.update(path.read_bytes())
+    versions = [cv2.__version__, np.__version__, scipy.__version__, cv2.getCPUFeaturesLine()]
+    running.update(json.dumps(versions).encode())
+    return running.hexdigest()

@@ -1,0 +1,85 @@
+"""The image files of a traverse with the user's masks, and what is odd about them."""
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pancam_graph.errors import InputError
+from pancam_graph.geometry import BoolArray
+from pancam_graph.io.image_files import GreyImage, read_eye_content
+from pancam_graph.io.mask_files import mask_file, read_mask
+from pancam_graph.traverse import Traverse
+
+__all__ = ["Pictures", "image_name", "listed", "read_pictures"]
+
+_NAMED = 3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pictures:
+    """Images as arrays, and the user's masks; by rows of the traverse."""
+
+    images: tuple[GreyImage | None, ...]
+    """None without a file, or where a file before it is the same picture."""
+    user_masks: tuple[BoolArray | None, ...]
+    """True where white; None: there is none."""
+    warnings: tuple[str, ...]
+    """Of colour, and of pictures that are there twice."""
+
+
+def read_pictures(traverse: Traverse, progress: Callable[[int, int], None] | None = None) -> Pictures:
+    """Read all image files of a traverse and the masks that belong to them.
+
+    Raises InputError if no image has a file, ImageError naming the file for one that cannot be read or has
+    another size than its camera, and for such a mask.
+    """
+    if all(image.file is None for image in traverse.images):
+        raise InputError(f"traverse {traverse.name}: expected observations or image files, found neither")
+    folder = traverse.folder or Path()
+    images: list[GreyImage | None] = []
+    masks: list[BoolArray | None] = []
+    coloured: list[str] = []
+    warnings: list[str] = []
+    first_of: dict[bytes, int] = {}
+    mask_of: dict[tuple[Path, tuple[int, ...]], BoolArray] = {}
+    for row, (entry, eye) in enumerate(zip(traverse.images, traverse.image_eye, strict=True)):
+        image, mask = None, None
+        if entry.file is not None:
+            content = read_eye_content(folder / entry.file, traverse.rig, int(eye))
+            image = content.samples
+            if content.colour:
+                coloured.append(entry.file)
+            # Two pictures of one scene differ by their noise; two that are alike to the bit are one.
+            first = first_of.setdefault(hashlib.sha256(image.tobytes()).digest(), row)
+            if first != row and image.min() < image.max():
+                warnings.append(
+                    f"image {image_name(traverse, row)}: the same picture as image "
+                    f"{image_name(traverse, first)}; left out"
+                )
+                image = None
+            path = mask_file(traverse, row)
+            if image is not None and path is not None:
+                if (path, image.shape) not in mask_of:
+                    height, width = image.shape
+                    mask_of[path, image.shape] = read_mask(path, width, height, Path(entry.file).name)
+                mask = mask_of[path, image.shape]
+        images.append(image)
+        masks.append(mask)
+        if progress is not None:
+            progress(row + 1, len(traverse.images))
+    if coloured:
+        warnings.insert(0, f"images in colour, of which the luma is used: {listed(coloured)}")
+    return Pictures(images=tuple(images), user_masks=tuple(masks), warnings=tuple(warnings))
+
+
+def image_name(traverse: Traverse, row: int) -> str:
+    """An image as warnings name it: its id, and its file where the id does not say it."""
+    image = traverse.images[row]
+    return image.id if image.file is None else f"{image.id} ({image.file})"
+
+
+def listed(names: Sequence[str]) -> str:
+    """A few names, and how many more there are."""
+    more = len(names) - _NAMED
+    return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")
