@@ -31,6 +31,8 @@ def find_sky(image: NDArray[Any], elevation_rad: FloatArray) -> BoolArray:
     edge: hills beyond the skyline stay, however smooth. Specks (hot pixels, cosmic rays) belong to the sky
     around them; clouds with structure count as terrain.
     """
+    if not (elevation_rad > _SEED_RAD).any():
+        return np.zeros(image.shape, dtype=bool)
     grey = image.astype(np.float32)
     seeds, level = _seeds(grey, elevation_rad)
     if not seeds.any():
