@@ -18,7 +18,7 @@ from pancam_graph.images import FrontEndOptions, find_observations
 from pancam_graph.images._features import find_features
 from pancam_graph.images._normalise import usable_mask
 from pancam_graph.images._pairs import PairGeometry
-from pancam_graph.images._tracks import Links, join_tracks
+from pancam_graph.images._tracks import Links, join_tracks, spread_tracks
 from pancam_graph.images._verify import epipolar_px
 from pancam_graph.io import read_pds
 from pancam_graph.rigs import Eye, Rig
@@ -437,3 +437,21 @@ def test_opportunity(opportunity_folder: Path) -> None:
     assert np.mean(obs.sigma_px == FrontEndOptions().refined_sigma_px) > 0.85
     again = found_in(find_observations(disturbed(traverse, 0.5, seed=0)))
     assert len(again) == pytest.approx(len(obs), rel=0.02)
+
+
+def test_tracks_are_thinned_evenly_and_stay_whole() -> None:
+    """A thousand points in one corner and fifty elsewhere, seen by two images, some of them by a third."""
+    rng = np.random.default_rng(2)
+    uv = np.concatenate([rng.uniform(0, 60, (1000, 2)), rng.uniform(0, 1000, (50, 2))])
+    views = np.where(np.arange(len(uv)) % 5 == 0, 3, 2)
+    track = np.repeat(np.arange(len(uv)), views)
+    image = np.arange(len(track)) - np.searchsorted(track, track)
+    size = np.full((3, 2), 1000.0)
+    kept = spread_tracks(image, track, uv[track], size, 100)
+    chosen = np.unique(track[kept])
+    assert (np.bincount(track[kept], minlength=len(uv))[chosen] == views[chosen]).all()
+    assert set(range(1000, 1050)) <= set(chosen.tolist())
+    crowd = chosen[chosen < 1000]
+    assert 40 < len(crowd) < 200
+    assert np.mean(views[crowd] == 3) == pytest.approx(1)
+    assert spread_tracks(image, track, uv[track], size, 2000).all()

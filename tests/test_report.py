@@ -25,6 +25,7 @@ from pancam_graph.report._map import ellipse_outlines, make_map, place_labels, t
 from pancam_graph.report._numbers import round_factor, rounded, short, thinned
 from pancam_graph.report._page import headline, lead, make_page
 from pancam_graph.report._scene import eye_circles, label_stops, make_masts, make_scene
+from pancam_graph.report._tables import observation_table
 from pancam_graph.report._terrain import landmark_residuals, make_terrain
 from pancam_graph.rigs import Rig, mer_navcam
 from pancam_graph.solution import Refined, Seconds, Solution, State
@@ -414,7 +415,24 @@ def test_image_table_counts_what_the_solution_says(solution: Solution, page: str
     assert all(np.all(observations.image[r] == i) for i, r in enumerate(rows))
     total = sum(e.used * e.after_px**2 for e in table) / solution.used.sum()
     assert np.sqrt(total) == pytest.approx(solution.rms_final_px)
-    assert page.count("<tr><td") == len(solution.traverse.images) + len(solution.traverse.stops)
+    assert page.count("<tr><td") == len(solution.traverse.images) + len(solution.traverse.stops) + 3
+
+
+def test_observation_table_counts_by_reason(solution: Solution) -> None:
+    observations = solution.traverse.observations
+    assert observations is not None
+    cells = [
+        re.findall(r"<td[^>]*>([^<]*)</td>", row) for row in observation_table(solution).split("<tr>")[2:]
+    ]
+    assert [row[0] for row in cells] == ["one stop", "several stops", "all"]
+    numbers = np.array([[int(c) for c in (*row[1:4], *row[5:])] for row in cells])
+    assert (numbers[0] + numbers[1] == numbers[2]).all()
+    assert (numbers[:2] > 0).all(axis=0)[:3].all()
+    kinds = ("outlier", "single", "behind", "outside")
+    expected = [len(observations), solution.used.sum(), *(solution.reason.count(kind) for kind in kinds)]
+    assert numbers[2, 1:].tolist() == expected
+    assert (numbers[:, 1] == numbers[:, 2:].sum(axis=1)).all()
+    assert [float(row[4]) for row in cells] == pytest.approx(100 * numbers[:, 2] / numbers[:, 1], abs=0.06)
 
 
 def test_rig_table_says_what_was_free(solution: Solution, page: str) -> None:

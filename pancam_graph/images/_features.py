@@ -19,6 +19,8 @@ DESCRIPTOR_NORM = 255.0
 """Length of a stored descriptor."""
 
 _CELLS = 16
+_LEAST_SHARE = 0.1
+_MOST_FEATURES = 20_000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -75,7 +77,11 @@ def find_features(
     usable = (usable_mask(image) if usable is None else usable) & (wanted_mask > 0)
     found = sift.detect(grey, None)
     table = np.array([(k.pt[1], k.pt[0], k.size, k.response) for k in found]).reshape(-1, 4)
-    rows = _choose(table, usable, options.max_features)
+    # A narrow overlap carries alone what else the whole image carries, and what telemetry leaves open makes
+    # it look wider than it is: hence the square.
+    share = max(float(np.mean(wanted)), _LEAST_SHARE)
+    limit = min(options.max_features / share**2, max(_MOST_FEATURES, options.max_features))
+    rows = _choose(table, usable, round(limit))
     chosen = [found[i] for i in rows]
     angles = _vertical_angle_deg(camera, camera_up, table[rows][:, [1, 0]])
     for keypoint, angle in zip(chosen, angles, strict=True):

@@ -14,7 +14,7 @@ from pancam_graph.images._options import FrontEndOptions
 from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._read import image_name, listed
 from pancam_graph.images._steps import Progress, Steps
-from pancam_graph.images._tracks import Links, join_tracks
+from pancam_graph.images._tracks import Links, join_tracks, spread_tracks
 from pancam_graph.traverse import Observations, Traverse
 
 __all__ = ["find_masks", "find_observations"]
@@ -88,6 +88,11 @@ def find_observations(
         rows = image == i
         uv_px[rows] = work.features[i].uv_px[feature[rows]]
         size_px[rows] = work.features[i].size_px[feature[rows]]
+    cameras = [traverse.rig.eyes[eye].camera for eye in traverse.image_eye]
+    extent_px = np.array([[c.width_px, c.height_px] for c in cameras])
+    spread = spread_tracks(image, track, uv_px, extent_px, options.max_ties)
+    image, feature, uv_px, size_px = image[spread], feature[spread], uv_px[spread], size_px[spread]
+    track = np.unique(track[spread], return_inverse=True)[1]
     uv_px, refined = work.refined(image, track, uv_px)
     as_found = np.hypot(options.sigma_px, options.sigma_per_size * size_px)
     observations = Observations(
@@ -97,6 +102,9 @@ def find_observations(
         sigma_px=np.where(refined, options.refined_sigma_px, as_found),
         origin="images",
     )
+    if work.stop_pairs:
+        observations, lonely = work.tied(observations, feature)
+        warnings += lonely
     work.cache.forget_others()
     return traverse.with_observations(observations, warnings)
 

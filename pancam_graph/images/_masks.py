@@ -13,7 +13,7 @@ from pancam_graph.images._normalise import usable_mask
 from pancam_graph.images._sky import find_sky
 from pancam_graph.traverse import Traverse
 
-__all__ = ["ImageMask", "Reason", "elevation_rad", "mask_image", "saturated"]
+__all__ = ["ImageMask", "Reason", "at_pixels", "elevation_rad", "mask_image", "saturated"]
 
 _FULL_SCALES = (255, 1023, 4095, 16383, 65535)
 _NEAR_FULL = 0.98
@@ -116,3 +116,10 @@ def elevation_rad(traverse: Traverse, row: int) -> FloatArray:
     grid_v, grid_u = np.mgrid[:height, :width].astype(np.float32)
     at = grid_u * ((_NODES - 1) / max(width - 1, 1)), grid_v * ((_NODES - 1) / max(height - 1, 1))
     return np.asarray(cv2.remap(nodes, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+
+
+def at_pixels(usable: BoolArray, uv_px: FloatArray) -> BoolArray:
+    """Whether the pixels (n, 2) are usable; those outside the image are as the nearest inside."""
+    height, width = usable.shape
+    u, v = np.rint(uv_px).astype(np.int64).T
+    return np.asarray(usable[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)])

@@ -21,8 +21,13 @@ class FrontEndOptions:
     """How much contrast is raised at most; more finds more features in haze, and more noise."""
     contrast_threshold: float = 0.01
     """SIFT's; lower finds fainter features."""
-    max_features: int = 20_000
-    """The strongest features kept per image, evenly over a grid of cells."""
+    max_features: int = 6_000
+    """The strongest features kept per image, evenly over a grid of cells, where all of it overlaps others.
+
+    Where half of it does, four times as many, up to 20 000: a narrow overlap has to carry more."""
+    max_ties: int = 2_500
+    """Where an image shares more points than these with others, those that most images see are kept, evenly
+    over a grid of cells; a point that any of its images keeps counts in all."""
     min_depth_m: float = 0.5
     """Nothing nearer than this is matched."""
     min_overlap: float = 0.05

@@ -18,10 +18,18 @@ _CELLS = 32
 
 
 def overlapping_pairs(
-    traverse: Traverse, options: FrontEndOptions, progress: Callable[[int, int], None] | None = None
+    traverse: Traverse,
+    options: FrontEndOptions,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    stops: BoolArray,
 ) -> list[PairGeometry]:
-    """Pairs of images (a before b) that can see the same terrain by all that telemetry knows."""
-    candidates = np.argwhere(np.triu(_cones_meet(traverse, options), 1))
+    """Pairs of images (a before b) that can see the same terrain by all that telemetry knows.
+
+    Only of those pairs of stops (stops, stops) that are asked for; symmetric.
+    """
+    wanted = stops[np.ix_(traverse.image_stop, traverse.image_stop)]
+    candidates = np.argwhere(np.triu(_cones_meet(traverse, options) & wanted, 1))
     pairs = []
     for k, (a, b) in enumerate(candidates.tolist()):
         pair = PairGeometry(traverse, a, b, options.mount_sigma_rad)

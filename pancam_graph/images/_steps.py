@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.images._between import near_stops, stereo_stops, tie_stops
 from pancam_graph.images._cache import Arrays, Cache, digest
 from pancam_graph.images._features import Features, find_features
-from pancam_graph.images._masks import ImageMask, Reason, elevation_rad, mask_image
+from pancam_graph.images._masks import ImageMask, Reason, at_pixels, elevation_rad, mask_image
 from pancam_graph.images._match import Matches
 from pancam_graph.images._match_pair import match_pair
 from pancam_graph.images._options import FrontEndOptions
@@ -21,13 +22,14 @@ from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._read import Pictures, image_name, read_pictures
 from pancam_graph.images._refine import refine_tracks
 from pancam_graph.images._rover import find_rover, rover_partners
-from pancam_graph.traverse import Traverse
+from pancam_graph.traverse import Observations, Traverse
 
 __all__ = ["Progress", "Steps"]
 
 _LOG = logging.getLogger(__name__)
 _WORLD_UP = np.array([0.0, 0.0, 1.0])
 _PATCH_PX = 8  # how far from its pixel a refined observation looks at the image
+_COLUMNS = ("image", "track", "uv_px", "sigma_px")
 _OVER_EXPOSED = 0.3
 _MOST = 0.5
 _WHY = {
@@ -75,10 +77,32 @@ class Steps:
         ]
 
     @cached_property
-    def pairs(self) -> list[PairGeometry]:
+    def _near(self) -> tuple[list[PairGeometry], list[tuple[int, int]]]:
+        """Pairs of images whose features are to be compared, and pairs of stops that their terrain ties."""
+
+        def overlapping(stops: BoolArray) -> list[PairGeometry]:
+            found = overlapping_pairs(traverse, options, partial(self.tell, "overlaps"), stops=stops)
+            return [pair for pair in found if there[pair.a] and there[pair.b]]
+
+        traverse, options = self.traverse, self.options
         there = [image is not None for image in self.pictures.images]
-        found = overlapping_pairs(self.traverse, self.options, partial(self.tell, "overlaps"))
-        return [pair for pair in found if there[pair.a] and there[pair.b]]
+        pairs = overlapping(np.eye(len(traverse.stops), dtype=bool))
+        stereo = stereo_stops(traverse, [(pair.a, pair.b) for pair in pairs])
+        near = near_stops(traverse, options)
+        placed = near & stereo[:, None] & stereo
+        if (near & ~placed).any():
+            pairs += overlapping(near & ~placed)
+        return pairs, [(a, b) for a, b in np.argwhere(np.triu(placed, 1)).tolist()]
+
+    @property
+    def pairs(self) -> list[PairGeometry]:
+        """Pairs of images whose features are to be compared."""
+        return self._near[0]
+
+    @property
+    def stop_pairs(self) -> list[tuple[int, int]]:
+        """Pairs of stops that their terrain ties."""
+        return self._near[1]
 
     @cached_property
     def masks(self) -> list[ImageMask | None]:
@@ -153,7 +177,7 @@ class Steps:
         for found, mask in zip(self.features, self.masks, strict=True):
             keep = np.zeros(len(found), dtype=bool)
             if mask is not None:
-                keep = _at(mask.usable(between_stops=True), found.uv_px)
+                keep = at_pixels(mask.usable(between_stops=True), found.uv_px)
             rows.append(np.flatnonzero(keep))
         return rows
 
@@ -199,6 +223,34 @@ class Steps:
         good[first[moved]] = True  # it stays where it was found: the others fit to it
         return np.where(moved[:, None], found, uv_px), good
 
+    def tied(self, observations: Observations, feature: IntArray) -> tuple[Observations, list[str]]:
+        """Observations with those that tie stops added, off the rover; warnings. See `tie_stops`."""
+        usable = [
+            None if mask is None else mask.usable(between_stops=True, margin_px=_PATCH_PX)
+            for mask in self.masks
+        ]
+
+        def make() -> Arrays:
+            found, warnings = tie_stops(
+                self.traverse.with_observations(observations),
+                self.pictures.images,
+                usable,
+                self.features,
+                feature,
+                self.stop_pairs,
+                self.options,
+                partial(self.tell, "ties between stops"),
+            )
+            return {name: getattr(found, name) for name in _COLUMNS} | {
+                "warnings": np.array(warnings, dtype=str)
+            }
+
+        columns = [getattr(observations, name) for name in _COLUMNS]
+        key = digest("ties", self.picture_keys, self.feature_keys, usable, columns, feature, self.stop_pairs)
+        kept = self.cache.recall("ties", key, make)
+        warnings = [str(text) for text in kept.pop("warnings")]
+        return Observations(**kept, origin=observations.origin), warnings
+
     def _clear(self, image: IntArray, track: IntArray, uv_px: FloatArray) -> BoolArray:
         """Whether no pixel is left out within a patch around each observation."""
         stop = self.traverse.image_stop[image]
@@ -214,7 +266,7 @@ class Steps:
                 rows = np.flatnonzero((image == i) & (linking == between))
                 if len(rows):
                     usable = mask.usable(between_stops=between, margin_px=_PATCH_PX)
-                    clear[rows] = _at(usable, uv_px[rows])
+                    clear[rows] = at_pixels(usable, uv_px[rows])
         return clear
 
     def over_exposed(self) -> list[str]:
@@ -242,10 +294,3 @@ class Steps:
 
 def _as_arrays(function: Callable[..., Features | Matches], *arguments: Any, **more: Any) -> Arrays:
     return dict(vars(function(*arguments, **more)))
-
-
-def _at(usable: BoolArray, uv_px: FloatArray) -> BoolArray:
-    """Whether the pixels (n, 2) are usable; those outside the image are as the nearest inside."""
-    height, width = usable.shape
-    u, v = np.rint(uv_px).astype(np.int64).T
-    return np.asarray(usable[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)])

@@ -4,9 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pancam_graph.geometry import FloatArray, IntArray
+from pancam_graph.geometry import BoolArray, FloatArray, IntArray
 
-__all__ = ["Links", "join_tracks"]
+__all__ = ["Links", "join_tracks", "spread_tracks"]
+
+_CELLS = 16
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -71,3 +73,24 @@ def join_tracks(links: Links) -> tuple[IntArray, IntArray, IntArray]:
     rows = np.array([i for m in tracks for i in m], dtype=np.int64)
     number = np.repeat(np.arange(len(tracks), dtype=np.int64), [len(m) for m in tracks])
     return nodes[rows, 0], nodes[rows, 1], number
+
+
+def spread_tracks(
+    image: IntArray, track: IntArray, uv_px: FloatArray, size_px: FloatArray, most: int
+) -> BoolArray:
+    """Which observations (n,) to keep, so that no image has many more than `most`, evenly over its cells.
+
+    Columns as `join_tracks` returns them, with pixels (n, 2) and the images' widths and heights (images, 2).
+    Each image takes the longest track of each of its cells before the second longest of any; a track stays
+    whole where any of its images takes it.
+    """
+    length = np.bincount(track)
+    taken = np.zeros(len(length), dtype=bool)
+    for i in np.unique(image).tolist():
+        rows = np.flatnonzero(image == i)
+        column, row = np.clip(uv_px[rows] / size_px[i] * _CELLS, 0, _CELLS - 1).astype(np.int64).T
+        cell = row * _CELLS + column
+        order = np.lexsort((track[rows], -length[track[rows]], cell))
+        rank = np.arange(len(rows)) - np.searchsorted(cell[order], cell[order])
+        taken[track[rows[order[np.argsort(rank, kind="stable")[:most]]]]] = True
+    return np.asarray(taken[track])

@@ -15,7 +15,7 @@ from pancam_graph.report._packed import packed, packed_plotly
 from pancam_graph.report._scene import make_masts, make_scene
 from pancam_graph.report._script import SCRIPT
 from pancam_graph.report._style import STYLE
-from pancam_graph.report._tables import image_table, rig_table, stop_table
+from pancam_graph.report._tables import image_table, observation_table, rig_table, stop_table
 from pancam_graph.report._template import NO_VECTORS, PAGE, RIG, SCENE_CONTROLS, VECTOR_CONTROLS
 from pancam_graph.report._terrain import make_terrain
 from pancam_graph.solution import Solution
@@ -32,6 +32,7 @@ _REASONS = {
     "outlier": "as outliers",
     "single": "of points seen only once",
     "behind": "of points behind a camera",
+    "outside": "outside the domain of a camera model",
 }
 
 
@@ -65,6 +66,7 @@ def make_page(solution: Solution, mosaics: WrittenMosaics | None = None) -> str:
         mosaics=mosaic_section(mosaics),
         corrections=_section("Corrections of pan and tilt", corrections),
         cross_validation=cross_validation_section(solution.cross_validation, solution.traverse),
+        observations=observation_table(solution),
         images=image_table(solution, table),
         stops=stop_table(solution),
         rig=RIG.format(table=rig_table(solution)) if solution.refined else "",

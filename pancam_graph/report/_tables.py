@@ -12,7 +12,7 @@ from pancam_graph.report._map import translation_covariance_in_world
 from pancam_graph.report._numbers import fixed
 from pancam_graph.solution import Solution
 
-__all__ = ["image_table", "rig_table", "stop_table", "table"]
+__all__ = ["image_table", "observation_table", "rig_table", "stop_table", "table"]
 
 _SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 
@@ -69,6 +69,43 @@ def image_table(solution: Solution, residuals: Sequence[ImageResiduals]) -> str:
         for image, stop, entry in zip(traverse.images, traverse.image_stop, residuals, strict=True)
     ]
     return table("Images", columns, rows, texts=3)
+
+
+def observation_table(solution: Solution) -> str:
+    """Observations of points that one stop sees and that several see: how many were used, and why not."""
+    columns = (
+        ("points seen by", "whether a point was matched in images of one stop only, or of several"),
+        ("points", "terrain points"),
+        ("observations", "found in the images, or given"),
+        ("used", "observations that took part"),
+        ("inliers (%)", "share of the observations that took part"),
+        ("outliers", "contradict the other observations of their point by more than noise explains"),
+        ("single", "of points that no other image sees"),
+        ("behind", "of points that came to lie behind the camera"),
+        ("outside", "beyond what the camera's model describes"),
+    )
+    traverse, observations = solution.traverse, solution.traverse.observations
+    if observations is None or not len(observations):
+        return table("Observations", columns, [], texts=1)
+    _, track = np.unique(observations.track, return_inverse=True)
+    stop = traverse.image_stop[observations.image]
+    lowest, highest = np.full(track.max() + 1, len(traverse.stops)), np.full(track.max() + 1, -1)
+    np.minimum.at(lowest, track, stop)
+    np.maximum.at(highest, track, stop)
+    several, reason = lowest != highest, np.array(solution.reason)
+    rows = []
+    for name, which in (
+        ("one stop", ~several),
+        ("several stops", several),
+        ("all", np.full_like(several, True)),
+    ):
+        own = which[track]
+        used, found = int(np.sum(solution.used & own)), int(own.sum())
+        counts = [int(np.sum(own & (reason == why))) for why in ("outlier", "single", "behind", "outside")]
+        share = fixed(100 * used / found, 1) if found else ""
+        numbers = [str(int(which.sum())), str(found), str(used), share, *(str(c) for c in counts)]
+        rows.append((name, *numbers))
+    return table("Observations", columns, rows, texts=1)
 
 
 def stop_table(solution: Solution) -> str:

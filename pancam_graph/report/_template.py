@@ -51,6 +51,12 @@ script-src 'unsafe-inline' 'unsafe-eval'; img-src data: blob:; connect-src data:
 {corrections}
 {cross_validation}
 <section>
+<h2>Observations</h2>
+{observations}
+<p class="caption">What was left out, and why; each observation's reason is in <code>residuals.csv</code>.
+Whatever contradicted the geometry of its pair of images was never an observation.</p>
+</section>
+<section>
 <h2>Images</h2>
 {images}
 <p class="caption">Press a head to sort.</p>

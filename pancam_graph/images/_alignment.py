@@ -1,0 +1,240 @@
+"""Where a stop stands relative to another, from terrain points of the one and pixels of the other."""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from pancam_graph.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.images._features import Features
+from pancam_graph.images._match import match_in_windows
+from pancam_graph.images._options import FrontEndOptions
+from pancam_graph.images._pairs import Segments
+from pancam_graph.images._terrain import Sighting, Terrain
+
+__all__ = ["Alignment", "Ties", "align_stops", "fit_pose", "telemetry_alignment", "whitened_distance"]
+
+_MAX_TURN_COSINE = float(np.cos(np.deg2rad(40.0)))
+_MAX_ZOOM = 2.5
+_LEAST_SEEN = 20
+_STEPS_PER_OCTAVE = 2
+_FINAL_STEPS = 6
+_AGREE_SIGMAS = 3.0
+_CHANCE_SIGMAS = 4.0
+_ROUNDS = 2
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Alignment:
+    """Pose of a stop's mast in a world where another stop stands at its own."""
+
+    world_T_mast: gtsam.Pose3
+    root: FloatArray
+    """(6, k) square root of its covariance in the tangent."""
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Of the pose, (6, 6)."""
+        return np.asarray(self.root @ self.root.T)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Ties:
+    """Points of a terrain, and where images of another stop saw the same."""
+
+    row: IntArray
+    """(n,) of the terrain."""
+    image: IntArray
+    """(n,)"""
+    uv_px: FloatArray
+    """(n, 2)"""
+
+    @staticmethod
+    def concatenate(parts: "list[Ties]") -> "Ties":
+        """All ties in one."""
+        empty = np.empty(0, dtype=np.int64)
+        return Ties(
+            row=np.concatenate([empty, *(p.row for p in parts)]),
+            image=np.concatenate([empty, *(p.image for p in parts)]),
+            uv_px=np.concatenate([np.empty((0, 2)), *(p.uv_px for p in parts)]),
+        )
+
+    def select(self, rows: BoolArray | IntArray) -> "Ties":
+        """Some of the ties."""
+        return Ties(row=self.row[rows], image=self.image[rows], uv_px=self.uv_px[rows])
+
+    def __len__(self) -> int:
+        """Number of ties."""
+        return len(self.row)
+
+
+def telemetry_alignment(terrain: Terrain, a: int, b: int) -> Alignment:
+    """Stop b relative to stop a, as telemetry has it; what the images of each say of its pointing counts."""
+    first, second = terrain.traverse.stops[a], terrain.traverse.stops[b]
+    apart_m = float(np.linalg.norm(first.world_T_mast.translation() - second.world_T_mast.translation()))
+    rotation = np.hypot(first.sigma_rotation_rad, second.sigma_rotation_rad)
+    # A common error of a stop's pan cannot be told from its heading.
+    pointing = max((max(f.sigma_pan_rad, f.sigma_tilt_rad) for f in terrain.traverse.frames), default=0.0)
+    lever = apart_m * np.hypot(first.sigma_rotation_rad, pointing)
+    translation = np.hypot(np.hypot(first.sigma_translation_m, second.sigma_translation_m), lever)
+    sigma = np.repeat([np.hypot(rotation, np.sqrt(2) * pointing), translation], 3)
+    return Alignment(world_T_mast=second.world_T_mast, root=np.diag(sigma)[:, sigma > 0])
+
+
+def align_stops(
+    terrain: Terrain,
+    features: list[Features],
+    feature_of: IntArray,
+    a: int,
+    b: int,
+    options: FrontEndOptions,
+) -> Alignment | None:
+    """Stop b relative to stop a, from features whose descriptors agree; None where that could be chance.
+
+    Each point of a's terrain is looked for among the first sightings of b's, around where telemetry has it;
+    what most of these matches say corrects the pose, and the search is repeated in the smaller windows.
+    `feature_of` is the feature of each of the terrain's observations.
+    """
+    prior = telemetry_alignment(terrain, a, b)
+    found = prior
+    for _ in range(_ROUNDS):
+        ties, half_width = _matched(terrain, features, feature_of, (a, b), found, options)
+        if len(ties) < options.min_pair_matches:
+            return None
+        start_px = float(np.median(half_width))
+        found = fit_pose(terrain, ties, prior, found, start_px)
+        distance = whitened_distance(terrain, ties, found.world_T_mast)
+        # Wrong matches lie anywhere in their windows: so many would agree by chance.
+        chance = np.minimum(1.0, (_AGREE_SIGMAS / half_width) ** 2)
+        expected, spread = float(chance.sum()), float(np.sqrt(np.sum(chance * (1 - chance))))
+        agreeing = np.count_nonzero(distance < _AGREE_SIGMAS)
+        if agreeing < max(options.min_pair_matches, expected + _CHANCE_SIGMAS * spread):
+            return None
+    return found
+
+
+def _matched(
+    terrain: Terrain,
+    features: list[Features],
+    feature_of: IntArray,
+    stops: tuple[int, int],
+    at: Alignment,
+    options: FrontEndOptions,
+) -> tuple[Ties, FloatArray]:
+    """Points of the first stop matched with first sightings of the second's; their windows' half widths."""
+    rows_of = {i: np.flatnonzero(terrain.image == i) for i in np.unique(terrain.image).tolist()}
+    ours, theirs = ([i for i in rows_of if terrain.traverse.image_stop[i] == s] for s in stops)
+    parts, widths = [], []
+    for i in ours:
+        rows = rows_of[i]
+        own = _chosen(features[i], feature_of[terrain.row[rows]])
+        for j in theirs:
+            seen = terrain.sighting(rows, j, at.world_T_mast)
+            radius = _radius_px(terrain, rows, seen, at, options)
+            usable = _comparable(terrain, j, seen, radius)
+            if np.count_nonzero(usable) < _LEAST_SEEN:
+                continue
+            segments = Segments(
+                far_px=seen.uv_px,
+                near_px=seen.uv_px,
+                far_radius_px=radius,
+                near_radius_px=radius,
+                magnification=seen.zoom,
+                valid=usable,
+            )
+            other = _chosen(features[j], feature_of[terrain.row[rows_of[j]]])
+            matches = match_in_windows(own, other, segments, options)
+            parts.append(
+                Ties(
+                    row=rows[matches.a],
+                    image=np.full(len(matches), j, dtype=np.int64),
+                    uv_px=other.uv_px[matches.b],
+                )
+            )
+            widths.append(radius[matches.a])
+    return Ties.concatenate(parts), np.concatenate([np.empty(0), *widths])
+
+
+def _chosen(features: Features, rows: IntArray) -> Features:
+    return Features(
+        uv_px=features.uv_px[rows], size_px=features.size_px[rows], descriptor=features.descriptor[rows]
+    )
+
+
+def _radius_px(
+    terrain: Terrain, rows: IntArray, seen: Sighting, at: Alignment, options: FrontEndOptions
+) -> FloatArray:
+    spread = seen.covariance_px2(at.covariance, terrain.sigma_inverse_m[rows])
+    largest = np.linalg.eigvalsh(spread)[:, 1]
+    return np.asarray(options.search_sigmas * np.sqrt(largest) + options.search_slack_px)
+
+
+def _comparable(terrain: Terrain, image: int, seen: Sighting, margin_px: FloatArray) -> BoolArray:
+    """Which points the image can show, and from a similar side and distance."""
+    camera = terrain.camera(image)
+    size = np.array([camera.width_px, camera.height_px])
+    on = np.all((seen.uv_px > -margin_px[:, None]) & (seen.uv_px < size + margin_px[:, None]), axis=1)
+    alike = (seen.cosine > _MAX_TURN_COSINE) & (np.abs(np.log(seen.zoom)) < np.log(_MAX_ZOOM))
+    return np.asarray(seen.valid & on & alike & (margin_px < size.max() / 4))
+
+
+def sightings(terrain: Terrain, ties: Ties, world_T_mast: gtsam.Pose3) -> Sighting:
+    """How the images of the ties should see their points, in the ties' order."""
+    order = np.lexsort((ties.image, terrain.image[ties.row]))
+    first, second = terrain.image[ties.row[order]], ties.image[order]
+    changes = np.flatnonzero((np.diff(first) != 0) | (np.diff(second) != 0)) + 1
+    parts = [
+        terrain.sighting(ties.row[k], int(ties.image[k[0]]), world_T_mast) for k in np.split(order, changes)
+    ]
+    back = np.argsort(order)
+    names = vars(parts[0])
+    return Sighting(**{name: np.concatenate([getattr(p, name) for p in parts])[back] for name in names})
+
+
+def whitened_distance(
+    terrain: Terrain, ties: Ties, world_T_mast: gtsam.Pose3, noise_px: float = 1.0
+) -> FloatArray:
+    """How far ties (n,) are from where they should be, in units of what noise and depths leave open."""
+    residual, root, _ = _whitened(terrain, ties, world_T_mast, noise_px)
+    return np.asarray(np.linalg.norm(np.einsum("nij,nj->ni", root, residual), axis=1))
+
+
+def _whitened(
+    terrain: Terrain, ties: Ties, world_T_mast: gtsam.Pose3, noise_px: float
+) -> tuple[FloatArray, FloatArray, Sighting]:
+    """Residuals (n, 2), and what takes them to unit covariance (n, 2, 2)."""
+    seen = sightings(terrain, ties, world_T_mast)
+    noise = np.square(noise_px * np.maximum(seen.zoom, 1.0))[:, None, None] * np.eye(2)
+    covariance = noise + seen.covariance_px2(np.zeros((6, 6)), terrain.sigma_inverse_m[ties.row])
+    return ties.uv_px - seen.uv_px, np.linalg.inv(np.linalg.cholesky(covariance)), seen
+
+
+def fit_pose(
+    terrain: Terrain,
+    ties: Ties,
+    prior: Alignment,
+    start: Alignment,
+    start_scale: float,
+    noise_px: float = 1.0,
+) -> Alignment:
+    """The pose that brings most ties onto their points, against the prior.
+
+    Many ties may be wrong: weights follow Geman and McClure with a scale that shrinks from `start_scale`,
+    in units of the noise, to 1 (graduated non-convexity: Blake and Zisserman 1987).
+    """
+    octaves = max(0.0, float(np.log2(start_scale)))
+    shrinking = start_scale * 0.5 ** np.arange(0, octaves, 1 / _STEPS_PER_OCTAVE)
+    pose, columns = start.world_T_mast, prior.root.shape[1]
+    information = np.eye(columns)
+    for scale in [*shrinking, *[1.0] * _FINAL_STEPS]:
+        residual, root, seen = _whitened(terrain, ties, pose, noise_px)
+        r = np.einsum("nij,nj->ni", root, residual)
+        J = root @ seen.d_pose @ prior.root
+        weight = (scale**2 / (scale**2 + np.sum(r * r, axis=1))) ** 2 * seen.valid
+        # The tangent at the pose stands for that at the prior: they differ by little.
+        gone = gtsam.Pose3.Logmap(prior.world_T_mast.between(pose))
+        q = np.linalg.lstsq(prior.root, gone, rcond=None)[0]
+        information = np.eye(columns) + np.einsum("n,nik,nil->kl", weight, J, J)
+        step = np.linalg.solve(information, np.einsum("n,nik,ni->k", weight, J, r) - q)
+        pose = pose.retract(prior.root @ step)
+    return Alignment(world_T_mast=pose, root=prior.root @ np.linalg.inv(np.linalg.cholesky(information)).T)

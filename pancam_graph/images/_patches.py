@@ -1,0 +1,198 @@
+"""Least-squares matching of patches (Gruen 1985), after a search by correlation: what runs per patch.
+
+A patch of image a is compared with image b under an affine map from a to b, and any gain and offset. Images
+are given by their cubic spline coefficients.
+"""
+
+import math
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pancam_graph.geometry import FloatArray, IntArray
+from pancam_graph.kernel import compiled
+
+__all__ = ["HALF_WIDTH_PX", "MAX_REACH_PX", "Coefficients", "align_patches"]
+
+Coefficients: TypeAlias = NDArray[np.float32]
+"""Of cubic splines, (height, width)."""
+
+HALF_WIDTH_PX = 6
+"""Of a patch, in image a."""
+MAX_REACH_PX = 12
+"""Furthest a search goes along u or v of image a."""
+
+_WEIGHT_PX = 4.0
+_SIDE = 2 * HALF_WIDTH_PX + 1
+_CONVERGED_PX = 0.01
+_MAX_STEP_PX = 1.0
+_MAX_AFFINE_STEP = 0.1
+_SAME_PEAK_PX = 2
+
+
+@compiled
+def _at(coefficients: Coefficients, u: float, v: float) -> float:
+    """Brightness at a pixel, of the nearest one on the image."""
+    height, width = coefficients.shape
+    u = min(max(u, 0.0), width - 1.0)
+    v = min(max(v, 0.0), height - 1.0)
+    i, j = math.floor(u), math.floor(v)
+    x, y = u - i, v - j
+    a0, a3 = (1 - x) ** 3 / 6, x**3 / 6
+    a1, a2 = 2 / 3 - x * x + x**3 / 2, 2 / 3 - (1 - x) ** 2 + (1 - x) ** 3 / 2
+    b0, b3 = (1 - y) ** 3 / 6, y**3 / 6
+    b1, b2 = 2 / 3 - y * y + y**3 / 2, 2 / 3 - (1 - y) ** 2 + (1 - y) ** 3 / 2
+    # Cubic splines continue beyond the edge as in a mirror.
+    i0, i2, i3 = abs(i - 1), min(i + 1, 2 * width - 3 - i), min(i + 2, 2 * width - 4 - i)
+    value = 0.0
+    for k in range(4):
+        row = abs(j - 1 + k)
+        if row > height - 1:
+            row = 2 * height - 2 - row
+        b = b0 if k == 0 else b1 if k == 1 else b2 if k == 2 else b3
+        c = coefficients[row]
+        value += b * (a0 * c[i0] + a1 * c[i] + a2 * c[i2] + a3 * c[i3])
+    return value
+
+
+@compiled
+def _standardise(patch: FloatArray, weight: FloatArray) -> float:
+    """Take out a patch's weighted mean and standard deviation; returns the latter."""
+    mean = np.sum(patch * weight)
+    patch -= mean
+    spread = math.sqrt(max(np.sum(patch * patch * weight), 1e-12))
+    patch /= spread
+    return spread
+
+
+@compiled
+def align_patches(
+    first: int,
+    last: int,
+    image_a: Coefficients,
+    image_b: Coefficients,
+    uv_a: FloatArray,
+    affine: FloatArray,
+    reach: IntArray,
+    steps: int,
+    uv_b: FloatArray,
+    found: FloatArray,
+) -> None:
+    """Where the patches around pixels of a lie in b, for rows `first` to `last`.
+
+    `uv_a` (n, 2); `affine` (n, 2, 2) is the derivative of the pixel in b by that in a, and `uv_b` (n, 2) the
+    pixel in b, both at the start; `uv_b` is moved. `reach` (n, 2) is how many pixels of a the search by
+    correlation goes from the start to either side, along u and v. `found` (n, 4) gets the correlation where
+    the least-squares matching starts, where it ends, the second best of the search, and how far from its
+    start it ended, in pixels of b.
+    """
+    n_taps = _SIDE * _SIDE
+    offset, weight = np.empty((n_taps, 2)), np.empty(n_taps)
+    for k in range(n_taps):
+        offset[k, 0], offset[k, 1] = k % _SIDE - HALF_WIDTH_PX, k // _SIDE - HALF_WIDTH_PX
+        weight[k] = math.exp(-0.5 * (offset[k, 0] ** 2 + offset[k, 1] ** 2) / _WEIGHT_PX**2)
+    weight /= weight.sum()
+    widest = _SIDE + 2 * MAX_REACH_PX
+    template, patch, jacobian = np.empty(n_taps), np.empty(n_taps), np.empty((n_taps, 6))
+    around, scores = np.empty((widest, widest)), np.empty((widest, widest))
+    change = np.empty(6)
+    for row in range(first, last):
+        u, v = uv_a[row]
+        for k in range(n_taps):
+            template[k] = _at(image_a, u + offset[k, 0], v + offset[k, 1])
+        contrast = _standardise(template, weight)
+        m00, m01, m10, m11 = affine[row, 0, 0], affine[row, 0, 1], affine[row, 1, 0], affine[row, 1, 1]
+        x, y = uv_b[row]
+
+        # The search, on a grid of pixels of a.
+        rx, ry = reach[row]
+        second = -1.0
+        if rx > 0 or ry > 0:
+            for j in range(_SIDE + 2 * ry):
+                for i in range(_SIDE + 2 * rx):
+                    du, dv = i - HALF_WIDTH_PX - rx, j - HALF_WIDTH_PX - ry
+                    around[j, i] = _at(image_b, x + m00 * du + m01 * dv, y + m10 * du + m11 * dv)
+            best, best_i, best_j = -2.0, rx, ry
+            for j in range(2 * ry + 1):
+                for i in range(2 * rx + 1):
+                    total, square, product = 0.0, 0.0, 0.0
+                    for k in range(n_taps):
+                        w, value = weight[k], around[j + k // _SIDE, i + k % _SIDE]
+                        total += w * value
+                        square += w * value * value
+                        product += w * value * template[k]
+                    scores[j, i] = product / math.sqrt(max(square - total * total, 1e-12))
+                    if scores[j, i] > best:
+                        best, best_i, best_j = scores[j, i], i, j
+            for j in range(2 * ry + 1):
+                for i in range(2 * rx + 1):
+                    if max(abs(i - best_i), abs(j - best_j)) > _SAME_PEAK_PX:
+                        second = max(second, scores[j, i])
+            du, dv = best_i - rx, best_j - ry
+            x, y = x + m00 * du + m01 * dv, y + m10 * du + m11 * dv
+        x_start, y_start = x, y
+
+        # Columns: two of shift, four of the affine map; gain and offset are taken out as from the patches.
+        determinant = m00 * m11 - m01 * m10
+        for k in range(n_taps):
+            pu, pv = u + offset[k, 0], v + offset[k, 1]
+            gu = (_at(image_a, pu + 0.5, pv) - _at(image_a, pu - 0.5, pv)) / contrast
+            gv = (_at(image_a, pu, pv + 0.5) - _at(image_a, pu, pv - 0.5)) / contrast
+            gx, gy = (gu * m11 - gv * m10) / determinant, (gv * m00 - gu * m01) / determinant
+            jacobian[k] = (
+                gx,
+                gy,
+                gx * offset[k, 0],
+                gx * offset[k, 1],
+                gy * offset[k, 0],
+                gy * offset[k, 1],
+            )
+        for c in range(6):
+            mean, along = 0.0, 0.0
+            for k in range(n_taps):
+                mean += weight[k] * jacobian[k, c]
+                along += weight[k] * template[k] * jacobian[k, c]
+            for k in range(n_taps):
+                jacobian[k, c] -= mean + along * template[k]
+        normal = np.zeros((6, 6))
+        for k in range(n_taps):
+            for c in range(6):
+                for d in range(c + 1):
+                    normal[c, d] += weight[k] * jacobian[k, c] * jacobian[k, d]
+        trace = 0.0
+        for c in range(6):
+            trace += normal[c, c]
+            for d in range(c):
+                normal[d, c] = normal[c, d]
+        for c in range(6):
+            normal[c, c] += 1e-9 * (1 + trace)
+        inverse = np.linalg.inv(normal)
+
+        at_start, correlation, moving = -1.0, -1.0, True
+        for step in range(steps + 1):
+            for k in range(n_taps):
+                du, dv = offset[k, 0], offset[k, 1]
+                patch[k] = _at(image_b, x + m00 * du + m01 * dv, y + m10 * du + m11 * dv)
+            _standardise(patch, weight)
+            correlation = np.sum(weight * patch * template)
+            if step == 0:
+                at_start = correlation
+            if step == steps or not moving:
+                break
+            change[:] = 0.0
+            for k in range(n_taps):
+                error = weight[k] * (patch[k] - template[k])
+                for c in range(6):
+                    change[c] -= error * jacobian[k, c]
+            change[:] = inverse @ change
+            x += min(max(change[0], -_MAX_STEP_PX), _MAX_STEP_PX)
+            y += min(max(change[1], -_MAX_STEP_PX), _MAX_STEP_PX)
+            m00 += min(max(change[2], -_MAX_AFFINE_STEP), _MAX_AFFINE_STEP)
+            m01 += min(max(change[3], -_MAX_AFFINE_STEP), _MAX_AFFINE_STEP)
+            m10 += min(max(change[4], -_MAX_AFFINE_STEP), _MAX_AFFINE_STEP)
+            m11 += min(max(change[5], -_MAX_AFFINE_STEP), _MAX_AFFINE_STEP)
+            moving = math.hypot(change[0], change[1]) > _CONVERGED_PX
+        uv_b[row, 0], uv_b[row, 1] = x, y
+        found[row, 0], found[row, 1], found[row, 2] = at_start, correlation, second
+        found[row, 3] = math.hypot(x - x_start, y - y_start)

@@ -1,0 +1,38 @@
+"""Images as cubic splines, blurred as far as they are to be compared."""
+
+from collections import OrderedDict
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from pancam_graph.io.image_files import GreyImage
+
+__all__ = ["Splines"]
+
+_BLUR_PX = 0.7
+_CACHED_IMAGES = 48
+
+
+class Splines:
+    """Spline coefficients of images, the ones asked for last kept."""
+
+    def __init__(self, images: Sequence[GreyImage | None]) -> None:
+        """Of images that are there wherever coefficients are asked for."""
+        self._images = images
+        self._kept = OrderedDict[tuple[int, int], NDArray[np.float32]]()
+
+    def __call__(self, row: int, half_octaves: int = 0) -> NDArray[np.float32]:
+        """Coefficients (height, width) of an image; each half octave blurs it by a factor of sqrt(2) more."""
+        key = row, half_octaves
+        if key not in self._kept:
+            grey = self._images[row]
+            assert grey is not None  # it has features
+            blurred = ndimage.gaussian_filter(grey.astype(np.float32), _BLUR_PX * 2 ** (half_octaves / 2))
+            coefficients = ndimage.spline_filter(blurred, 3, output=np.float32, mode="mirror")
+            self._kept[key] = np.ascontiguousarray(coefficients)
+            if len(self._kept) > _CACHED_IMAGES:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(key)
+        return self._kept[key]

@@ -1,0 +1,270 @@
+"""The terrain that the images of single stops place, and how other stops should see it."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import gtsam
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pancam_graph.cameras import Camera
+from pancam_graph.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.solution import Solution
+from pancam_graph.traverse import Observations, Traverse
+
+__all__ = ["Sighting", "Terrain", "terrain_of"]
+
+_NEAREST_INVERSE_M = 1e-7
+_NEIGHBOURS = 12
+_NEIGHBOUR_PX = 60.0
+_FITS = 3
+_CAUCHY_SIGMAS = 2.0
+_GRAZING = 0.03
+_SLOPE_SHARE = 0.5
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sighting:
+    """How an image of another stop should see n points of a terrain."""
+
+    uv_px: FloatArray
+    """(n, 2)"""
+    d_pose: FloatArray
+    """(n, 2, 6) how the pixels move with the other mast's pose, in GTSAM's tangent."""
+    d_inverse_depth: FloatArray
+    """(n, 2) how they move with the points' inverse depths."""
+    cosine: FloatArray
+    """(n,) of the angle between both lines of sight."""
+    zoom: FloatArray
+    """(n,) how much larger the other image shows what faces the camera, by lengths."""
+    valid: BoolArray
+    """(n,) False for points behind the camera; their rows mean nothing."""
+
+    def select(self, rows: BoolArray | IntArray) -> "Sighting":
+        """Some of the points."""
+        return Sighting(**{name: column[rows] for name, column in vars(self).items()})
+
+    def covariance_px2(self, pose_covariance: FloatArray, sigma_inverse_m: FloatArray) -> FloatArray:
+        """(n, 2, 2) what the pose (6, 6) and the inverse depths (n,) leave open."""
+        depth = self.d_inverse_depth * sigma_inverse_m[:, None]
+        pose = self.d_pose @ pose_covariance @ np.swapaxes(self.d_pose, 1, 2)
+        return np.asarray(pose + depth[:, :, None] * depth[:, None, :])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Terrain:
+    """Points with the image that each was first seen in, sorted by track."""
+
+    traverse: Traverse
+    """At the stops and angles that the stops' own images give; its observations are those of the stops."""
+    track: IntArray
+    """(n,)"""
+    row: IntArray
+    """(n,) the first observation of each track."""
+    inverse_depth: FloatArray
+    """(n,) per metre along the axis of the camera that saw it first; 0 for infinity."""
+    sigma_inverse_m: FloatArray
+    """(n,) its standard deviation."""
+    slope: FloatArray
+    """(n, 2) how the inverse depth of the surface changes by pixel of that camera."""
+
+    def select(self, rows: BoolArray | IntArray) -> "Terrain":
+        """Some of the points."""
+        columns = ("track", "row", "inverse_depth", "sigma_inverse_m", "slope")
+        return replace(self, **{name: getattr(self, name)[rows] for name in columns})
+
+    @property
+    def observations(self) -> Observations:
+        """Those of the stops."""
+        assert self.traverse.observations is not None
+        return self.traverse.observations
+
+    @cached_property
+    def image(self) -> IntArray:
+        """(n,) where each was first seen."""
+        return np.asarray(self.observations.image[self.row])
+
+    @cached_property
+    def uv_px(self) -> FloatArray:
+        """(n, 2) pixel there."""
+        return np.asarray(self.observations.uv_px[self.row])
+
+    @cached_property
+    def stop(self) -> IntArray:
+        """(n,) of that image."""
+        return self.traverse.image_stop[self.image]
+
+    @cached_property
+    def _poses(self) -> tuple[FloatArray, FloatArray]:
+        return self.traverse.camera_poses()
+
+    def camera(self, image: int) -> Camera:
+        """Camera model of an image."""
+        return self.traverse.rig.eyes[int(self.traverse.image_eye[image])].camera
+
+    def points_m(self, rows: IntArray, shift_px: tuple[float, float] = (0.0, 0.0)) -> FloatArray:
+        """World points (n, 3) of rows of one image; `shift_px` beside them, on the plane of the surface."""
+        image = int(self.image[rows[0]])
+        origin, ray = _sights(self.camera(image), self.uv_px[rows] + shift_px)
+        inverse = self.inverse_depth[rows] + self.slope[rows] @ np.array(shift_px)
+        R, centre = (p[image] for p in self._poses)
+        return np.asarray(centre + (origin + ray / np.maximum(inverse, _NEAREST_INVERSE_M)[:, None]) @ R.T)
+
+    def sighting(self, rows: IntArray, image: int, world_T_mast: gtsam.Pose3) -> Sighting:
+        """How `image` sees rows of one image of another stop, if its mast is at that pose."""
+        points = self.points_m(rows)
+        first = int(self.image[rows[0]])
+        R_a, centre_a = (p[first] for p in self._poses)
+        camera = self.camera(image)
+        mast_R, mast_t = self._mast_T_camera(image)
+        R_m, t_m = world_T_mast.rotation().matrix(), world_T_mast.translation()
+        in_mast = (points - t_m) @ R_m
+        uv, d_point, valid = camera.project_with_jacobian((in_mast - mast_t) @ mast_R)
+        d_mast = d_point @ mast_R.T
+        # A turn of the mast by w takes what it sees by -w x p, a shift by -v.
+        d_pose = np.concatenate([np.cross(d_mast, in_mast[:, None]), -d_mast], axis=2)
+        to_a = points - centre_a
+        range_a = np.linalg.norm(to_a, axis=1)
+        along = to_a / np.maximum((to_a @ R_a) @ _forward(self.camera(first)), 1e-12)[:, None]
+        inverse = np.maximum(self.inverse_depth[rows], _NEAREST_INVERSE_M)
+        d_world = d_mast @ R_m.T
+        d_inverse = np.einsum("nij,nj->ni", d_world, -along / inverse[:, None] ** 2)
+        to_b = points - (R_m @ mast_t + t_m)
+        range_b = np.maximum(np.linalg.norm(to_b, axis=1), 1e-9)
+        focal = [float(c.pinhole.calibration_matrix[0, 0]) for c in (self.camera(first), camera)]
+        return Sighting(
+            uv_px=uv,
+            d_pose=d_pose,
+            d_inverse_depth=d_inverse,
+            cosine=np.einsum("ni,ni->n", to_a, to_b) / np.maximum(range_a * range_b, 1e-12),
+            zoom=focal[1] / focal[0] * range_a / range_b,
+            valid=valid,
+        )
+
+    def affine(self, rows: IntArray, image: int, world_T_mast: gtsam.Pose3) -> FloatArray:
+        """Derivative (n, 2, 2) of the pixel in `image` by the pixel of one other image, on the surface."""
+        camera = self.camera(image)
+        mast_R, mast_t = self._mast_T_camera(image)
+        R_m, t_m = world_T_mast.rotation().matrix(), world_T_mast.translation()
+        pixels = []
+        for shift in ((-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0)):
+            in_mast = (self.points_m(rows, shift) - t_m) @ R_m
+            pixels.append(camera.project((in_mast - mast_t) @ mast_R)[0])
+        return np.stack([pixels[1] - pixels[0], pixels[3] - pixels[2]], -1) / 2
+
+    def _mast_T_camera(self, image: int) -> tuple[FloatArray, FloatArray]:
+        t = self.traverse
+        R, centre = t.rig.mast_T_camera(t.pan_tilt_rad[t.image_frame[[image]]], t.image_eye[[image]])
+        return R[0], centre[0]
+
+
+def terrain_of(solution: Solution) -> Terrain:
+    """The points that a solution of single stops places, each with its surface."""
+    t, final = solution.traverse, solution.final
+    obs = t.observations
+    assert obs is not None
+    frames = tuple(
+        replace(f, pan_rad=float(pan), tilt_rad=float(tilt))
+        for f, (pan, tilt) in zip(t.frames, final.pan_tilt_rad, strict=True)
+    )
+    stops = tuple(replace(s, world_T_mast=pose) for s, pose in zip(t.stops, final.world_T_mast, strict=True))
+    refined = replace(t, frames=frames, stops=stops)
+    # Observations are sorted by track, then image.
+    tracks, first = np.unique(obs.track, return_index=True)
+    landmark = np.searchsorted(solution.landmark_track, tracks).clip(max=len(solution.landmark_track) - 1)
+    known = (solution.landmark_track[landmark] == tracks) & solution.used[first]
+    known &= np.isfinite(final.landmarks_m[landmark]).all(axis=1)
+    tracks, first, points = tracks[known], first[known], final.landmarks_m[landmark[known]]
+
+    image = obs.image[first]
+    to_point = points - final.world_t_camera[image]
+    ahead = np.array([_forward(e.camera) for e in t.rig.eyes])[t.image_eye[image]]
+    axis = np.einsum("nij,nj->ni", final.world_R_camera[image], ahead)
+    depth = np.einsum("ni,ni->n", axis, to_point)
+    inverse = 1 / np.maximum(depth, 1e-3)
+    sigma = _sigma_inverse_m(solution, tracks, to_point, image)
+    good = (depth > 1e-3) & np.isfinite(sigma)
+    terrain = Terrain(
+        traverse=refined,
+        track=tracks[good],
+        row=first[good],
+        inverse_depth=inverse[good],
+        sigma_inverse_m=sigma[good],
+        slope=np.zeros((int(good.sum()), 2)),
+    )
+    slope = terrain.slope.copy()
+    for i in np.unique(terrain.image):
+        rows = np.flatnonzero(terrain.image == i)
+        slope[rows] = _slopes(terrain, rows, final.world_R_camera[i])
+    return replace(terrain, slope=slope)
+
+
+def _sigma_inverse_m(
+    solution: Solution, tracks: IntArray, to_point: FloatArray, image: IntArray
+) -> FloatArray:
+    """Of inverse depths (n,), by the longest baseline across the line of sight; infinite without any."""
+    t, obs = solution.traverse, solution.traverse.observations
+    assert obs is not None
+    rows = np.flatnonzero(solution.used & np.isin(obs.track, tracks))
+    k = np.searchsorted(tracks, obs.track[rows])
+    direction = to_point / np.linalg.norm(to_point, axis=1, keepdims=True)
+    centre = solution.final.world_t_camera
+    across = np.cross(centre[obs.image[rows]] - centre[image[k]], direction[k])
+    baseline = np.zeros(len(tracks))
+    np.maximum.at(baseline, k, np.linalg.norm(across, axis=1))
+    focal = t.calibration[image, 0, 0]
+    noise = np.sqrt(2) * float(np.median(solution.sigma_px))
+    with np.errstate(divide="ignore"):
+        return np.asarray(noise / (focal * baseline))
+
+
+def _forward(camera: Camera) -> FloatArray:
+    """The axis that depths are measured along: the line of sight of the image's middle."""
+    middle = np.array([[(camera.width_px - 1) / 2, (camera.height_px - 1) / 2]])
+    return np.asarray(camera.unproject(middle).direction[0])
+
+
+def _sights(camera: Camera, uv_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Origins and rays (n, 3) of pixels, the rays of unit length along the camera's axis."""
+    rays = camera.unproject(uv_px)
+    return rays.origin_m, rays.direction / (rays.direction @ _forward(camera))[:, None]
+
+
+def _slopes(terrain: Terrain, rows: IntArray, world_R_camera: FloatArray) -> FloatArray:
+    """Slopes (n, 2) of the inverse depth around points of one image.
+
+    The inverse depth of a plane is linear in the pixel of a pinhole. Each plane is fitted to the nearest
+    points, robustly, and held to level ground, or to facing the camera near the horizon.
+    """
+    camera = terrain.camera(int(terrain.image[rows[0]]))
+    uv, w, sigma = terrain.uv_px[rows], terrain.inverse_depth[rows], terrain.sigma_inverse_m[rows]
+    up = world_R_camera.T @ np.array([0.0, 0.0, 1.0])
+    _, ray = _sights(camera, uv)
+    d_ray = [_sights(camera, uv + s)[1] - _sights(camera, uv - s)[1] for s in ((0.5, 0.0), (0.0, 0.5))]
+    down = -(ray @ up)
+    steep = down > _GRAZING
+    level = (
+        np.stack([d @ up for d in d_ray], 1) * np.where(steep, -w / np.maximum(down, _GRAZING), 0)[:, None]
+    )
+    focal = float(camera.pinhole.calibration_matrix[0, 0])
+    prior = (_SLOPE_SHARE * np.linalg.norm(level, axis=1) + w / focal) ** -2.0
+
+    count = min(_NEIGHBOURS + 1, len(rows))
+    distance, near = (np.reshape(x, (len(rows), -1)) for x in cKDTree(uv).query(uv, k=count))
+    delta = uv[near] - uv[:, None]
+    design = np.concatenate([np.ones((*near.shape, 1)), delta], axis=2)
+    base = np.where(distance < _NEIGHBOUR_PX, 1 / np.hypot(sigma[near], sigma[:, None]) ** 2, 0.0)
+    target = w[near] - w[:, None]
+    slope, offset = level.copy(), np.zeros(len(rows))
+    for _ in range(_FITS):
+        error = target - offset[:, None] - np.einsum("nki,ni->nk", delta, slope)
+        weight = base / (1 + error**2 * base / _CAUCHY_SIGMAS**2)
+        normal = np.einsum("nk,nki,nkj->nij", weight, design, design)
+        right = np.einsum("nk,nki,nk->ni", weight, design, target)
+        normal[:, 0, 0] += 1e-6 * base.max(axis=1)
+        for i in (0, 1):
+            normal[:, 1 + i, 1 + i] += prior
+            right[:, 1 + i] += prior * level[:, i]
+        solved = np.linalg.solve(normal, right[..., None])[..., 0]
+        offset, slope = solved[:, 0], solved[:, 1:]
+    return np.asarray(slope)
