@@ -158,7 +158,7 @@ def _conditioning(plt: ModuleType, results: Results) -> Any:
     shown = [m for m in ORIGINS_M if results.get(name_of(m), "projective", 0.5, "iterations") is not None]
     if not shown:
         return None
-    figure, ax = plt.subplots(figsize=(5.6, 3.2), layout="constrained")
+    figure, ax = plt.subplots(figsize=(6.6, 3.2), layout="constrained")
     for i, (model, label, colour) in enumerate(
         (("projective", "conditioned", "#0b6e4f"), ("projective, as it is", "as it is", "#a63d57"))
     ):
@@ -170,7 +170,8 @@ def _conditioning(plt: ModuleType, results: Results) -> Any:
             finite = [v for v in (row.q05, row.median, row.q95) if math.isfinite(v)]
             if finite:
                 ax.plot([x, x], [finite[0], finite[-1]], color=colour, lw=1.5)
-                ax.plot([x], [finite[len(finite) // 2]], marker="os"[i], color=colour)
+            if math.isfinite(row.median):
+                ax.plot([x], [row.median], marker="os"[i], color=colour)
             if row.failed:
                 ax.annotate(
                     f"{row.failed} of {row.seeds}\nfail",
@@ -187,7 +188,7 @@ def _conditioning(plt: ModuleType, results: Results) -> Any:
     ax.set_xlim(-0.5, len(shown) - 0.5)
     ax.set_ylim(0, 1.3 * ax.get_ylim()[1])  # room for what failed
     ax.grid(alpha=0.3, axis="y")
-    ax.legend(frameon=False, loc="center left")
+    ax.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
 
 
