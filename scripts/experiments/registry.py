@@ -68,7 +68,7 @@ def plan(*, seeds: int, quick: bool, families: Sequence[str] = FAMILIES) -> Plan
     tasks: list[Task] = []
     left_out: list[str] = []
     few = min(seeds, max(2, seeds // 5))
-    """Of what tells the same with every seed."""
+    """Of what tells the same with every seed, or takes long for a look."""
     if "validation" in families:
         tasks += [validation.ValidationTask(noise_px=0.5, seed=seed) for seed in range(min(seeds, 10))]
     if "clusters" in families:
@@ -84,7 +84,8 @@ def plan(*, seeds: int, quick: bool, families: Sequence[str] = FAMILIES) -> Plan
     if "conditioning" in families:
         tasks += [ConditioningTask(scenario=CLUSTERS[1], noise_px=0.5, seed=seed) for seed in range(few)]
     if "localisation" in families:
-        tasks += _over_seeds((*PANORAMAS, *TRAVERSES), _MIDDLE_PX, seeds, KNOWN_RIG)
+        tasks += _over_seeds(PANORAMAS, _MIDDLE_PX, seeds, KNOWN_RIG)
+        tasks += _over_seeds(TRAVERSES, _MIDDLE_PX, few if quick else seeds, KNOWN_RIG)
     if "opportunity" in families:
         folder = opportunity.opportunity_folder()
         if folder is None:

@@ -71,12 +71,13 @@ def run_tasks(
     tasks: Sequence[Task], *, processes: int, progress: Callable[[str, int, int], None] | None = None
 ) -> list[Sample]:
     """Samples of all tasks in their order, whatever the number of processes."""
-    samples: list[Sample] = []
-    for done, found in enumerate(_results(tasks, processes), start=1):
-        samples += found
+    found: list[list[Sample]] = []
+    # The last are the longest: begun first, they leave no process alone at the end.
+    for done, samples in enumerate(_results(tasks[::-1], processes), start=1):
+        found.append(samples)
         if progress is not None:
             progress("running", done, len(tasks))
-    return samples
+    return [sample for samples in reversed(found) for sample in samples]
 
 
 def _results(tasks: Sequence[Task], processes: int) -> Iterator[list[Sample]]:
