@@ -252,6 +252,7 @@ def test_least_squares_matching_beats_the_features_own_places(
     assert after < 0.5 * before
 
 
+@pytest.mark.slow
 def test_the_same_on_any_number_of_threads(
     small: tuple[Rendering, Traverse], small_found: Traverse, monkeypatch: pytest.MonkeyPatch
 ) -> None:

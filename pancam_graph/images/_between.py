@@ -16,7 +16,7 @@ from pancam_graph.images._alignment import (
     whitened_distance,
 )
 from pancam_graph.images._features import Features
-from pancam_graph.images._masks import at_pixels
+from pancam_graph.images._masks import pixels_at
 from pancam_graph.images._options import FrontEndOptions
 from pancam_graph.images._patches import HALF_WIDTH_PX, MAX_REACH_PX, Coefficients, align_patches
 from pancam_graph.images._splines import Splines
@@ -77,15 +77,15 @@ def tie_stops(
     """Observations of the traverse with what pairs of stops see of each other's terrain added; warnings.
 
     The traverse has observations within stops, sorted by track, then image; `feature_of` says of which
-    feature each is. A solve of these places the terrain of each stop. Features that look alike correct where
-    stops stand relative to each other; then the patch around a point of one stop is sought in the images of
-    the other where the corrected poses have it, warped by the surface there, and matched by least squares.
-    Points outside `usable`, by image, are left out at both ends: the rover drives along.
+    feature each is, `usable` where each image (height, width) shows terrain. A solve of these places the
+    terrain of each stop. Features that look alike correct where stops stand relative to each other; then the
+    patch around a point of one stop is sought in the images of the other where the corrected poses have it,
+    warped by the surface there, and matched by least squares.
     """
     assert traverse.observations is not None
     solution = solve(traverse)
     terrain = terrain_of(solution)
-    terrain = terrain.select(_on_ground(usable, terrain.image, terrain.uv_px))
+    terrain = terrain.select(_on_terrain(usable, terrain.image, terrain.uv_px))
     spline = Splines(images)
     chosen = _spread(terrain)
     unit = float(np.median(traverse.observations.sigma_px / solution.sigma_px))
@@ -98,7 +98,7 @@ def tie_stops(
             if alignment is None:
                 continue
             ties, noise_px = _between(terrain, spline, chosen, (one, other), alignment, options)
-            ties = ties.select(_on_ground(usable, ties.image, ties.uv_px))
+            ties = ties.select(_on_terrain(usable, ties.image, ties.uv_px))
             _LOG.info("%s in %s: %d ties, noise %.2f px", names[0], names[1], len(ties), noise_px)
             count += len(ties)
             parts.append(ties)
@@ -114,12 +114,13 @@ def tie_stops(
     return _joined(traverse.observations, terrain, ties, np.concatenate(sigmas)), warnings
 
 
-def _on_ground(usable: Sequence[BoolArray | None], image: IntArray, uv_px: FloatArray) -> BoolArray:
-    """Which pixels (n, 2) of images (n,) are usable."""
+def _on_terrain(usable: Sequence[BoolArray | None], image: IntArray, uv_px: FloatArray) -> BoolArray:
+    """Which pixels (n, 2) of images (n,) show terrain."""
     found = np.zeros(len(image), dtype=bool)
-    for i in np.unique(image):
-        if (mask := usable[int(i)]) is not None:
-            found[image == i] = at_pixels(mask, uv_px[image == i])
+    for i in np.unique(image).tolist():
+        mask, rows = usable[i], image == i
+        assert mask is not None  # it has observations
+        found[rows] = pixels_at(mask, uv_px[rows])
     return found
 
 

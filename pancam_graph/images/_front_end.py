@@ -36,8 +36,9 @@ def find_observations(
     Features are matched between images that overlap by the pointing of telemetry (stops, pan, tilt and
     their standard deviations), and only where the camera models leave a place for them; then each pair's
     geometry is corrected by what most of its matches say, the matching is repeated in the narrower
-    windows, and what is far from its epipolar line is left out. The same files give the same observations
-    to the last bit.
+    windows, and what is far from its epipolar line is left out. Stops that see in stereo are tied by the
+    terrain that each of them places (see `tie_stops`). The same files give the same observations to the last
+    bit.
 
     Left out are what the user's masks cover, missing and saturated pixels, and sky (see `find_masks`).
     Between stops, so is the rover itself, and matches that stand still relative to the mast are dropped; at
@@ -48,8 +49,8 @@ def find_observations(
     taken from there, and the result is the same to the last bit.
 
     Returns the traverse with observations of origin "images", in place of any that it had, and with
-    warnings for images without observations or over-exposed or there twice, and for pairs that overlap but
-    give no matches.
+    warnings for images without observations or over-exposed or there twice, and for pairs of images that
+    overlap, and of stops that are near, but give no matches.
 
     Raises InputError if no image has a file or nothing is found, ImageError naming the file for
     one that cannot be read or has another size than its camera, and for such a mask.
@@ -103,8 +104,8 @@ def find_observations(
         origin="images",
     )
     if work.stop_pairs:
-        observations, lonely = work.tied(observations, feature)
-        warnings += lonely
+        observations, apart = work.tied(observations, feature)
+        warnings += apart
     work.cache.forget_others()
     return traverse.with_observations(observations, warnings)
 

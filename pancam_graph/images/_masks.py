@@ -13,7 +13,7 @@ from pancam_graph.images._normalise import usable_mask
 from pancam_graph.images._sky import find_sky
 from pancam_graph.traverse import Traverse
 
-__all__ = ["ImageMask", "Reason", "at_pixels", "elevation_rad", "mask_image", "saturated"]
+__all__ = ["ImageMask", "Reason", "elevation_rad", "mask_image", "saturated"]
 
 _FULL_SCALES = (255, 1023, 4095, 16383, 65535)
 _NEAR_FULL = 0.98
@@ -118,7 +118,7 @@ def elevation_rad(traverse: Traverse, row: int) -> FloatArray:
     return np.asarray(cv2.remap(nodes, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
-def at_pixels(usable: BoolArray, uv_px: FloatArray) -> BoolArray:
+def pixels_at(usable: BoolArray, uv_px: FloatArray) -> BoolArray:
     """Whether the pixels (n, 2) are usable; those outside the image are as the nearest inside."""
     height, width = usable.shape
     u, v = np.rint(uv_px).astype(np.int64).T

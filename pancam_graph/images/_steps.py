@@ -13,7 +13,7 @@ from pancam_graph.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.images._between import near_stops, stereo_stops, tie_stops
 from pancam_graph.images._cache import Arrays, Cache, digest
 from pancam_graph.images._features import Features, find_features
-from pancam_graph.images._masks import ImageMask, Reason, at_pixels, elevation_rad, mask_image
+from pancam_graph.images._masks import ImageMask, Reason, elevation_rad, mask_image, pixels_at
 from pancam_graph.images._match import Matches
 from pancam_graph.images._match_pair import match_pair
 from pancam_graph.images._options import FrontEndOptions
@@ -29,7 +29,6 @@ __all__ = ["Progress", "Steps"]
 _LOG = logging.getLogger(__name__)
 _WORLD_UP = np.array([0.0, 0.0, 1.0])
 _PATCH_PX = 8  # how far from its pixel a refined observation looks at the image
-_COLUMNS = ("image", "track", "uv_px", "sigma_px")
 _OVER_EXPOSED = 0.3
 _MOST = 0.5
 _WHY = {
@@ -77,32 +76,28 @@ class Steps:
         ]
 
     @cached_property
-    def _near(self) -> tuple[list[PairGeometry], list[tuple[int, int]]]:
-        """Pairs of images whose features are to be compared, and pairs of stops that their terrain ties."""
-
-        def overlapping(stops: BoolArray) -> list[PairGeometry]:
-            found = overlapping_pairs(traverse, options, partial(self.tell, "overlaps"), stops=stops)
-            return [pair for pair in found if there[pair.a] and there[pair.b]]
-
-        traverse, options = self.traverse, self.options
-        there = [image is not None for image in self.pictures.images]
-        pairs = overlapping(np.eye(len(traverse.stops), dtype=bool))
-        stereo = stereo_stops(traverse, [(pair.a, pair.b) for pair in pairs])
-        near = near_stops(traverse, options)
+    def _all_pairs(self) -> tuple[list[PairGeometry], list[tuple[int, int]]]:
+        """Pairs of images whose features are compared, and pairs of stops that their terrain ties."""
+        pairs = self._overlapping(np.eye(len(self.traverse.stops), dtype=bool))
+        stereo = stereo_stops(self.traverse, [(p.a, p.b) for p in pairs])
+        near = near_stops(self.traverse, self.options)
         placed = near & stereo[:, None] & stereo
         if (near & ~placed).any():
-            pairs += overlapping(near & ~placed)
+            pairs += self._overlapping(near & ~placed)
         return pairs, [(a, b) for a, b in np.argwhere(np.triu(placed, 1)).tolist()]
+
+    def _overlapping(self, stops: BoolArray) -> list[PairGeometry]:
+        there = [image is not None for image in self.pictures.images]
+        found = overlapping_pairs(self.traverse, self.options, partial(self.tell, "overlaps"), stops=stops)
+        return [pair for pair in found if there[pair.a] and there[pair.b]]
 
     @property
     def pairs(self) -> list[PairGeometry]:
-        """Pairs of images whose features are to be compared."""
-        return self._near[0]
+        return self._all_pairs[0]
 
     @property
     def stop_pairs(self) -> list[tuple[int, int]]:
-        """Pairs of stops that their terrain ties."""
-        return self._near[1]
+        return self._all_pairs[1]
 
     @cached_property
     def masks(self) -> list[ImageMask | None]:
@@ -177,7 +172,7 @@ class Steps:
         for found, mask in zip(self.features, self.masks, strict=True):
             keep = np.zeros(len(found), dtype=bool)
             if mask is not None:
-                keep = at_pixels(mask.usable(between_stops=True), found.uv_px)
+                keep = pixels_at(mask.usable(between_stops=True), found.uv_px)
             rows.append(np.flatnonzero(keep))
         return rows
 
@@ -224,7 +219,7 @@ class Steps:
         return np.where(moved[:, None], found, uv_px), good
 
     def tied(self, observations: Observations, feature: IntArray) -> tuple[Observations, list[str]]:
-        """Observations with those that tie stops added, off the rover; warnings. See `tie_stops`."""
+        """Observations within stops and those that `tie_stops` adds, and its warnings."""
         usable = [
             None if mask is None else mask.usable(between_stops=True, margin_px=_PATCH_PX)
             for mask in self.masks
@@ -241,15 +236,15 @@ class Steps:
                 self.options,
                 partial(self.tell, "ties between stops"),
             )
-            return {name: getattr(found, name) for name in _COLUMNS} | {
-                "warnings": np.array(warnings, dtype=str)
-            }
+            names = ("image", "track", "uv_px", "sigma_px")
+            columns = {name: np.asarray(getattr(found, name)) for name in names}
+            return {**columns, "warnings": np.array(warnings, dtype=str)}
 
-        columns = [getattr(observations, name) for name in _COLUMNS]
-        key = digest("ties", self.picture_keys, self.feature_keys, usable, columns, feature, self.stop_pairs)
+        columns = observations.image, observations.track, observations.uv_px, observations.sigma_px, feature
+        key = digest("ties", self.picture_keys, self.mask_keys, self.traverse.stops, columns)
         kept = self.cache.recall("ties", key, make)
         warnings = [str(text) for text in kept.pop("warnings")]
-        return Observations(**kept, origin=observations.origin), warnings
+        return Observations(**kept, origin="images"), warnings
 
     def _clear(self, image: IntArray, track: IntArray, uv_px: FloatArray) -> BoolArray:
         """Whether no pixel is left out within a patch around each observation."""
@@ -266,7 +261,7 @@ class Steps:
                 rows = np.flatnonzero((image == i) & (linking == between))
                 if len(rows):
                     usable = mask.usable(between_stops=between, margin_px=_PATCH_PX)
-                    clear[rows] = at_pixels(usable, uv_px[rows])
+                    clear[rows] = pixels_at(usable, uv_px[rows])
         return clear
 
     def over_exposed(self) -> list[str]:

@@ -70,8 +70,8 @@ class Terrain:
 
     def select(self, rows: BoolArray | IntArray) -> "Terrain":
         """Some of the points."""
-        columns = ("track", "row", "inverse_depth", "sigma_inverse_m", "slope")
-        return replace(self, **{name: getattr(self, name)[rows] for name in columns})
+        names = ("track", "row", "inverse_depth", "sigma_inverse_m", "slope")
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     @property
     def observations(self) -> Observations:
