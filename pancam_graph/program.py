@@ -21,17 +21,10 @@ from pancam_graph.io.cache_folder import cache_folder, is_cache
 from pancam_graph.smoother import Update
 from pancam_graph.solution import Solution
 
-__all__ = ["SHARING_HELP", "Parser", "Progress", "print_summary", "resumable", "run", "show_log"]
+__all__ = ["Parser", "Progress", "print_summary", "resumable", "run", "show_log"]
 
 BAD_INPUT = 2
 INTERRUPTED = 130
-SHARING_HELP = (
-    "what of the rig is estimated, and who shares it: QUANTITY=SCOPE[:ENTRY[~SIGMA],...] with quantities "
-    "calibration (fx_px fy_px skew_px cx_px cy_px, or focal), mounts and pan_T_tilt (rx_rad ry_rad rz_rad "
-    "x_m y_m z_m), radius (radius_m; model circle) and scopes fixed, all, eye, stop, image; without entries "
-    "all are free; SIGMA is the prior's, inf for none; what traverse.json says of a quantity is overridden; "
-    "for example calibration=eye:focal mounts=eye"
-)
 _STAGES = {"screening": "looking for outliers", "approach": "adjusting", "solve": "adjusting to the end"}
 
 

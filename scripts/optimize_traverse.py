@@ -12,14 +12,14 @@ Exit status: 0 solved, 1 not converged (results are written), 2 bad input (nothi
 
 import time
 from dataclasses import replace
-from pathlib import Path
 
 from pancam_graph import SolveOptions, cross_validate, find_observations, read_input, solve
 from pancam_graph.images.mosaic import MosaicOptions
 from pancam_graph.incremental import solve_incrementally
-from pancam_graph.io import EXPORTS, cache_folder, check_exports, check_out
+from pancam_graph.io import cache_folder, check_exports, check_out
 from pancam_graph.kernel import must_compile
-from pancam_graph.program import SHARING_HELP, Parser, Progress, print_summary, resumable, run, show_log
+from pancam_graph.main_options import add_main_options
+from pancam_graph.program import Parser, Progress, print_summary, resumable, run, show_log
 from pancam_graph.sharing import parse_sharing
 from pancam_graph.solve import COMPILING
 from pancam_graph.stopping import criteria
@@ -28,67 +28,7 @@ from pancam_graph.stopping import criteria
 def main() -> int:
     """Read, match images where observations are missing, solve, write."""
     parser = Parser(__doc__ or "")
-    parser.add_argument("traverse", type=Path, metavar="TRAVERSE", help="folder to read")
-    parser.add_argument("--out", type=Path, required=True, help="folder to write")
-    parser.add_argument(
-        "--model",
-        choices=("mast", "circle", "free", "projective"),
-        default="mast",
-        help="mast: rigid pan-tilt mast (default); circle: camera centres on the mast's circles, rotations "
-        "free; free: every camera on its own; projective: every projection matrix on its own",
-    )
-    parser.add_argument(
-        "--landmarks",
-        choices=("eliminated", "explicit"),
-        default="eliminated",
-        help="eliminated: terrain points follow the cameras (default); explicit: they are variables, slow",
-    )
-    parser.add_argument(
-        "--method",
-        choices=("joint", "alternation"),
-        default="joint",
-        help="joint: everything at once (default); alternation: what all stops share and everything else in "
-        "turn, slow",
-    )
-    parser.add_argument(
-        "--loss",
-        choices=("none", "huber", "cauchy"),
-        default="huber",
-        help="robust loss while outliers are sought (default huber); none: keep every observation",
-    )
-    parser.add_argument(
-        "--stop",
-        action="append",
-        default=[],
-        metavar="NAME=NUMBER",
-        help="when the final iterations end; may be given for each of max_iterations (default 100), "
-        "relative_decrease (of the cost, 1e-7), relative_step, max_gradient, residual_sigmas; 0: not used",
-    )
-    parser.add_argument("--sharing", nargs="+", default=(), metavar="WORD", help=SHARING_HELP)
-    parser.add_argument(
-        "--incremental",
-        action="store_true",
-        help="add the stops one by one as a rover does, with iSAM2 (model mast), a line for each",
-    )
-    parser.add_argument(
-        "--cross-validate",
-        action="store_true",
-        help="solve halves of the terrain points too, and show honest sigmas beside the formal ones",
-    )
-    parser.add_argument(
-        "--export",
-        action="append",
-        choices=EXPORTS,
-        default=[],
-        help="write a folder more into OUT (may be given for each); colmap: undistorted images and a model "
-        "with rigs and frames, for dense reconstruction; cahvor: the refined cameras as text files",
-    )
-    parser.add_argument(
-        "--mosaic",
-        action="store_true",
-        help="write mosaics of each stop before and after too, around the horizon and from above",
-    )
-    parser.add_argument("--no-report", action="store_true", help="do not write report.html")
+    add_main_options(parser)
     arguments = parser.parse_args()
     show_log(verbose=arguments.verbose)
     choices = {name: getattr(arguments, name) for name in ("model", "landmarks", "method", "loss")}
