@@ -123,7 +123,8 @@ class Landmarks:
         A landmark beyond infinity is placed at that distance too; one without a direction at its origin.
         """
         x, w = self.vector[:, :3], self.vector[:, 3]
-        depth = np.maximum(w, np.linalg.norm(x, axis=1) / furthest_m).clip(1e-300)
+        distance = np.sqrt(np.einsum("ij,ij->i", x, x))
+        depth = np.maximum(w, distance / furthest_m).clip(1e-300)
         return np.asarray(self.origin_m + x / depth[:, None])
 
     def about(self, origin_m: FloatArray) -> "Landmarks":

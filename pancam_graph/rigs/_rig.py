@@ -110,10 +110,9 @@ class Rig:
 
         `pan_T_tilt` are tilt axes (n, 3, 3), (n, 3) in place of the rig's own.
         """
-        pan_R, zero = pan_tilt_rotation(pan_rad, np.zeros_like(pan_rad)), np.zeros((len(pan_rad), 3))
         axis_R, axis_t = pan_T_tilt or (self.pan_T_tilt.rotation().matrix(), self.pan_T_tilt.translation())
-        tilt_R = pan_tilt_rotation(np.zeros_like(tilt_rad), tilt_rad)
-        return compose(*compose(pan_R, zero, axis_R, axis_t), tilt_R, zero)
+        pan_R, tilt_R = pan_tilt_rotation(pan_rad, 0.0), pan_tilt_rotation(0.0, tilt_rad)
+        return pan_R @ axis_R @ tilt_R, (pan_R @ axis_t[..., None])[..., 0]
 
     def mast_T_camera(self, pan_tilt_rad: FloatArray, eye: IntArray) -> tuple[FloatArray, FloatArray]:
         """Camera poses in the mast frame for n images: pan and tilt (n, 2), eye index (n,)."""
