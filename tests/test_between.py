@@ -24,7 +24,7 @@ from pancam_graph import (
 )
 from pancam_graph.cameras import Pinhole
 from pancam_graph.geometry import HEAD_R_FORWARD_CAMERA, FloatArray
-from pancam_graph.images import FrontEndOptions, _refine
+from pancam_graph.images import FrontEndOptions, _refine, _steps
 from pancam_graph.images._alignment import Ties, fit_pose, telemetry_alignment
 from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._patches import align_patches
@@ -253,15 +253,22 @@ def test_least_squares_matching_beats_the_features_own_places(
 
 
 @pytest.mark.slow
-def test_the_same_on_any_number_of_threads(
-    small: tuple[Rendering, Traverse], small_found: Traverse, monkeypatch: pytest.MonkeyPatch
+def test_the_same_on_any_number_of_threads_and_from_the_cache(
+    small: tuple[Rendering, Traverse], small_found: Traverse, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setenv("PANCAM_GRAPH_THREADS", "1" if n_workers() > 1 else "2")
-    again, before = find_observations(small[1], QUICK).observations, small_found.observations
-    assert again is not None
+    def not_again(*_: object) -> None:
+        raise AssertionError("what was kept is made anew")
+
+    before = small_found.observations
     assert before is not None
-    for name in ("image", "track", "uv_px", "sigma_px"):
-        assert getattr(again, name).tobytes() == getattr(before, name).tobytes()
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", "1" if n_workers() > 1 else "2")
+    for _ in range(2):
+        again = find_observations(small[1], QUICK, cache=tmp_path)
+        assert again.observations is not None
+        assert again.warnings == small_found.warnings
+        for name in ("image", "track", "uv_px", "sigma_px"):
+            assert getattr(again.observations, name).tobytes() == getattr(before, name).tobytes()
+        monkeypatch.setattr(_steps, "tie_stops", not_again)
 
 
 def test_small_panoramas_place_the_second_stop(
