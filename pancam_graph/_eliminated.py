@@ -86,18 +86,13 @@ class EliminatedSolver(Solver):
         """Where each image has a variable of its own."""
         joint = JointSystem(problem, system)
 
-        def gain_ahead(_values: gtsam.Values) -> float | None:
-            if system.regained > _FOLLOWING * system.moved_cost:
-                return None
-            return joint.root().gain() + system.gain_alone
-
         outcome = optimise(
             lambda: OnLastGroup(joint, rule),
             rule,
             n_observations=int(problem.kept.sum()),
             stage=stage,
             on_iteration=self.on_iteration,
-            gain_ahead=gain_ahead,
+            gain_ahead=lambda _values: _gain_ahead(system, joint.root),
         )
         return outcome, joint.known_root
 
@@ -112,13 +107,10 @@ class EliminatedSolver(Solver):
             graph.push_back(factor)
         joint: Root | None = None
 
-        def gain_ahead(values: gtsam.Values) -> float | None:
-            """As the linearised system has it; told once landmarks follow without being placed anew."""
+        def root(values: gtsam.Values) -> Root:
             nonlocal joint
-            if system.regained > _FOLLOWING * system.moved_cost:
-                return None
             joint = joint_root(template, problem.factors, values, blocks.panels(values))
-            return joint.gain() + system.gain_alone
+            return joint
 
         parameters = parameters_of(rule, InOrder(blocks.ordering()))
         outcome = optimise(
@@ -127,7 +119,7 @@ class EliminatedSolver(Solver):
             n_observations=int(problem.kept.sum()),
             stage=stage,
             on_iteration=self.on_iteration,
-            gain_ahead=gain_ahead,
+            gain_ahead=lambda values: _gain_ahead(system, lambda: root(values)),
         )
         if blocks.settle(outcome.values):
             joint = None  # it was that of another point
@@ -169,6 +161,13 @@ class _Fit:
     joint: Root | None
     """Of the whole system at the problem's values, where the iterations ended by it; the system is
     linearised there then."""
+
+
+def _gain_ahead(system: LandmarkSystem, root: Callable[[], Root]) -> float | None:
+    """As the linearised system has it; told once landmarks follow without being placed anew."""
+    if system.regained > _FOLLOWING * system.moved_cost:
+        return None
+    return root().gain() + system.gain_alone
 
 
 def _only_landmarks(problem: Problem, loss: Loss) -> tuple[Problem, Outcome]:

@@ -57,11 +57,10 @@ class Problem:
 
     def points_m(self) -> FloatArray:
         """World points (landmarks, 3), none further than where parallax tells nothing."""
-        vector = self.landmarks.vector
-        distance = np.sqrt(np.einsum("ij,ij->i", vector[:, :3], vector[:, :3]))
+        length, w = self.landmarks.length, self.landmarks.vector[:, 3]
         # Most are nearer than any limit.
-        beyond = distance * _FURTHEST_PARALLAX_SIGMAS > vector[:, 3] * _LEAST_BASELINE_M * _resolution(self)
-        furthest = np.full(len(vector), np.inf)
+        beyond = length * _FURTHEST_PARALLAX_SIGMAS > w * _LEAST_BASELINE_M * _resolution(self)
+        furthest = np.full(len(w), np.inf)
         furthest[beyond] = reach_m(self, beyond) / _FURTHEST_PARALLAX_SIGMAS
         return self.landmarks.points_m(furthest)
 

@@ -72,14 +72,7 @@ def loosened_root(problem: Problem, system: LandmarkSystem, factor: float) -> Ro
 
 def held_columns(template: FactorTemplate) -> dict[int, IntArray]:
     """By group, the columns that telemetry holds."""
-    link = template.linkage
-    out: dict[int, IntArray] = {}
-    for key, components in template.held_columns().items():
-        if len(components):
-            g = int(link.group[link.row[key]])
-            columns = link.columns_of(key).start + components
-            out[g] = np.concatenate([out.get(g, np.zeros(0, dtype=np.int64)), columns])
-    return out
+    return template.linkage.by_group(template.held_columns().items())
 
 
 def add_factors(

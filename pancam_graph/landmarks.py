@@ -117,14 +117,19 @@ class Landmarks:
     origin_m: FloatArray
     """(landmarks, 3) world point that X / w is relative to"""
 
+    @cached_property
+    def length(self) -> FloatArray:
+        """(landmarks,) of X; the distance from the origin is that over w."""
+        x = self.vector[:, :3]
+        return np.asarray(np.sqrt(np.einsum("ij,ij->i", x, x)))
+
     def points_m(self, furthest_m: FloatArray) -> FloatArray:
         """World points (landmarks, 3); those further than `furthest_m` (landmarks,) are brought to it.
 
         A landmark beyond infinity is placed at that distance too; one without a direction at its origin.
         """
         x, w = self.vector[:, :3], self.vector[:, 3]
-        distance = np.sqrt(np.einsum("ij,ij->i", x, x))
-        depth = np.maximum(w, distance / furthest_m).clip(1e-300)
+        depth = np.maximum(w, self.length / furthest_m).clip(1e-300)
         return np.asarray(self.origin_m + x / depth[:, None])
 
     def about(self, origin_m: FloatArray) -> "Landmarks":

@@ -21,7 +21,7 @@ from pancam_graph.io.cache_folder import cache_folder, is_cache
 from pancam_graph.smoother import Update
 from pancam_graph.solution import Solution
 
-__all__ = ["Parser", "Progress", "print_summary", "resumable", "run", "show_log"]
+__all__ = ["Parser", "Progress", "degrees", "print_summary", "resumable", "run", "show_log"]
 
 BAD_INPUT = 2
 INTERRUPTED = 130
@@ -38,6 +38,11 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Print one line and end with status 2."""
         self.exit(BAD_INPUT, f"{self.prog}: {message} (--help explains)\n")
+
+
+def degrees(text: str) -> float:
+    """An argument in degrees, as radians."""
+    return float(np.deg2rad(float(text)))
 
 
 def run(main: Callable[[], int]) -> NoReturn:

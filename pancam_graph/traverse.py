@@ -42,6 +42,11 @@ class Stop:
     sigma_translation_m: float
     """Standard deviation of each translation component of the prior; 0: held."""
 
+    @property
+    def sigmas(self) -> FloatArray:
+        """Standard deviations (6,) of the prior in the tangent of the pose, rotation first."""
+        return np.repeat([self.sigma_rotation_rad, self.sigma_translation_m], 3)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:

@@ -9,16 +9,10 @@ Exit status: 0 written, 2 bad input (nothing is written).
 
 from pathlib import Path
 
-import numpy as np
-
 from pancam_graph.io import write_rendering
-from pancam_graph.program import Parser, Progress, run, show_log
+from pancam_graph.program import Parser, Progress, degrees, run, show_log
 from pancam_graph.rigs import TEMPLATES, rig_template
 from pancam_graph.simulate import RenderOptions, render
-
-
-def _degrees(text: str) -> float:
-    return float(np.deg2rad(float(text)))
 
 
 def main() -> int:
@@ -34,15 +28,15 @@ def main() -> int:
     add(
         "--sweep-deg",
         dest="sweep_rad",
-        type=_degrees,
+        type=degrees,
         help="range of pan (as far as frames overlap by 20 %%)",
     )
-    add("--tilts-deg", dest="tilts_rad", type=_degrees, nargs="+", help="of each row, up positive (one row)")
+    add("--tilts-deg", dest="tilts_rad", type=degrees, nargs="+", help="of each row, up positive (one row)")
     add("--rocks", dest="rock_abundance", type=float, default=d.rock_abundance, help="share of ground (0.05)")
     add(
         "--sun-elevation-deg",
         dest="sun_elevation_rad",
-        type=_degrees,
+        type=degrees,
         default=d.sun_elevation_rad,
         help="(38)",
     )
@@ -50,7 +44,7 @@ def main() -> int:
     add("--deck", action="store_true", help="show the rover's own deck, which moves along with it")
     add("--pointing-scale", type=float, default=1.0, help="errors of pan and tilt, times the rig's (1)")
     add("--sigma-stop-m", type=float, default=d.sigma_stop_m, help="odometry's, per axis (%(default)s)")
-    add("--sigma-stop-deg", dest="sigma_stop_rad", type=_degrees, default=d.sigma_stop_rad, help="(0.57)")
+    add("--sigma-stop-deg", dest="sigma_stop_rad", type=degrees, default=d.sigma_stop_rad, help="(0.57)")
     a = vars(parser.parse_args())
     out, rig, seed, verbose = (a.pop(k) for k in ("out", "rig", "seed", "verbose"))
     show_log(verbose=verbose)

@@ -9,17 +9,10 @@ Exit status: 0 written, 2 bad input (nothing is written).
 
 from pathlib import Path
 
-import numpy as np
-
-from pancam_graph.errors import InputError
-from pancam_graph.io import write_traverse, write_truth
-from pancam_graph.program import Parser, run, show_log
+from pancam_graph.io import check_new, write_traverse, write_truth
+from pancam_graph.program import Parser, degrees, run, show_log
 from pancam_graph.rigs import TEMPLATES, rig_template
 from pancam_graph.simulate import SimulationOptions, simulate
-
-
-def _degrees(text: str) -> float:
-    return float(np.deg2rad(float(text)))
 
 
 def main() -> int:
@@ -32,24 +25,23 @@ def main() -> int:
     add("--stops", type=int, default=d.stops, help="places of the mast (%(default)s)")
     add("--spacing-m", type=float, default=d.spacing_m, help="from stop to stop (%(default)s)")
     add("--pans", type=int, help="frames per row (so many that the widest eye's overlap by 28 %%)")
-    add("--sweep-deg", dest="sweep_rad", type=_degrees, default=d.sweep_rad, help="range of pan (360)")
-    add("--tilts-deg", dest="tilts_rad", type=_degrees, nargs="+", help="of each row, up positive (two rows)")
+    add("--sweep-deg", dest="sweep_rad", type=degrees, default=d.sweep_rad, help="range of pan (360)")
+    add("--tilts-deg", dest="tilts_rad", type=degrees, nargs="+", help="of each row, up positive (two rows)")
     add("--points-per-image", type=int, default=d.points_per_image, help="density (%(default)s)")
     add("--noise-px", type=float, default=d.noise_px, help="sigma per coordinate (%(default)s)")
     add("--noise-stretch", type=float, default=1.0, help="length over width of error ellipses (1: round)")
     add("--outliers", type=float, default=d.outliers, help="share of random pixels (%(default)s)")
     add("--pointing-scale", type=float, default=1.0, help="errors of pan and tilt, times the rig's (1)")
     add("--sigma-stop-m", type=float, default=d.sigma_stop_m, help="odometry's, per axis (%(default)s)")
-    add("--sigma-stop-deg", dest="sigma_stop_rad", type=_degrees, default=d.sigma_stop_rad, help="(0.57)")
+    add("--sigma-stop-deg", dest="sigma_stop_rad", type=degrees, default=d.sigma_stop_rad, help="(0.57)")
     add("--focal-error", type=float, default=0.0, help="of the rig that the traverse claims, a share (0)")
-    add("--mount-error-deg", dest="mount_error_rad", type=_degrees, default=0.0, help="of its mounts (0)")
+    add("--mount-error-deg", dest="mount_error_rad", type=degrees, default=0.0, help="of its mounts (0)")
     add("--mount-error-m", type=float, default=0.0, help="of its mounts (0)")
     add("--radius-error-m", type=float, default=0.0, help="of its circles (0)")
     a = vars(parser.parse_args())
     out, rig, seed, verbose = (a.pop(k) for k in ("out", "rig", "seed", "verbose"))
     show_log(verbose=verbose)
-    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
-        raise InputError(f"{out}: expected a new or empty folder, found files")
+    check_new(out)
     options = SimulationOptions(**{**a, "tilts_rad": a["tilts_rad"] and tuple(a["tilts_rad"])})
     s = simulate(rig_template(rig), options, seed=seed)
     write_traverse(s.traverse, out)

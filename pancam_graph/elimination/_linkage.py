@@ -1,5 +1,6 @@
 """How camera poses hang on the variables of a graph: what a model tells the landmark blocks."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -77,6 +78,16 @@ class Linkage:
         i = self.row[key]
         begin = int(self.variable_column[i])
         return slice(begin, begin + int(self.dim[i]))
+
+    def by_group(self, components: Iterable[tuple[int, IntArray]]) -> dict[int, IntArray]:
+        """By group, the columns of components (n,) of variables, by key; only groups with any."""
+        out: dict[int, IntArray] = {}
+        for key, own in components:
+            if len(own):
+                g = int(self.group[self.row[key]])
+                columns = self.columns_of(key).start + own
+                out[g] = np.concatenate([out.get(g, np.zeros(0, dtype=np.int64)), columns])
+        return out
 
     @cached_property
     def touched(self) -> BoolArray:

@@ -15,7 +15,7 @@ from pancam_graph.graph._rig_variables import RigVariables
 from pancam_graph.landmarks import CameraViews
 from pancam_graph.sharing import Sharing
 from pancam_graph.solution import Refined, RigCorrection, State
-from pancam_graph.traverse import Stop, Traverse
+from pancam_graph.traverse import Traverse
 
 __all__ = ["FactorTemplate", "Factors", "diagonal_noise", "read_variable"]
 
@@ -121,12 +121,12 @@ class FactorTemplate(ABC):
         entry, slot = self.traverse.stops[stop], self.mast(stop)
         if not isinstance(slot, Key):
             return []
-        return [gtsam.PriorFactorPose3(slot.key, entry.world_T_mast, diagonal_noise(_stop_sigmas(entry)))]
+        return [gtsam.PriorFactorPose3(slot.key, entry.world_T_mast, diagonal_noise(entry.sigmas))]
 
     def held_of_stops(self) -> dict[int, IntArray]:
         """`held_columns` of the masts."""
         slots = [(self.mast(i), stop) for i, stop in enumerate(self.traverse.stops)]
-        return {s.key: np.flatnonzero(_stop_sigmas(stop) == 0) for s, stop in slots if isinstance(s, Key)}
+        return {s.key: np.flatnonzero(stop.sigmas == 0) for s, stop in slots if isinstance(s, Key)}
 
     def stop_covariance(self, covariance: Covariance) -> FloatArray:
         """Covariance of each mast pose (stops, 6, 6), rotation first, body frame; 0 where held."""
@@ -157,10 +157,6 @@ def _sigmas(
             block = covariance.block(int(stop[i]), int(stop[i]))[np.ix_(columns, columns)]
             sigma[i] = np.sqrt(np.einsum("ij,jk,ik->i", jacobian, block, jacobian).clip(0.0))
     return sigma
-
-
-def _stop_sigmas(stop: Stop) -> FloatArray:
-    return np.repeat([stop.sigma_rotation_rad, stop.sigma_translation_m], 3)
 
 
 def diagonal_noise(sigmas: FloatArray) -> gtsam.noiseModel.Base:

@@ -9,6 +9,7 @@ from pancam_graph.io.exports import check_exports as check_exports
 from pancam_graph.io.image_files import read_image as read_image
 from pancam_graph.io.inputs import read_input as read_input
 from pancam_graph.io.pds import read_pds as read_pds
+from pancam_graph.io.rendering import check_new as check_new
 from pancam_graph.io.rendering import write_rendering as write_rendering
 from pancam_graph.io.rendering import write_truth as write_truth
 from pancam_graph.io.results import check_out as check_out

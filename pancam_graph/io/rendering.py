@@ -12,7 +12,7 @@ from pancam_graph.io._atomic import whole_file, whole_folder
 from pancam_graph.io.traverse_json import write_traverse
 from pancam_graph.simulate import Rendering, Truth
 
-__all__ = ["write_rendering", "write_truth"]
+__all__ = ["check_new", "write_rendering", "write_truth"]
 
 _TRUTH = "truth.npz"
 
@@ -29,6 +29,12 @@ def write_truth(truth: Truth, folder: Path) -> None:
     whole_file(folder / _TRUTH, content.getvalue())
 
 
+def check_new(folder: Path) -> None:
+    """Raise InputError unless a folder is new or empty."""
+    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+        raise InputError(f"{folder}: expected a new or empty folder, found files")
+
+
 def write_rendering(
     rendering: Rendering, folder: Path | str, *, progress: Callable[[int, int], None] | None = None
 ) -> None:
@@ -38,8 +44,7 @@ def write_rendering(
     written, and how many there are. Raises InputError unless `folder` is new or empty.
     """
     folder = Path(folder)
-    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
-        raise InputError(f"{folder}: expected a new or empty folder, found files")
+    check_new(folder)
     images = rendering.traverse.images
     with whole_folder(folder) as partial:
         for row, image in enumerate(images):

@@ -12,7 +12,7 @@ from pancam_graph.geometry import FloatArray, pose_arrays
 from pancam_graph.report._look import AFTER, BEFORE, REJECTED, axis, layout
 from pancam_graph.report._map import ellipse_outlines, translation_covariance_in_world
 from pancam_graph.report._numbers import Json, polyline, rounded
-from pancam_graph.report._packed import packed, packed_plotly
+from pancam_graph.report._packed import HEAD, UNPACKED, packed, packed_plotly
 from pancam_graph.report._style import STYLE
 from pancam_graph.simulate import Simulation
 from pancam_graph.smoother import TraverseSmoother, Update
@@ -125,6 +125,7 @@ def _page(steps: Sequence[DriveStep], simulation: Simulation) -> str:
     loops = [c for step in steps for c in step.update.closures]
     closed = ", ".join(f"{c.stop} sees {c.other} again" for c in loops if c.accepted) or "none"
     return _PAGE.format(
+        unpacked=UNPACKED,
         title=escape(f"Drive of {len(steps)} stops, {simulation.traverse.name}"),
         style=STYLE + "\n#map { height: 600px; } #errors { height: 600px; } #at { width: 420px; }",
         lead=escape(f"At the end: {last.summary}. Loop closures: {closed}."),
@@ -176,21 +177,9 @@ def _trace(name: str, position_m: FloatArray, **more: object) -> Json:
     }
 
 
-_PAGE = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta http-equiv="Content-Security-Policy" content="default-src 'none'; style-src 'unsafe-inline';
-script-src 'unsafe-inline' 'unsafe-eval'; img-src data: blob:; connect-src data: blob:">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-<style>{style}</style>
-</head>
-<body>
-<header>
-<h1>{title}</h1>
-<p class="lead">{lead}</p>
-</header>
+_PAGE = (
+    HEAD
+    + """</header>
 <div class="controls"><button id="play">Play</button>
 <label>Stop <input id="at" type="range" min="1" max="{n}" value="{n}"></label><span id="note"></span></div>
 <div class="pair">
@@ -203,11 +192,7 @@ the estimate has not.</p></section>
 <script type="text/plain" id="packed-figures">{figures}</script>
 <script>
 "use strict";
-async function unpacked(id) {{
-  const packed = Uint8Array.from(atob(document.getElementById(id).textContent), (c) => c.charCodeAt(0));
-  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
-  return new Response(stream).text();
-}}
+{unpacked}
 (async () => {{
   (0, eval)(await unpacked("packed-plotly"));
   const page = JSON.parse(await unpacked("packed-figures"));
@@ -238,3 +223,4 @@ async function unpacked(id) {{
 </body>
 </html>
 """
+)

@@ -1,4 +1,4 @@
-"""What a page carries inside: text compressed and in letters."""
+"""How every page begins, and what it carries inside: text compressed and in letters."""
 
 import base64
 import gzip
@@ -6,7 +6,30 @@ from functools import lru_cache
 
 from plotly.offline import get_plotlyjs
 
-__all__ = ["packed", "packed_plotly"]
+__all__ = ["HEAD", "UNPACKED", "packed", "packed_plotly"]
+
+HEAD = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; style-src 'unsafe-inline';
+script-src 'unsafe-inline' 'unsafe-eval'; img-src data: blob:; connect-src data: blob:">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{title}</title>
+<style>{style}</style>
+</head>
+<body>
+<header>
+<h1>{title}</h1>
+<p class="lead">{lead}</p>
+"""
+"""To be filled with a title, a style and a sentence that leads in."""
+UNPACKED = """async function unpacked(id) {
+  const packed = Uint8Array.from(atob(document.getElementById(id).textContent), (c) => c.charCodeAt(0));
+  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
+  return new Response(stream).text();
+}"""
+"""The script that undoes `packed`, of the element with an id."""
 
 
 def packed(text: str) -> str:

@@ -1,18 +1,19 @@
 """The script of the page: unpacks Plotly and the figures, draws, and sorts tables."""
 
+from pancam_graph.report._packed import UNPACKED
+
 __all__ = ["SCRIPT"]
 
-SCRIPT = r"""
+SCRIPT = (
+    r"""
 "use strict";
 // Nothing leaves this page: Plotly's button that uploads a chart is taken away.
 const config = { displaylogo: false, responsive: true, showSendToCloud: false, plotlyServerURL: "",
   modeBarButtonsToRemove: ["sendChartToCloud", "select2d", "lasso2d", "resetCameraLastSave3d"] };
 
-async function unpacked(id) {
-  const packed = Uint8Array.from(atob(document.getElementById(id).textContent), (c) => c.charCodeAt(0));
-  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
-  return new Response(stream).text();
-}
+"""
+    + UNPACKED
+    + r"""
 
 function filled(select, names) {
   names.forEach((name, row) => select.add(new Option(name, String(row))));
@@ -158,3 +159,4 @@ function sayFailed(place, error) {
   }
 })();
 """
+)

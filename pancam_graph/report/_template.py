@@ -1,5 +1,7 @@
 """The frame of the page, and the controls of its figures."""
 
+from pancam_graph.report._packed import HEAD
+
 __all__ = ["NO_VECTORS", "PAGE", "RIG", "SCENE_CONTROLS", "VECTOR_CONTROLS"]
 
 SCENE_CONTROLS = (
@@ -23,21 +25,9 @@ RIG = """<section>
 images said nothing of the entry.</p>
 </section>
 """
-PAGE = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta http-equiv="Content-Security-Policy" content="default-src 'none'; style-src 'unsafe-inline';
-script-src 'unsafe-inline' 'unsafe-eval'; img-src data: blob:; connect-src data: blob:">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-<style>{style}</style>
-</head>
-<body>
-<header>
-<h1>{title}</h1>
-<p class="lead">{lead}</p>
-{warnings}
+PAGE = (
+    HEAD
+    + """{warnings}
 <dl class="figures">
 {headline}
 </dl>
@@ -88,3 +78,4 @@ upwards. All conventions: <code>docs/conventions.md</code> of pancam_graph.</li>
 </body>
 </html>
 """
+)

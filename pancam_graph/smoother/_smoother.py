@@ -173,8 +173,7 @@ class TraverseSmoother:
                 f"stop {stop.id}: expected sigmas above 0, of the motion from {other.id}; found "
                 f"{stop.sigma_rotation_rad} and {stop.sigma_translation_m}"
             )
-        sigmas = np.repeat([stop.sigma_rotation_rad, stop.sigma_translation_m], 3)
-        noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+        noise = gtsam.noiseModel.Diagonal.Sigmas(stop.sigmas)
         if previous.mast is None:
             station.motion = gtsam.PriorFactorPose3(station.mast, stop.world_T_mast, noise)
         else:

@@ -113,8 +113,7 @@ class Station:
             out.append(self.motion)
         elif self.mast is not None:
             stop = t.stops[0]
-            sigmas = np.repeat([stop.sigma_rotation_rad, stop.sigma_translation_m], 3)
-            out.append(gtsam.PriorFactorPose3(self.mast, stop.world_T_mast, _noise(sigmas, firm=firm)))
+            out.append(gtsam.PriorFactorPose3(self.mast, stop.world_T_mast, _noise(stop.sigmas, firm=firm)))
         return out + self.other_priors(firm=firm)
 
     def other_priors(self, *, firm: bool) -> list[gtsam.NonlinearFactor]:
@@ -247,14 +246,12 @@ class Patch:
 
     def held_columns(self) -> dict[int, IntArray]:
         """By group, the columns that telemetry holds."""
-        link, out = self.linkage, dict[int, IntArray]()
-        for station in self.stations:
-            for key, components in station.template.held_columns().items():
-                name = station.global_key[key]
-                if len(components) and name in link.row:
-                    g, columns = int(link.group[link.row[name]]), link.columns_of(name).start + components
-                    out[g] = np.concatenate([out.get(g, np.zeros(0, dtype=np.int64)), columns])
-        return out
+        return self.linkage.by_group(
+            (station.global_key[key], components)
+            for station in self.stations
+            for key, components in station.template.held_columns().items()
+            if station.global_key[key] in self.linkage.row
+        )
 
     def image(self, image: IntArray, station: IntArray) -> IntArray:
         """Rows among the patch's images, of images (n,) of the whole drive that are of stations (n,)."""
