@@ -93,12 +93,13 @@ class Measurements:
         return float(np.median(1 / np.sqrt(np.abs(w[:, 0, 0] * w[:, 1, 1] - w[:, 0, 1] * w[:, 1, 0]))))
 
     def part(self, rows: IntArray) -> "Measurements":
-        """Rows of whole landmarks, these numbered anew without gaps."""
+        """Rows of whole landmarks, ascending; landmarks numbered anew without gaps."""
+        landmark = self.landmark[rows]
         return replace(
             self,
             row=self.row[rows],
             image=self.image[rows],
-            landmark=np.unique(self.landmark[rows], return_inverse=True)[1],
+            landmark=np.cumsum(np.diff(landmark, prepend=landmark[:1]) > 0),
             uv_px=self.uv_px.take(rows, axis=0),
             whitening=self.whitening.take(rows, axis=0),
         )

@@ -1,18 +1,32 @@
 """Ranges of items over all cores, for compiled loops that release the interpreter's lock."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from functools import cache
+from threading import local
+from typing import TypeVar
 
 from threadpoolctl import ThreadpoolController
 
 from pancam_graph.errors import InputError
 
-__all__ = ["blas_on_one_thread", "in_parallel", "n_workers"]
+__all__ = ["blas_on_one_thread", "each", "in_parallel", "n_workers"]
 
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
 _VARIABLE = "PANCAM_GRAPH_THREADS"
+
+
+class _Thread(local):
+    """What each thread knows of itself."""
+
+    is_busy = False
+    """Whether it works on one of several ranges."""
+
+
+_THREAD = _Thread()
 
 
 def n_workers() -> int:
@@ -34,28 +48,43 @@ def in_parallel(function: Callable[[int, int], None], n: int, *, grain: int) -> 
     """Call function(begin, end) over consecutive ranges of 0 to n, of about `grain` items each.
 
     The ranges depend on n and the grain alone, never on the number of threads; each item is in one of them.
-    Where there is one range, or one thread, everything runs in the caller's. The function must not call this
-    one. Raises the exception of the first range that failed, when no range runs any more.
+    Where there is one range, or one thread, everything runs in the caller's; so does what one of several
+    ranges calls this for. Raises the exception of the first range that failed, when no range runs any more.
     """
     n_ranges = max(min(n, 1), round(n / grain))
     ranges = [(n * i // n_ranges, n * (i + 1) // n_ranges) for i in range(n_ranges)]
     waiting, failed = iter(enumerate(ranges)), dict[int, Exception]()
 
+    # Threads that wait for threads of the same pool would wait for ever.
+    workers = 1 if n_ranges == 1 or _THREAD.is_busy else n_workers()
+
     def drain() -> None:
+        was_busy, _THREAD.is_busy = _THREAD.is_busy, workers > 1 or _THREAD.is_busy
         for i, (begin, end) in waiting:  # drawn under the interpreter's lock: each range once
             try:
                 function(begin, end)
             except Exception as error:  # noqa: PERF203  a range is worth far more than a try
                 failed[i] = error  # raised below, in the caller's thread
+        _THREAD.is_busy = was_busy
 
     # The caller works too: to wake one thread less is a good part of a small range's time.
-    workers = n_workers()
     others = [_pool(workers).submit(drain) for _ in range(min(workers, len(ranges)) - 1)]
     drain()
     for other in others:
         other.result()  # cheaper than waiting for all at once
     if failed:
         raise failed[min(failed)]
+
+
+def each(function: Callable[[_Item], _Result], items: Sequence[_Item]) -> list[_Result]:
+    """function(item) of all items, in their order; each is a range of its own of `in_parallel`."""
+    made = dict[int, _Result]()
+
+    def make(first: int, last: int) -> None:
+        made.update((i, function(items[i])) for i in range(first, last))
+
+    in_parallel(make, len(items), grain=1)
+    return [made[i] for i in range(len(items))]
 
 
 def blas_on_one_thread() -> AbstractContextManager[object]:

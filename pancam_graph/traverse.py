@@ -286,11 +286,14 @@ def _require_observations(obs: Observations, n_images: int) -> None:
             f"{mean[np.argmax(other)]:.6g}, the root of the mean variance in covariance_px2, or no sigma_px"
         )
         _require_rows("sigma_px", right, other, sigma_px)
-    pairs = np.unique(np.column_stack([obs.image, obs.track]), axis=0, return_counts=True)
-    if (pairs[1] > 1).any():
-        image, track = pairs[0][pairs[1] > 1][0]
+    order = np.lexsort((obs.track, obs.image))
+    image, track = obs.image[order], obs.track[order]
+    twice = (image[1:] == image[:-1]) & (track[1:] == track[:-1])
+    if twice.any():
+        row = int(np.argmax(twice))
         raise InputError(
-            f"observations: expected an image to see a track once, found image {image}, track {track} twice"
+            f"observations: expected an image to see a track once, found image {image[row]}, "
+            f"track {track[row]} twice"
         )
 
 

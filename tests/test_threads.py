@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pancam_graph.errors import InputError
-from pancam_graph.threads import in_parallel, n_workers
+from pancam_graph.threads import each, in_parallel, n_workers
 
 
 def ranges_of(n: int, grain: int) -> list[tuple[int, int]]:
@@ -73,3 +73,26 @@ def test_a_forked_process_starts_threads_of_its_own(monkeypatch) -> None:
     child.kill()
     assert not hangs
     assert child.exitcode == 0
+
+
+@pytest.mark.parametrize("threads", ["1", "2"])
+def test_ranges_within_ranges_run_in_the_thread_of_the_outer_one(monkeypatch, threads) -> None:
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", threads)
+    ran = []
+
+    def outer(begin: int, end: int) -> None:
+        own = threading.current_thread()
+        in_parallel(lambda a, b: ran.append((begin, a, threading.current_thread() is own)), 4, grain=1)
+
+    in_parallel(outer, 6, grain=1)
+    assert sorted(ran) == [(i, j, True) for i in range(6) for j in range(4)]
+    # And when all is done, ranges are for all threads again.
+    if threads == "2":
+        both = threading.Barrier(2, timeout=10)
+        in_parallel(lambda begin, end: both.wait() and None, 2, grain=1)
+
+
+def test_each_keeps_the_order(monkeypatch) -> None:
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", "2")
+    assert each(lambda x: 10 * x, [3, 1, 2]) == [30, 10, 20]
+    assert each(lambda x: x, []) == []

@@ -103,5 +103,5 @@ def blocks_of(linkage: Linkage, m: Measurements) -> tuple[IntArray, dict[int, tu
     seen[first[m.landmark], m.image] = True
     return first, {
         int(b): tuple(sorted(set().union(*(groups[i] for i in np.flatnonzero(seen[b])))))
-        for b in np.unique(first)
+        for b in np.flatnonzero(seen.any(axis=1))
     }

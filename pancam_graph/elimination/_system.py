@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from threading import local
 from typing import TypeVar
 
 import numpy as np
@@ -59,11 +60,21 @@ class _Chunk:
     end: int
 
 
-class Room:
-    """Memory that systems linearised in turn may share: to get it anew takes as long as to fill it."""
+class Room(local):
+    """Memory that systems linearised in turn may share: to get it anew takes as long as to fill it.
+
+    Each thread has its own, so that systems may also be linearised at once.
+    """
 
     def __init__(self) -> None:
-        self.numbers = np.empty(0)
+        self._numbers = np.empty(0)
+
+    def numbers(self, n: int) -> FloatArray:
+        """(n,) numbers, whatever they were before."""
+        if len(self._numbers) < n:
+            # Twice as much as there was: what grows little by little is not all got anew each time.
+            self._numbers = np.empty(max(n, 2 * len(self._numbers)))
+        return self._numbers[:n]
 
 
 _Wave = list[_Chunk]
@@ -179,9 +190,10 @@ class LandmarkSystem:
         sights.occurrence_begin[occurrences] = n_obs
         sights.place_begin[occurrences] = places
         sights.landmark_begin[n], sights.pair_begin[n] = occurrences, pairs
+        in_order = np.array_equal(rows, np.arange(n_obs))
         self.sights = sights._replace(
-            uv_px=m.uv_px.take(rows, axis=0),  # several times as fast as an index
-            whitening=m.whitening.take(rows, axis=0),
+            uv_px=m.uv_px if in_order else m.uv_px.take(rows, axis=0),  # several times as fast as an index
+            whitening=m.whitening if in_order else m.whitening.take(rows, axis=0),
             occurrence_begin=sights.occurrence_begin[: occurrences + 1].copy(),
             occurrence_unit=sights.occurrence_unit[:occurrences].copy(),
             occurrence_row=sights.occurrence_row[:occurrences].copy(),
@@ -298,10 +310,7 @@ class LandmarkSystem:
     def _room(self, wave: list[_Chunk]) -> _Systems:
         """A dense system (S, s) for each chunk of a wave, in memory that is used again."""
         dims = [len(self.blocks[chunk.block].row) for chunk in wave]
-        need = sum(n * n + n for n in dims)
-        memory = self._memory.numbers
-        if len(memory) < need:
-            memory = self._memory.numbers = np.empty(need)
+        memory = self._memory.numbers(sum(n * n + n for n in dims))
         out, begin = [], 0
         for n in dims:
             out.append((memory[begin : begin + n * n], memory[begin + n * n :][:n]))

@@ -10,6 +10,7 @@ from pancam_graph.geometry import FloatArray, IntArray
 from pancam_graph.smoother._localise import localise
 from pancam_graph.smoother._map import DriveMap
 from pancam_graph.smoother._options import Closure, SmootherOptions
+from pancam_graph.smoother._sets import distinct
 from pancam_graph.smoother._station import Station
 
 __all__ = ["Loop", "bridge", "judged", "loops"]
@@ -40,7 +41,7 @@ def loops(drive: DriveMap, rows: IntArray) -> list[Loop]:
     """Rows that see known tracks far off, by station and by the part of the drive that they belong to."""
     out = []
     of_station = drive.station_of(rows)
-    for number in np.unique(of_station)[::-1].tolist():
+    for number in distinct(of_station)[::-1].tolist():
         own = rows[of_station == number]
         while len(own):
             home = drive.home(drive.ledger.track[own])
@@ -57,9 +58,9 @@ def loops(drive: DriveMap, rows: IntArray) -> list[Loop]:
 
 def _anchor(drive: DriveMap, rows: IntArray, number: int) -> int:
     """The station that shares most of the tracks of these rows with another."""
-    track, votes = np.unique(drive.ledger.track[rows]), np.zeros(len(drive.stations), dtype=np.int64)
+    track, votes = distinct(drive.ledger.track[rows]), np.zeros(len(drive.stations), dtype=np.int64)
     home = drive.home(track)
-    for name in np.unique(home).tolist():
+    for name in distinct(home).tolist():
         placed = drive.blocks[name].placed
         m = placed.measurements
         shared = np.isin(placed.track, track)[m.landmark]
@@ -80,7 +81,7 @@ def judged(
     station = loop.station
     here = station.world_T_mast(values)
     known = covariance + np.diag(_LEAST_SIGMAS**2)
-    track, rows = np.unique(drive.ledger.track[loop.rows]), loop.rows
+    track, rows = distinct(drive.ledger.track[loop.rows]), loop.rows
     stride = max(1, len(rows) // _ENOUGH)
     track = track[::stride]
     rows = rows[np.isin(drive.ledger.track[rows], track)]

@@ -13,6 +13,7 @@ from pancam_graph.smoother._map import Change, DriveMap
 from pancam_graph.smoother._options import SmootherOptions
 from pancam_graph.smoother._station import Postures, Station
 from pancam_graph.smoother._tree import Tree
+from pancam_graph.threads import each
 
 __all__ = ["Engine", "Rounds"]
 
@@ -148,12 +149,16 @@ class Engine:
         affected = touched | {b for b, block in blocks.items() if not moving.isdisjoint(block.keys)}
         at = Postures(self._tree.next_theta(theta, moving))
         for b in sorted(affected):
-            block = blocks[b]
+            removed += [blocks[b].slot] * (blocks[b].slot >= 0)
+            for postures in (estimate, at):
+                postures.of_all(blocks[b].patch.stations)
+
+        def linearise(b: int) -> None:
             if b not in touched:
-                block.settle(estimate)
-            if block.slot >= 0:
-                removed.append(block.slot)
-            block.linearise(at, values, self._unit)
+                blocks[b].settle(estimate)
+            blocks[b].linearise(at, values, self._unit)
+
+        each(linearise, sorted(affected))
         return affected
 
     def _to_move(self, unlike: set[int]) -> set[int]:
@@ -189,8 +194,10 @@ class Engine:
     def restart(self, values: gtsam.Values) -> None:
         """A new tree of all factors, linearised at these values, where landmarks are already."""
         self._tree, self._bent, theta = Tree(), [], Postures(values)
-        for block in self._drive.blocks.values():
-            block.linearise(theta, values, self._unit)
+        blocks = list(self._drive.blocks.values())
+        for block in blocks:
+            theta.of_all(block.patch.stations)
+        each(lambda block: block.linearise(theta, values, self._unit), blocks)
         factors = self._drive.factors(firm=False)
         self._priors = gtsam.NonlinearFactorGraph()
         for factor in factors:
@@ -216,10 +223,12 @@ class Engine:
 
     def _evaluate(self, affected: set[int]) -> tuple[set[int], float]:
         """Blocks that are less linear than they were taken for, and the cost of everything."""
-        estimate, unlike = Postures(self._tree.estimate), set()
-        for b, block in self._drive.blocks.items():
+        estimate, unlike, blocks = Postures(self._tree.estimate), set(), self._drive.blocks
+        for b in affected:
+            estimate.of_all(blocks[b].patch.stations)
+        each(lambda b: blocks[b].follow(estimate), sorted(affected))
+        for b, block in blocks.items():
             if b in affected:
-                block.follow(estimate)
                 if abs(block.cost - block.modelled_cost(estimate.values)) > _UNLIKE:
                     unlike.add(b)
             else:

@@ -1,5 +1,6 @@
 """What a drive consists of: stations, observations, landmarks in blocks by the stop that saw them first."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import gtsam
@@ -11,7 +12,9 @@ from pancam_graph.landmarks import Landmarks, residuals
 from pancam_graph.smoother._block import LandmarkBlock
 from pancam_graph.smoother._ledger import Fate, Ledger
 from pancam_graph.smoother._placing import Placed, Seen, believed, combined, gathered, placed_anew
+from pancam_graph.smoother._sets import distinct
 from pancam_graph.smoother._station import Patch, Postures, Station
+from pancam_graph.threads import each
 
 __all__ = ["Change", "DriveMap"]
 
@@ -25,6 +28,18 @@ class Change:
     slots: list[int] = field(default_factory=list)
     """Factors of iSAM2 whose blocks are no more."""
     rejected: int = 0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Rebuilt:
+    """A block made anew."""
+
+    seen: Seen
+    """All that it might have, and what of that is believed."""
+    stays: BoolArray
+    """(landmarks,) that have two observations or more"""
+    block: LandmarkBlock | None
+    """Of those; None: there are none."""
 
 
 class DriveMap:
@@ -75,9 +90,9 @@ class DriveMap:
         order = np.argsort(track)
         self._track, self._home = track[order], home[order]
         of_row = self.home(self.ledger.track[used])
-        for name in np.unique(home).tolist():
+        for name in distinct(home).tolist():
             rows, own = used[of_row == name], home == name
-            numbers = np.unique(self.station_of(rows))
+            numbers = distinct(self.station_of(rows))
             patch = Patch([self.stations[i] for i in numbers])
             placed = gathered(self.ledger, self.image_station, patch, None, rows, none).placed
             at = np.flatnonzero(own)[np.argsort(track[own])]
@@ -92,7 +107,7 @@ class DriveMap:
     def near_blocks(self, track: IntArray) -> set[int]:
         """Stations of the blocks that tracks are of."""
         home = self.home(track)
-        return {s for name in np.unique(home[home >= 0]).tolist() for s in self.blocks[name].patch.place}
+        return {s for name in distinct(home[home >= 0]).tolist() for s in self.blocks[name].patch.place}
 
     def take_in(self, rows: IntArray, cameras: Postures, change: Change, but: IntArray) -> None:
         """Landmarks get observations, or are born of them; what waited for a second ray takes part too.
@@ -100,13 +115,13 @@ class DriveMap:
         `but` are rows that shall go on waiting.
         """
         ledger = self.ledger
-        track = np.unique(ledger.track[rows])
-        rows = np.union1d(rows, np.setdiff1d(self.idle(track, Fate.WAITING, Fate.OUTLIER), but))
+        track = distinct(ledger.track[rows])
+        rows = distinct(rows, np.setdiff1d(self.idle(track, Fate.WAITING, Fate.OUTLIER), but))
         # What was rejected about here may be judged too early: it is looked at again.
         around = self.near_blocks(track) | set(self.station_of(rows).tolist())
         out = ledger.all_with(Fate.OUTLIER)
-        rows = np.union1d(rows, out[np.isin(self.station_of(out), list(around))])
-        track = np.unique(ledger.track[rows])
+        rows = distinct(rows, out[np.isin(self.station_of(out), list(around))])
+        track = distinct(ledger.track[rows])
         own, station = np.searchsorted(track, ledger.track[rows]), self.station_of(rows)
         home = self.home(track)
         known = home >= 0
@@ -115,17 +130,20 @@ class DriveMap:
         np.minimum.at(first, own, station)
         home = np.where(known, home, np.where(enough, first, -1))
         of_row = home[own]
-        for name in np.unique(of_row[of_row >= 0]).tolist():
-            self._rebuild(name, rows[of_row == name], np.zeros(0, dtype=np.int64), cameras, change)
+        self._rebuild(
+            [(name, rows[of_row == name], rows[:0]) for name in distinct(of_row[of_row >= 0]).tolist()],
+            cameras,
+            change,
+        )
 
     def give_up(self, rows: IntArray, cameras: Postures, change: Change) -> None:
         """Landmarks lose observations, whose fate is set; others that these had ruled out may come back."""
         ledger = self.ledger
-        track = np.unique(ledger.track[rows])
+        track = distinct(ledger.track[rows])
         idle = self.idle(track, Fate.OUTLIER)
         home, home_idle = self.home(ledger.track[rows]), self.home(ledger.track[idle])
-        for name in np.unique(home[home >= 0]).tolist():
-            self._rebuild(name, idle[home_idle == name], rows[home == name], cameras, change)
+        names = distinct(home[home >= 0]).tolist()
+        self._rebuild([(b, idle[home_idle == b], rows[home == b]) for b in names], cameras, change)
 
     def drop_behind(self, cameras: Postures, change: Change) -> None:
         """Landmarks lose observations of cameras that they have come to lie behind of."""
@@ -145,45 +163,62 @@ class DriveMap:
             if len(lost):
                 self.ledger.set_fate(lost, Fate.OUTLIER)
                 change.rejected += len(lost)
-                self._rebuild(name, lost[:0], lost, cameras, change)
+                self._rebuild([(name, lost[:0], lost)], cameras, change)
             else:  # found in front after all
                 block.replace(placed)
                 change.touched.add(name)
 
-    def _rebuild(self, name: int, rows: IntArray, lost: IntArray, cameras: Postures, change: Change) -> None:
-        ledger, block = self.ledger, self.blocks.pop(name, None)
-        before = () if block is None else block.patch.stations
-        more = np.setdiff1d(self.station_of(rows), [s.number for s in before])
-        patch = (
-            Patch([*before, *(self.stations[i] for i in more)]) if len(more) or block is None else block.patch
-        )
-        known = None if block is None else block.placed
-        if block is not None and block.slot >= 0:
-            change.slots.append(block.slot)
-        seen = gathered(ledger, self.image_station, patch, known, rows, lost)
-        if len(seen.placed.track):
-            views = patch.views(cameras)
-            seen = believed(placed_anew(seen, views), views, self._outlier_sigma)
-            self._settle(name, seen, change)
-        change.touched.discard(name)
-        if name in self.blocks:
-            change.touched.add(name)
+    def _rebuild(
+        self, parts: Sequence[tuple[int, IntArray, IntArray]], cameras: Postures, change: Change
+    ) -> None:
+        """Make blocks anew: of each its name, the rows that it gets, and those that it loses."""
+        names: list[int] = []
+        work: list[tuple[Placed | None, Patch, IntArray, IntArray]] = []
+        for name, rows, lost in parts:
+            block = self.blocks.pop(name, None)
+            before = () if block is None else block.patch.stations
+            more = np.setdiff1d(self.station_of(rows), [s.number for s in before])
+            patch = Patch([*before, *(self.stations[i] for i in more)])
+            if block is not None:
+                patch = patch if len(more) else block.patch
+                if block.slot >= 0:
+                    change.slots.append(block.slot)
+            cameras.of_all(patch.stations)
+            names.append(name)
+            work.append((None if block is None else block.placed, patch, rows, lost))
+        for name, made in zip(names, each(lambda one: self._rebuilt(*one, cameras), work), strict=True):
+            self._settle(name, made, change)
 
-    def _settle(self, name: int, seen: Seen, change: Change) -> None:
-        """Say what became of observations, and make the block of what is left."""
-        placed, accepted, ledger = seen.placed, seen.accepted, self.ledger
-        m = placed.measurements
-        stays = np.bincount(m.landmark, accepted, minlength=m.n_landmarks) >= 2
-        used = accepted & stays[m.landmark]
-        before = ledger.fate[m.row]
-        ledger.fate[m.row] = np.where(
-            used, int(Fate.USED), np.where(accepted, int(Fate.WAITING), int(Fate.OUTLIER))
-        )
-        change.rejected += int(np.sum(~accepted & (before != int(Fate.OUTLIER))))
-        self._set_home(placed.track[~stays], -1)
-        self._set_home(placed.track[stays], name)
+    def _rebuilt(
+        self, known: Placed | None, patch: Patch, rows: IntArray, lost: IntArray, cameras: Postures
+    ) -> "_Rebuilt":
+        """What becomes of a block; nothing else changes yet."""
+        seen = gathered(self.ledger, self.image_station, patch, known, rows, lost)
+        if not len(seen.placed.track):
+            return _Rebuilt(seen=seen, stays=np.zeros(0, dtype=bool), block=None)
+        views = patch.views(cameras)
+        seen = believed(placed_anew(seen, views), views, self._outlier_sigma)
+        placed, m = seen.placed, seen.placed.measurements
+        stays = np.bincount(m.landmark, seen.accepted, minlength=m.n_landmarks) >= 2
+        used = seen.accepted & stays[m.landmark]
+        block = None
         if stays.any():
-            self.blocks[name] = LandmarkBlock(placed.part(stays, used), self._room)
+            block = LandmarkBlock(placed if used.all() else placed.part(stays, used), self._room)
+        return _Rebuilt(seen=seen, stays=stays, block=block)
+
+    def _settle(self, name: int, made: "_Rebuilt", change: Change) -> None:
+        """Say what became of observations, and take the block of what is left."""
+        placed, accepted, fate = made.seen.placed, made.seen.accepted, self.ledger.fate
+        m = placed.measurements
+        idle = np.where(accepted, int(Fate.WAITING), int(Fate.OUTLIER))
+        change.rejected += int(np.sum(~accepted & (fate[m.row] != int(Fate.OUTLIER))))
+        fate[m.row] = np.where(accepted & made.stays[m.landmark], int(Fate.USED), idle)
+        self._set_home(placed.track[~made.stays], -1)
+        self._set_home(placed.track[made.stays], name)
+        change.touched.discard(name)
+        if made.block is not None:
+            self.blocks[name] = made.block
+            change.touched.add(name)
 
     def _set_home(self, track: IntArray, name: int) -> None:
         at = np.searchsorted(self._track, track)
@@ -197,7 +232,7 @@ class DriveMap:
     def seen_from(self, track: IntArray, stations: set[int]) -> BoolArray:
         """(n,) whether known tracks are seen from any of some stations; False of unknown ones."""
         out, home = np.zeros(len(track), dtype=bool), self.home(track)
-        for name in np.unique(home[home >= 0]).tolist():
+        for name in distinct(home[home >= 0]).tolist():
             block, own = self.blocks[name], np.flatnonzero(home == name)
             if block.patch.place.keys() <= stations:
                 out[own] = True
@@ -215,12 +250,12 @@ class DriveMap:
         """Some tracks (ascending) with all their observations, and new rows, as if one station moved."""
         home = self.home(track)
         parts = []
-        for name in np.unique(home[home >= 0]).tolist():
+        for name in distinct(home[home >= 0]).tolist():
             placed = self.blocks[name].placed
             which = np.isin(placed.track, track, assume_unique=True)
             parts.append(placed.part(which, which[placed.measurements.landmark]))
         images = [p.measurements.row for p in parts]
-        numbers = np.unique(np.concatenate([self.station_of(r) for r in (rows, *images)]))
+        numbers = distinct(np.concatenate([self.station_of(r) for r in (rows, *images)]))
         stations = [self.stations[i] for i in numbers if i != free.number]
         patch = Patch([*stations, free], free)
         known = combined(self.ledger, self.image_station, patch, parts) if parts else None

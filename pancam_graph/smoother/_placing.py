@@ -18,6 +18,7 @@ from pancam_graph.landmarks import (
     triangulate,
 )
 from pancam_graph.smoother._ledger import Fate, Ledger
+from pancam_graph.smoother._sets import distinct
 from pancam_graph.smoother._station import Patch
 
 __all__ = ["Placed", "Seen", "believed", "combined", "gathered", "placed_anew"]
@@ -114,14 +115,14 @@ def gathered(
 
     Rows that are outliers take part as such.
     """
-    new, gone = ledger.track[rows], np.unique(ledger.track[lost])
+    new, gone = ledger.track[rows], distinct(ledger.track[lost])
     if known is not None and len(lost):
         stay = ~np.isin(known.measurements.row, lost)
         left = np.bincount(known.measurements.landmark, stay, minlength=len(known.track)) > 0
         known = known.part(left, stay) if left.any() else None
     none = np.zeros(0, dtype=np.int64)
     old_track = none if known is None else known.track
-    track = np.union1d(old_track, new)
+    track = distinct(old_track, new)
     at = np.searchsorted(track, old_track)
     old = none if known is None else known.measurements.row
     old_landmark = none if known is None else at[known.measurements.landmark]

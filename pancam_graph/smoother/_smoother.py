@@ -23,6 +23,7 @@ from pancam_graph.smoother._localise import localise
 from pancam_graph.smoother._map import Change, DriveMap
 from pancam_graph.smoother._options import Closure, Estimate, SmootherOptions, Update
 from pancam_graph.smoother._placing import Seen
+from pancam_graph.smoother._sets import distinct
 from pancam_graph.smoother._state import SmootherState
 from pancam_graph.smoother._station import Postures, Station, copied
 from pancam_graph.threads import blas_on_one_thread
@@ -293,13 +294,13 @@ class TraverseSmoother:
         track, station = ledger.track[rows], drive.station_of(rows)
         is_near = np.zeros(len(rows), dtype=bool)
         unknown = drive.home(track) < 0
-        waiting = drive.idle(np.unique(track[unknown]), Fate.WAITING)
+        waiting = drive.idle(distinct(track[unknown]), Fate.WAITING)
         names, own = np.unique(ledger.track[waiting], return_inverse=True)
         first = np.full(len(names), len(drive.stations))
         np.minimum.at(first, own, drive.station_of(waiting))
         first_of = np.full(len(rows), -1)
         first_of[unknown] = first[np.searchsorted(names, track[unknown])]
-        for number in np.unique(station).tolist():
+        for number in distinct(station).tolist():
             mine = station == number
             near = around.get(number) or drive.near(number)
             is_near[mine & ~unknown] = drive.seen_from(track[mine & ~unknown], near)
@@ -402,10 +403,10 @@ class TraverseSmoother:
                     f"{why}"
                 )
         # A place that a stop sees twice or more, and is not the one that the track has elsewhere.
-        astray = drive.idle(np.unique(ledger.track[rows]), Fate.OUTLIER)
+        astray = drive.idle(distinct(ledger.track[rows]), Fate.OUTLIER)
         pairs = np.column_stack([ledger.track[astray], drive.station_of(astray)])
         pairs, counts = np.unique(pairs, axis=0, return_counts=True)
-        track = np.unique(pairs[counts >= 2, 0])
+        track = distinct(pairs[counts >= 2, 0])
         if len(track):
             names = [str(t) for t in track]
             out.append(

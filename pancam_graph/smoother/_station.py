@@ -154,6 +154,10 @@ class Postures:
             found = self._of[station.number] = station.template.posture(station.local(self.values))
         return found
 
+    def of_all(self, stations: Iterable[Station]) -> list[Posture]:
+        """The postures of stations. What threads are to read at once is worked out by this before."""
+        return [self.of(station) for station in stations]
+
     def moved(self, station: Station, own: gtsam.Values) -> "Postures":
         """The same with one station's own variables elsewhere."""
         values = gtsam.Values(self.values)
@@ -226,7 +230,7 @@ class Patch:
 
     def posture(self, postures: Postures) -> Posture:
         """Cameras and chain rule."""
-        of = [postures.of(s) for s in self.stations]
+        of = postures.of_all(self.stations)
         views = [p.views for p in of]
         chains = [p.chain[taken] for p, taken in zip(of, self._segments, strict=True)]
         return Posture(

@@ -1,0 +1,16 @@
+"""Sets of numbers as ascending arrays: what is merged here is mostly in order, which a stable sort uses."""
+
+import numpy as np
+
+from pancam_graph.geometry import IntArray
+
+__all__ = ["distinct"]
+
+
+def distinct(*numbers: IntArray) -> IntArray:
+    """All that occur in any of the arrays, ascending and once; as `np.unique`, several times as fast."""
+    ordered = np.sort(np.concatenate(numbers), kind="stable")
+    is_first = np.empty(len(ordered), dtype=bool)
+    is_first[:1] = True
+    np.not_equal(ordered[1:], ordered[:-1], out=is_first[1:])
+    return np.asarray(ordered[is_first])
