@@ -9,7 +9,7 @@ import pytest
 
 from pancam_graph import SimulationOptions, SmootherOptions, SolveOptions, TraverseSmoother, simulate, solve
 from pancam_graph.errors import InputError
-from pancam_graph.geometry import IntArray
+from pancam_graph.geometry import FloatArray, IntArray
 from pancam_graph.incremental import solve_incrementally, stops_of
 from pancam_graph.io import read_solution_json
 from pancam_graph.report import DriveStep, write_drive
@@ -118,6 +118,30 @@ def test_stops_may_come_in_any_order(small: Simulation, batch: Solution) -> None
     driven(small.traverse, smoother, [2, 0, 3, 1])
     assert smoother.stops == tuple(small.traverse.stops[i].id for i in (2, 0, 3, 1))
     require_batch(smoother, batch)
+
+
+def test_where_steps_do_not_settle_all_is_solved_anew(small: Simulation, batch: Solution) -> None:
+    # One round, and nothing may be where it was not linearised: what a new stop moves never settles.
+    options = SmootherOptions(max_rounds=1, relinearise_rad=1e-12, relinearise_m=1e-12)
+    smoother = TraverseSmoother(small.traverse.rig, options)
+    updates = driven(small.traverse, smoother)
+    assert updates[-1].fell_back
+    assert updates[-1].rounds == 1
+    require_batch(smoother, batch)
+
+
+@pytest.mark.parametrize("threads", ["1", "3"])
+def test_the_number_of_threads_changes_no_bit(small: Simulation, monkeypatch, threads: str) -> None:
+    def found_with(number: str) -> tuple[list[float], FloatArray]:
+        monkeypatch.setenv("PANCAM_GRAPH_THREADS", number)
+        smoother = TraverseSmoother(small.traverse.rig)
+        costs = [u.cost for u in driven(small.traverse, smoother)]
+        return costs, np.stack([pose.matrix() for pose in smoother.estimate().world_T_mast])
+
+    costs, poses = found_with("2")
+    other_costs, other_poses = found_with(threads)
+    assert other_costs == costs
+    assert np.array_equal(other_poses, poses)
 
 
 def test_observations_may_come_late(small: Simulation, batch: Solution) -> None:

@@ -123,6 +123,16 @@ class Ledger:
             covariance_px2=covariance,
         )
 
+    def find(self, image: IntArray, track: IntArray) -> IntArray:
+        """Rows (n,) of observations of tracks (n,) in images (n,); -1 where none is, or was removed."""
+        there = np.flatnonzero(self.fate != int(Fate.REMOVED))
+        if not len(there):
+            return np.full(len(track), -1)
+        known, wanted = _pairs(self.image[there], self.track[there]), _pairs(image, track)
+        order = np.argsort(known, kind="stable")
+        at = order[np.searchsorted(known[order], wanted).clip(max=len(order) - 1)]
+        return np.where(known[at] == wanted, there[at], -1)
+
     def with_fate(self, rows: IntArray, fate: Fate) -> IntArray:
         """Which of the rows have this fate."""
         found: IntArray = rows[self.fate[rows] == int(fate)]
@@ -135,3 +145,8 @@ class Ledger:
     def set_fate(self, rows: IntArray, fate: Fate) -> None:
         """Say what became of some."""
         self.fate[rows] = int(fate)
+
+
+def _pairs(image: IntArray, track: IntArray) -> IntArray:
+    """One number for an image and a track."""
+    return np.asarray(track * (1 << 24) + image)

@@ -7,7 +7,6 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from pancam_graph._diagnose import listed
 from pancam_graph.cameras import carry_to_pinhole
 from pancam_graph.errors import InputError
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray
@@ -17,22 +16,20 @@ from pancam_graph.sharing import Sharing
 from pancam_graph.smoother._batch import whole_traverse
 from pancam_graph.smoother._closure import bridge, judged, loops
 from pancam_graph.smoother._engine import Engine, Rounds
-from pancam_graph.smoother._frame import orthonormal
 from pancam_graph.smoother._ledger import Fate
 from pancam_graph.smoother._localise import localise
 from pancam_graph.smoother._map import Change, DriveMap
+from pancam_graph.smoother._nearness import by_nearness, sample
+from pancam_graph.smoother._odometry import guess, join, local_priors
 from pancam_graph.smoother._options import Closure, Estimate, SmootherOptions, Update
-from pancam_graph.smoother._placing import Seen
-from pancam_graph.smoother._sets import distinct
-from pancam_graph.smoother._state import SmootherState
+from pancam_graph.smoother._state import SmootherState, state_of
 from pancam_graph.smoother._station import Postures, Station, copied
+from pancam_graph.smoother._warnings import warnings_of
 from pancam_graph.threads import blas_on_one_thread
 from pancam_graph.traverse import Frame, Image, Observations, Stop, Traverse
 
 __all__ = ["TraverseSmoother"]
 
-_ENOUGH_PER_IMAGE = 60
-"""Observations of an image that place a new stop well enough to linearise there."""
 _TYPICAL_RANGE_M = 10.0
 
 
@@ -158,28 +155,10 @@ class TraverseSmoother:
         previous = self._station(after) if after is not None else next(reversed(self._stop.values()), None)
         station = Station(len(self._stop), entries, self._sharing, len(self._image_row))
         if previous is not None:
-            self._join(station, previous)
+            self._follow(station, previous)
         with blas_on_one_thread():
             rows = self._enter(station, observations)
             return self._placed(station, previous, rows, begin)
-
-    def _join(self, station: Station, previous: Station) -> None:
-        """Odometry from one station to another, if stops are known by that."""
-        station.after = previous.number
-        if self.options.telemetry == "absolute":
-            return
-        stop, other = station.traverse.stops[0], previous.traverse.stops[0]
-        if station.mast is None or len(station.held_of_mast):
-            raise InputError(
-                f"stop {stop.id}: expected sigmas above 0, of the motion from {other.id}; found "
-                f"{stop.sigma_rotation_rad} and {stop.sigma_translation_m}"
-            )
-        noise = gtsam.noiseModel.Diagonal.Sigmas(stop.sigmas)
-        if previous.mast is None:
-            station.motion = gtsam.PriorFactorPose3(station.mast, stop.world_T_mast, noise)
-        else:
-            moved = other.world_T_mast.between(stop.world_T_mast)
-            station.motion = gtsam.BetweenFactorPose3(previous.mast, station.mast, moved, noise)
 
     def _require_new(self, entries: Traverse) -> None:
         stop = entries.stops[0]
@@ -196,6 +175,12 @@ class TraverseSmoother:
                     raise InputError(
                         f"stop {stop.id}: {kind}: expected new ids, found {name!r} of another stop"
                     )
+
+    def _follow(self, station: Station, previous: Station) -> None:
+        """Note which station one comes after, and the odometry if that counts."""
+        station.after = previous.number
+        if self.options.telemetry == "odometry":
+            join(station, previous)
 
     def _enter(self, station: Station, observations: Observations | None) -> IntArray:
         """Make a station known; the ledger's rows of its observations."""
@@ -226,16 +211,16 @@ class TraverseSmoother:
         drive, engine = self._drive, self._engine
         rows = drive.ledger.with_fate(rows, Fate.WAITING)
         known, new = gtsam.Values(engine.estimate), gtsam.Values()
-        start = station.start(self._guess(station, previous))
+        start = station.start(guess(station, previous, engine.estimate))
         for key in start.keys():  # noqa: SIM118  gtsam.Values is not a dictionary
             if not known.exists(key):
                 copied(start, [key], new)
         known.insert(new)
         around = drive.near(previous.number) | {station.number} if previous is not None else {station.number}
-        near, far = self._by_nearness(rows, {station.number: around})
-        seen = self._sample(station, near)
+        near, far = by_nearness(drive, rows, {station.number: around})
+        seen = sample(drive, station, near)
         if seen is not None:
-            found = localise(station, known, seen, self._local_priors(station, previous, known), robust=True)
+            found = localise(station, known, seen, local_priors(station, previous, known), robust=True)
             new.update(found.values)
             known.update(found.values)
         change = Change()
@@ -260,62 +245,6 @@ class TraverseSmoother:
             change.rejected += late.rejected
             done.append(engine.advance(late))
         return done
-
-    def _guess(self, station: Station, previous: Station | None) -> gtsam.Pose3:
-        """Where odometry from the previous stop leads; without one, where telemetry has it."""
-        said = station.traverse.stops[0].world_T_mast
-        if previous is None or station.mast is None:
-            return said
-        moved = previous.traverse.stops[0].world_T_mast.between(said)
-        return orthonormal(previous.world_T_mast(self._engine.estimate) * moved)
-
-    def _local_priors(
-        self, station: Station, previous: Station | None, values: gtsam.Values
-    ) -> list[gtsam.NonlinearFactor]:
-        """Priors of a station's own variables while the others are held."""
-        between = station.motion
-        if previous is None or previous.mast is None or not isinstance(between, gtsam.BetweenFactorPose3):
-            return station.factors(firm=True)
-        assert station.mast is not None  # odometry leads to masts that move
-        moved = between.measured()
-        own = copied(values, [previous.mast])
-        held = gtsam.PriorFactorPose3(
-            station.mast, orthonormal(own.atPose3(previous.mast) * moved), between.noiseModel()
-        )
-        return [held, *station.other_priors(firm=True)]
-
-    def _by_nearness(self, rows: IntArray, around: dict[int, set[int]]) -> tuple[IntArray, IntArray]:
-        """Rows of tracks that stations near their own see, and of tracks that are far off.
-
-        `around` says which stations are near one, where that is not what shares landmarks with it. A track
-        without a place is of where its first observations are.
-        """
-        drive, ledger = self._drive, self._drive.ledger
-        track, station = ledger.track[rows], drive.station_of(rows)
-        is_near = np.zeros(len(rows), dtype=bool)
-        unknown = drive.home(track) < 0
-        waiting = drive.idle(distinct(track[unknown]), Fate.WAITING)
-        names, own = np.unique(ledger.track[waiting], return_inverse=True)
-        first = np.full(len(names), len(drive.stations))
-        np.minimum.at(first, own, drive.station_of(waiting))
-        first_of = np.full(len(rows), -1)
-        first_of[unknown] = first[np.searchsorted(names, track[unknown])]
-        for number in distinct(station).tolist():
-            mine = station == number
-            near = around.get(number) or drive.near(number)
-            is_near[mine & ~unknown] = drive.seen_from(track[mine & ~unknown], near)
-            is_near[mine & unknown] = np.isin(first_of[mine & unknown], list(near))
-        return rows[is_near], rows[~is_near]
-
-    def _sample(self, station: Station, rows: IntArray) -> Seen | None:
-        """Tracks enough to say where a station is: with a place, or seen from there twice."""
-        drive, track = self._drive, self._drive.ledger.track[rows]
-        names, own, count = np.unique(track, return_inverse=True, return_counts=True)
-        names = names[(count >= 2) | (drive.home(names) >= 0)]
-        enough = _ENOUGH_PER_IMAGE * len(station.traverse.images)
-        names = names[:: max(1, len(own) // enough)]
-        rows = rows[np.isin(track, names)]
-        return drive.excerpt(names, rows, station) if len(rows) and station.own else None
 
     def _closed(
         self,
@@ -380,40 +309,9 @@ class TraverseSmoother:
             cost=self.cost,
             fell_back=any(d.fell_back for d in done),
             closures=closures,
-            warnings=tuple(self._warnings(station, rows, closures)),
+            warnings=tuple(warnings_of(self._drive, station, rows, closures)),
             seconds=time.perf_counter() - begin,
         )
-
-    def _warnings(self, station: Station | None, rows: IntArray, closures: Sequence[Closure]) -> list[str]:
-        drive, ledger, out = self._drive, self._drive.ledger, []
-        if station is not None and len(drive.stations) > 1 and drive.near(station.number) == {station.number}:
-            out.append(
-                f"stop {station.id}: no track connects it to another stop; its place is what odometry says"
-            )
-        for c in closures:
-            if not c.accepted:
-                why = (
-                    f"only {c.inliers:.0%} of them agree on one pose"
-                    if c.inliers < 1 and c.sigmas < 4
-                    else f"they contradict the drive by {c.sigmas:.1f} sigma ({c.shift_m:.2f} m), "
-                    f"{c.inliers:.0%} agree"
-                )
-                out.append(
-                    f"stop {c.stop}: {c.observations} observations of tracks at {c.other} are not believed: "
-                    f"{why}"
-                )
-        # A place that a stop sees twice or more, and is not the one that the track has elsewhere.
-        astray = drive.idle(distinct(ledger.track[rows]), Fate.OUTLIER)
-        pairs = np.column_stack([ledger.track[astray], drive.station_of(astray)])
-        pairs, counts = np.unique(pairs, axis=0, return_counts=True)
-        track = distinct(pairs[counts >= 2, 0])
-        if len(track):
-            names = [str(t) for t in track]
-            out.append(
-                f"{listed(names, 'track')}: seen where other "
-                "observations of the number have another place; left out"
-            )
-        return out
 
     def add_observations(self, observations: Observations) -> Update:
         """Add observations of images that were added before; `observations.image` are rows of `images`.
@@ -423,13 +321,20 @@ class TraverseSmoother:
         added and for an image that has seen a track already.
         """
         begin = time.perf_counter()
+        drive, engine = self._drive, self._engine
         image = self._rows_of_images(observations)
-        self._require_unseen(image, observations.track)
+        known = drive.ledger.find(image, observations.track) >= 0
+        if known.any():
+            row = int(np.argmax(known))
+            raise InputError(
+                f"observations: row {row}: expected an image to see a track once, found image "
+                f"{self.images[image[row]]!r}, track {observations.track[row]} again"
+            )
         with blas_on_one_thread():
-            rows = self._drive.ledger.with_fate(self._append(observations, image), Fate.WAITING)
-            near, far = self._by_nearness(rows, {})
+            rows = drive.ledger.with_fate(self._append(observations, image), Fate.WAITING)
+            near, far = by_nearness(drive, rows, {})
             change = Change()
-            self._drive.take_in(near, Postures(self._engine.estimate), change, far)
+            drive.take_in(near, Postures(engine.estimate), change, far)
             return self._closed(None, rows, far, change, self._advanced(change), begin)
 
     def remove(self, observations: Observations) -> Update:
@@ -440,18 +345,14 @@ class TraverseSmoother:
         begin = time.perf_counter()
         ledger = self._drive.ledger
         image = self._rows_of_images(observations)
-        all_pairs, pairs = _pairs(ledger.image, ledger.track), _pairs(image, observations.track)
-        there = np.flatnonzero(ledger.fate != int(Fate.REMOVED))
-        order = there[np.argsort(all_pairs[there], kind="stable")]
-        at = np.searchsorted(all_pairs[order], pairs).clip(max=max(len(order) - 1, 0))
-        missing = all_pairs[order[at]] != pairs if len(order) else np.ones(len(pairs), dtype=bool)
+        rows = ledger.find(image, observations.track)
+        missing = rows < 0
         if missing.any():
             row = int(np.argmax(missing))
             raise InputError(
                 f"observations: row {row}: expected an observation that was added, found image "
                 f"{self.images[image[row]]!r} with track {observations.track[row]}"
             )
-        rows = order[at]
         with blas_on_one_thread():
             used = ledger.with_fate(rows, Fate.USED)
             ledger.set_fate(rows, Fate.REMOVED)
@@ -471,42 +372,13 @@ class TraverseSmoother:
             )
         return observations.image
 
-    def _require_unseen(self, image: IntArray, track: IntArray) -> None:
-        ledger = self._drive.ledger
-        there = ledger.fate != int(Fate.REMOVED)
-        pairs = _pairs(image, track)
-        known = np.isin(pairs, _pairs(ledger.image[there], ledger.track[there]))
-        if known.any():
-            row = int(np.argmax(known))
-            raise InputError(
-                f"observations: row {row}: expected an image to see a track once, found image "
-                f"{self.images[image[row]]!r}, track {track[row]} again"
-            )
-
     # --- what is kept ---
 
     def state(self) -> SmootherState:
         """Everything, to go on from later. Raises InputError where no stop was added."""
         if not self._stop:
             raise InputError("smoother: expected at least one stop to keep, found none")
-        drive, values, numbers = self._drive, self._engine.estimate, SmootherState.numbers
-        blocks = [(name, block.placed) for name, block in sorted(drive.blocks.items())]
-        keys = list(values.keys())
-        parts = [numbers(values, key) for key in keys]
-        none = np.zeros(0, dtype=np.int64)
-        return SmootherState(
-            traverse=whole_traverse(drive),
-            options=self.options,
-            after=np.array([s.after for s in drive.stations], dtype=np.int64),
-            fate=drive.ledger.fate.astype(np.int64),
-            track=np.concatenate([none, *(placed.track for _, placed in blocks)]),
-            home=np.concatenate([none, *(np.full(len(placed.track), name) for name, placed in blocks)]),
-            vector=np.concatenate([np.zeros((0, 4)), *(placed.landmarks.vector for _, placed in blocks)]),
-            origin_m=np.concatenate([np.zeros((0, 3)), *(placed.landmarks.origin_m for _, placed in blocks)]),
-            key=np.array(keys, dtype=np.int64),
-            width=np.array([len(part) for part in parts], dtype=np.int64),
-            value=np.concatenate([np.zeros(0), *parts]),
-        )
+        return state_of(self._drive, self.options, self._engine.estimate)
 
     @staticmethod
     def of(state: SmootherState) -> "TraverseSmoother":
@@ -521,7 +393,7 @@ class TraverseSmoother:
                 own = Traverse(name="", rig=t.rig, stops=(stop,), frames=frames, images=images)
                 station = Station(number, own, smoother._sharing, len(smoother._image_row))
                 if (after := int(state.after[number])) >= 0:
-                    smoother._join(station, drive.stations[after])
+                    smoother._follow(station, drive.stations[after])
                 smoother._enter(station, None)
             if t.observations is not None:
                 smoother._append(t.observations, t.observations.image)
@@ -545,8 +417,3 @@ class TraverseSmoother:
         from pancam_graph.io import load_smoother  # noqa: PLC0415  io imports this module
 
         return TraverseSmoother.of(load_smoother(Path(path)))
-
-
-def _pairs(image: IntArray, track: IntArray) -> IntArray:
-    """One number for an image and a track."""
-    return np.asarray(track * (1 << 24) + image)

@@ -7,10 +7,12 @@ import numpy as np
 
 from pancam_graph.geometry import FloatArray, IntArray
 from pancam_graph.graph import read_variable
+from pancam_graph.smoother._batch import whole_traverse
+from pancam_graph.smoother._map import DriveMap
 from pancam_graph.smoother._options import SmootherOptions
 from pancam_graph.traverse import Traverse
 
-__all__ = ["SmootherState"]
+__all__ = ["SmootherState", "state_of"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -56,3 +58,25 @@ class SmootherState:
             else:
                 out.insert(key, numbers)
         return out
+
+
+def state_of(drive: DriveMap, options: SmootherOptions, values: gtsam.Values) -> SmootherState:
+    """What is to be kept of a drive with these values."""
+    numbers = SmootherState.numbers
+    blocks = [(name, block.placed) for name, block in sorted(drive.blocks.items())]
+    keys = list(values.keys())
+    parts = [numbers(values, key) for key in keys]
+    none = np.zeros(0, dtype=np.int64)
+    return SmootherState(
+        traverse=whole_traverse(drive),
+        options=options,
+        after=np.array([s.after for s in drive.stations], dtype=np.int64),
+        fate=drive.ledger.fate.astype(np.int64),
+        track=np.concatenate([none, *(placed.track for _, placed in blocks)]),
+        home=np.concatenate([none, *(np.full(len(placed.track), name) for name, placed in blocks)]),
+        vector=np.concatenate([np.zeros((0, 4)), *(placed.landmarks.vector for _, placed in blocks)]),
+        origin_m=np.concatenate([np.zeros((0, 3)), *(placed.landmarks.origin_m for _, placed in blocks)]),
+        key=np.array(keys, dtype=np.int64),
+        width=np.array([len(part) for part in parts], dtype=np.int64),
+        value=np.concatenate([np.zeros(0), *parts]),
+    )

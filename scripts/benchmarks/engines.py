@@ -21,6 +21,7 @@ __all__ = [
     "Setting",
     "ceres_program",
     "measure",
+    "run_module",
     "solve_first_ever",
 ]
 
@@ -159,7 +160,7 @@ def measure(engine: Engine, files: Files, setting: Setting, repeats: int) -> Mea
     command = engine.command(files, setting, repeats)
     if isinstance(command, NotRun):
         return command
-    found = _run(command, setting.child_environment(engine.name))
+    found = run_module(command, setting.child_environment(engine.name))
     if isinstance(found, NotRun):
         return found
     return Measured(**{**found, "seconds": tuple(found["seconds"])})
@@ -179,7 +180,8 @@ def solve_first_ever(engine: Engine, files: Files, setting: Setting) -> float | 
     return found.first_s if found.first_s is not None else NotRun(reason="not measured", failed=False)
 
 
-def _run(command: list[str], environment: dict[str, str]) -> dict[str, Any] | NotRun:
+def run_module(command: list[str], environment: dict[str, str]) -> dict[str, Any] | NotRun:
+    """What a module of this package prints, run with its arguments in a process of its own."""
     done = subprocess.run(
         [sys.executable, "-m", *command],
         env=environment,
