@@ -130,6 +130,29 @@ def test_where_steps_do_not_settle_all_is_solved_anew(small: Simulation, batch: 
     require_batch(smoother, batch)
 
 
+def test_without_screening_all_that_is_seen_is_used() -> None:
+    # Points beside the way, placed by a stereo base far off, come to lie behind the stops that pass them.
+    passing = SimulationOptions(
+        stops=5,
+        spacing_m=8.0,
+        pans=12,
+        tilts_rad=(-0.2,),
+        points_per_image=60,
+        detection=0.2,
+        min_views=3,
+        reach_m=18.0,
+        link_stops=5,
+        max_turn_rad=float(np.pi),
+        max_zoom=8.0,
+        noise_px=1.5,
+    )
+    t = simulate(mer_navcam(), passing, seed=2).traverse
+    smoother = TraverseSmoother(t.rig, SmootherOptions(outlier_sigma=None))
+    driven(t, smoother)
+    assert np.all(smoother.used)
+    assert smoother.cost == pytest.approx(solve(t, SolveOptions(loss="none")).cost_final, rel=1e-5)
+
+
 @pytest.mark.parametrize("threads", ["1", "3"])
 def test_the_number_of_threads_changes_no_bit(small: Simulation, monkeypatch, threads: str) -> None:
     def found_with(number: str) -> tuple[list[float], FloatArray]:

@@ -167,13 +167,24 @@ def placed_anew(seen: Seen, views: CameraViews) -> Seen:
 def believed(seen: Seen, views: CameraViews, cutoff_sigma: float | None) -> Seen:
     """Touched landmarks without the observations that contradict the others; see `_rejection.screen`.
 
-    Only those that may hide an outlier are looked at. Observations of landmarks behind their camera go.
+    Only those that may hide an outlier are looked at. Observations of landmarks behind their camera go;
+    with no cutoff nothing else does.
     """
     placed = seen.placed
     m, n = placed.measurements, placed.measurements.n_landmarks
     whitened, in_front = residuals(placed.landmarks, m, views)
     if cutoff_sigma is None:
-        return replace(seen, accepted=seen.accepted & (in_front | ~seen.touched[m.landmark]))
+        # What lies behind a camera that sees it anew was placed by few rays: all of them may do better.
+        astray = (np.bincount(m.landmark, ~in_front, minlength=n) > 0) & seen.touched
+        if astray.any():
+            all_of = seen.accepted | astray[m.landmark]
+            seen = replace(
+                placed_anew(replace(seen, touched=astray, fresh=astray, accepted=all_of), views),
+                touched=seen.touched,
+                fresh=seen.fresh,
+            )
+            _, in_front = residuals(seen.placed.landmarks, m, views)
+        return replace(seen, accepted=np.where(seen.touched[m.landmark], in_front, seen.accepted))
     weight = seen.accepted.astype(float)
     square = weight * np.sum(whitened**2, axis=1)
     total, count = np.bincount(m.landmark, square, minlength=n), np.bincount(m.landmark, weight, minlength=n)
