@@ -162,11 +162,19 @@ class Adjustment:
         self.uncertainty = self._uncertainty()
 
     def take_over(self, values: gtsam.Values, used: BoolArray, costs: Sequence[float], reason: str) -> None:
-        """In place of `solve`: what was solved elsewhere, over the observations (n,) that were used there."""
+        """In place of `solve`: what was solved elsewhere, over the observations (n,) that were used there.
+
+        Where their noise is to be found, or pixels depend on the range, the last rounds of `solve` follow.
+        """
         m = self.problem.measurements
         problem = replace(self.problem, accepted=used[m.row], values=values)
         self.problem = _triangulated(problem).placed()
-        self.outcome = Outcome(values=values, converged=True, reason=reason, costs=tuple(costs))
+        if self._rescales or self.problem.template.rig_variables.pupil_moves:
+            self._recarry()
+            last = self._final_rounds()
+            self.outcome = replace(last, reason=f"{reason}; {last.reason}", costs=(*costs, *last.costs))
+        else:
+            self.outcome = Outcome(values=values, converged=True, reason=reason, costs=tuple(costs))
         self.final = _state(self.problem)
         self.uncertainty = self._uncertainty()
 
@@ -252,9 +260,6 @@ class Adjustment:
 
     def _final_rounds(self) -> Outcome:
         """Least squares over what was kept, until neither noise scale nor carried pixels move any more."""
-        rescale = self.options.rescale_noise
-        if rescale is None:
-            rescale = self.observations.origin == "images"
         costs: list[float] = []
         for _ in range(_FINAL_ROUNDS):
             before = self.problem.accepted
@@ -262,7 +267,7 @@ class Adjustment:
             self._note_behind(before & ~self.problem.accepted)
             costs += outcome.costs[1:] if costs else outcome.costs
             moved = self._recarry()
-            if rescale:
+            if self._rescales:
                 factor = self._noise_factor()
                 self.noise = self.noise.scaled(factor)
                 self.problem = replace(self.problem, measurements=self.problem.measurements.scaled(factor))
@@ -270,6 +275,12 @@ class Adjustment:
             if not (moved and outcome.converged):
                 break
         return replace(outcome, costs=tuple(costs))
+
+    @property
+    def _rescales(self) -> bool:
+        """Whether the noise is what residuals say, not what observations say of themselves."""
+        wanted = self.options.rescale_noise
+        return self.observations.origin == "images" if wanted is None else wanted
 
     def with_only(self, landmarks: BoolArray) -> tuple[Problem, Outcome]:
         """Least squares over some landmarks (landmarks,) from where `solve` ended, which stays as it is.

@@ -413,6 +413,21 @@ def test_a_traverse_is_solved_stop_by_stop(small: Simulation, batch: Solution, t
         solve_incrementally(small.traverse, SolveOptions(model="circle"))
 
 
+def test_noise_of_what_images_say_is_found_at_the_end(small: Simulation, batch: Solution) -> None:
+    # Tie points found in images do not know their noise: here it is taken for half of what it is.
+    observations = small.traverse.observations
+    assert observations is not None
+    found = replace(observations, sigma_px=observations.sigma_px / 2, origin="images")
+    t = small.traverse.with_observations(found)
+    solution = solve_incrementally(t, SolveOptions(outlier_sigma=8.0))
+    expected = solve(t, SolveOptions(outlier_sigma=8.0))
+    for one, other in zip(solution.stop_covariance, expected.stop_covariance, strict=True):
+        assert np.sqrt(np.diag(one)) == pytest.approx(np.sqrt(np.diag(other)), rel=0.01)
+    # Not those of half the noise.
+    ratio = np.sqrt(np.diag(solution.stop_covariance[-1]) / np.diag(batch.stop_covariance[-1]))
+    assert ratio == pytest.approx(np.ones(6), abs=0.1)
+
+
 def test_the_replay_has_a_frame_for_each_stop(small: Simulation, tmp_path: Path) -> None:
     smoother, steps = TraverseSmoother(small.traverse.rig), list[DriveStep]()
     for part in stops_of(small.traverse):
