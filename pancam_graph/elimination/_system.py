@@ -49,6 +49,8 @@ _SMALLEST_SUM = 200_000
 """Entries of systems whose sum is worth waking another thread."""
 _SMALLEST_CHUNK = 4000
 """Observations of a chunk that is worth its overhead."""
+_ENTRIES_PER_OBSERVATION = 25
+"""To fill and sum up as many entries of a chunk's dense system takes about as long as an observation."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,7 +159,6 @@ class LandmarkSystem:
         )
         begin = m.begin
         rows, cursor = np.empty(n_obs, dtype=np.int64), np.zeros(4, dtype=np.int64)
-        most = max(n_obs // _PARTS, _SMALLEST_CHUNK)
         self.blocks: list[Block] = []
         self.chunks: list[_Chunk] = []
         for a, b in pairwise(edges.tolist()):
@@ -179,6 +180,7 @@ class LandmarkSystem:
             )
             self.blocks.append(replace(block, n_units=n_units))
             counts = np.cumsum(begin[self.landmark_row[a:b] + 1] - begin[self.landmark_row[a:b]])
+            most = max(n_obs // _PARTS, _SMALLEST_CHUNK, len(block.row) ** 2 // _ENTRIES_PER_OBSERVATION)
             n_parts = -(-int(counts[-1]) // most)
             cuts = [a, *(a + 1 + np.searchsorted(counts, counts[-1] * np.arange(1, n_parts) / n_parts)), b]
             self.chunks += [

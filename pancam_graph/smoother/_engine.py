@@ -150,7 +150,7 @@ class Engine:
         at = Postures(self._tree.next_theta(theta, moving))
         for b in sorted(affected):
             removed += [blocks[b].slot] * (blocks[b].slot >= 0)
-            for postures in (estimate, at):
+            for postures in (at,) if b in touched else (estimate, at):
                 postures.of_all(blocks[b].patch.stations)
 
         def linearise(b: int) -> None:
