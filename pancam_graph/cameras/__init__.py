@@ -6,6 +6,7 @@ from pancam_graph.cameras._base import Rays as Rays
 from pancam_graph.cameras._cahv import CAHV as CAHV
 from pancam_graph.cameras._cahv import CAHVOR as CAHVOR
 from pancam_graph.cameras._cahv import CAHVORE as CAHVORE
+from pancam_graph.cameras._cahv import cahv_of_vectors as cahv_of_vectors
 from pancam_graph.cameras._carry import carry_to_pinhole as carry_to_pinhole
 from pancam_graph.cameras._conditioning import Conditioning as Conditioning
 from pancam_graph.cameras._matrix import CALIBRATION_ENTRIES as CALIBRATION_ENTRIES

@@ -4,6 +4,7 @@ Sources: Yakimovsky and Cunningham 1978 (CAHV); Gennery 2001 and 2006 (CAHVOR, C
 formulas, with d = P - C, are those of docs/conventions.md, section "CAHV family".
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -15,7 +16,7 @@ from pancam_graph.cameras._pinhole import Pinhole
 from pancam_graph.errors import CameraError
 from pancam_graph.geometry import BoolArray, FloatArray
 
-__all__ = ["CAHV", "CAHVOR", "CAHVORE"]
+__all__ = ["CAHV", "CAHVOR", "CAHVORE", "cahv_of_vectors"]
 
 _NEWTON_STEPS = 100
 _MIN_DEPTH = 1e-9
@@ -395,3 +396,16 @@ class CAHVORE(CAHVOR):
 
     def _distort_with_jacobian(self, d: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         raise AssertionError("CAHVORE is not central")
+
+
+def cahv_of_vectors(
+    width_px: int, height_px: int, vectors: Mapping[str, FloatArray], linearity: float = 1.0
+) -> CAHV:
+    """The model whose vectors, each (3,), these are by letter: CAHV, with O and R CAHVOR, with E CAHVORE.
+
+    `linearity` is CAHVORE's. Raises CameraError for vectors that make no camera.
+    """
+    own = dict(vectors)
+    if "E" in own:
+        return CAHVORE(width_px=width_px, height_px=height_px, linearity=linearity, **own)
+    return (CAHVOR if "R" in own else CAHV)(width_px=width_px, height_px=height_px, **own)

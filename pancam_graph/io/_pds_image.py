@@ -6,7 +6,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from pancam_graph.cameras import CAHV, CAHVOR, CAHVORE
+from pancam_graph.cameras import CAHV, cahv_of_vectors
 from pancam_graph.errors import CameraError, GeometryError, InputError
 from pancam_graph.geometry import Z_DOWN_R_Z_UP, FloatArray, pose_from_wxyz, rotation_from_wxyz
 from pancam_graph.io.pds_label import LabelGroup, PdsLabel, read_label
@@ -132,31 +132,20 @@ def _camera_model(group: LabelGroup, width_px: int, height_px: int) -> CAHV:
             )
         entry = f"MODEL_COMPONENT_{order.index(letter) + 1}"
         vectors[letter] = group.numbers(entry, 1 if letter in "TP" else 3)
-    c, a, h, v = (vectors[letter] for letter in "CAHV")
-    if kind == "CAHV":
-        return CAHV(width_px=width_px, height_px=height_px, C=c, A=a, H=h, V=v)
-    o, r = vectors["O"], vectors["R"]
-    if kind == "CAHVOR":
-        return CAHVOR(width_px=width_px, height_px=height_px, C=c, A=a, H=h, V=v, O=o, R=r)
-    # T: 1 perspective, 2 fish-eye, 3 general with the linearity in P.
-    linearity = {1: 1.0, 2: 0.0, 3: float(vectors["P"][0])}.get(int(vectors["T"][0]))
-    if linearity is None:
+    linearity = _linearity(group, order, vectors) if kind == "CAHVORE" else 1.0
+    vectors = {letter: vector for letter, vector in vectors.items() if letter not in "TP"}
+    return cahv_of_vectors(width_px, height_px, vectors, linearity)
+
+
+def _linearity(group: LabelGroup, order: list[str], vectors: dict[str, FloatArray]) -> float:
+    """By T: 1 perspective, 2 fish-eye, 3 general with the linearity in P."""
+    found = {1: 1.0, 2: 0.0, 3: float(vectors["P"][0])}.get(int(vectors["T"][0]))
+    if found is None:
         raise InputError(
             f"{group.where}: MODEL_COMPONENT_{order.index('T') + 1}: expected a CAHVORE type of 1, 2 or 3, "
             f"found {vectors['T'][0]:g}"
         )
-    return CAHVORE(
-        width_px=width_px,
-        height_px=height_px,
-        C=c,
-        A=a,
-        H=h,
-        V=v,
-        O=o,
-        R=r,
-        E=vectors["E"],
-        linearity=linearity,
-    )
+    return found
 
 
 def _mast_angles(label: PdsLabel, mast: MastKinematics) -> tuple[float, float]:

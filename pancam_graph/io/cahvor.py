@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pancam_graph.cameras import CAHV, CAHVOR, CAHVORE
+from pancam_graph.cameras import CAHV, CAHVOR, CAHVORE, cahv_of_vectors
 from pancam_graph.errors import CameraError, InputError
 from pancam_graph.geometry import FloatArray
 from pancam_graph.io._json import read_bytes, short
@@ -73,25 +73,10 @@ def read_cahvor(path: Path | str) -> CAHV:
         )
     kind = match[1]
     width_px, height_px = (int(n) for n in _numbers(path, entries, "Dimensions", 2))
-    c, a, h, v = (_numbers(path, entries, name, 3) for name in "CAHV")
+    vectors = {letter: _numbers(path, entries, letter, 3) for letter in kind}
+    linearity = _linearity(path, match[2], match[3], model) if kind == "CAHVORE" else 1.0
     try:
-        if kind == "CAHV":
-            return CAHV(width_px=width_px, height_px=height_px, C=c, A=a, H=h, V=v)
-        o, r = (_numbers(path, entries, name, 3) for name in "OR")
-        if kind == "CAHVOR":
-            return CAHVOR(width_px=width_px, height_px=height_px, C=c, A=a, H=h, V=v, O=o, R=r)
-        return CAHVORE(
-            width_px=width_px,
-            height_px=height_px,
-            C=c,
-            A=a,
-            H=h,
-            V=v,
-            O=o,
-            R=r,
-            E=_numbers(path, entries, "E", 3),
-            linearity=_linearity(path, match[2], match[3], model),
-        )
+        return cahv_of_vectors(width_px, height_px, vectors, linearity)
     except CameraError as error:
         raise InputError(f"{path}: {error}") from error
 
