@@ -1,13 +1,14 @@
 """Panoramas as image files would have them, with truth: a mast rig driven over a textured world."""
 
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from pancam_graph.errors import InputError
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.rigs import Rig
-from pancam_graph.simulate import _raycast
+from pancam_graph.simulate import _rays
 from pancam_graph.simulate._drive import (
     TelemetryStart,
     Truth,
@@ -19,7 +20,7 @@ from pancam_graph.simulate._drive import (
     telemetry,
 )
 from pancam_graph.simulate._options import RenderOptions
-from pancam_graph.simulate._raycast import Deck, Scene
+from pancam_graph.simulate._rays import Deck, Scene
 from pancam_graph.simulate._scene import make_deck, make_scene, slopes
 from pancam_graph.simulate._sensor import HALO_PX, GreyImage, expose
 from pancam_graph.threads import in_parallel
@@ -34,6 +35,88 @@ _KEPT_PX = 8_000_000  # lines of sight that are kept from image to image
 _EDGE_RAYS = 2  # along each side of a pixel that lies on an edge
 
 
+class _Traced(NamedTuple):
+    """What rays (n,) met."""
+
+    light: FloatArray
+    distance_m: FloatArray
+    ground_m: FloatArray
+    edge: IntArray
+
+
+def _trace(
+    scene: Scene,
+    deck: Deck,
+    origin_m: FloatArray,
+    direction: FloatArray,
+    pixel_rad: FloatArray,
+    below: IntArray | None = None,
+    over: tuple[FloatArray, FloatArray] | None = None,
+    *,
+    lit: bool = True,
+) -> _Traced:
+    """Follow rays; `below` and `over` name rays under them, of these or of others with their distances."""
+    n = len(direction)
+    out = _Traced(*(np.empty(n) for _ in range(3)), np.empty(n, dtype=np.int64))
+    below = np.full(n, -1) if below is None else below
+    rays = (origin_m, np.ascontiguousarray(direction), pixel_rad, below)
+    _rays.trace(scene, deck, *rays, *(over or (rays[1], out.ground_m)), lit, *out)
+    return out
+
+
+@dataclass(frozen=True)
+class _View:
+    """Whole rows of an image: origins (1 or h w, 3), directions (h, w, 3), widths of the pixels (h, w)."""
+
+    scene: Scene
+    deck: Deck
+    origin_m: FloatArray
+    direction: FloatArray
+    pixel_rad: FloatArray
+
+    def light(self) -> FloatArray:
+        """Radiance (h, w) of each pixel's middle, and of pixels on edges the mean over several rays."""
+        rows, columns = self.pixel_rad.shape
+        direction, pixel = self.direction.reshape(-1, 3), self.pixel_rad.ravel()
+        below = np.arange(columns, len(pixel) + columns)
+        below[-columns:] = -1
+        traced = _trace(self.scene, self.deck, self.origin_m, direction, pixel, below)
+        rough = np.flatnonzero(_edges(traced.edge.reshape(rows, columns), traced.distance_m.reshape(rows, columns)))
+        light = traced.light
+        steps = (np.arange(_EDGE_RAYS) + 0.5) / _EDGE_RAYS - 0.5
+        down = 0.5 * (direction[rough + columns] - direction[rough - columns])
+        right = 0.5 * (direction[rough + 1] - direction[rough - 1])
+        finer = np.stack([direction[rough] + p * down + q * right for p in steps for q in steps], axis=1)
+        finer /= np.linalg.norm(finer, axis=-1, keepdims=True)
+        rays = _EDGE_RAYS**2
+        again = _trace(
+            self.scene,
+            self.deck,
+            self.origin_m if len(self.origin_m) == 1 else np.repeat(self.origin_m[rough], rays, axis=0),
+            finer.reshape(-1, 3),
+            np.repeat(pixel[rough] / _EDGE_RAYS, rays),
+            np.repeat(rough + columns, rays),
+            (direction, traced.ground_m),
+        )
+        light[rough] = again.light.reshape(-1, rays).mean(axis=1)
+        return light.reshape(rows, columns)
+
+
+def _edges(edge: IntArray, distance_m: FloatArray) -> BoolArray:
+    """Which pixels (h, w) lie on an edge of the picture; none of the outermost, none beside one not seen."""
+    out = np.zeros(edge.shape, dtype=bool)
+    here, away = edge[1:-1, 1:-1], distance_m[1:-1, 1:-1]
+    rough, whole = np.zeros(here.shape, dtype=bool), here != -2
+    for a, b in ((0, 1), (2, 1), (1, 0), (1, 2)):
+        window = slice(a, a + len(here)), slice(b, b + here.shape[1])
+        there, far = edge[window], distance_m[window]
+        with np.errstate(invalid="ignore"):  # the sky from the sky
+            rough |= (there != here) | (np.abs(far - away) > 0.04 * away + 0.02 * far)
+        whole &= there != -2
+    out[1:-1, 1:-1] = rough & whole
+    return out
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Rendering:
     """A traverse of images as a solver gets it, what it should find, and the images, rendered when asked."""
@@ -46,7 +129,7 @@ class Rendering:
     options: RenderOptions
     seed: int
     _scene: Scene
-    _rays: dict[int, tuple[FloatArray, FloatArray, BoolArray]] = field(default_factory=dict)
+    _sights: dict[int, tuple[FloatArray, FloatArray, FloatArray]] = field(default_factory=dict)
 
     def image(self, row: int) -> GreyImage:
         """Image of that row of the traverse, (height, width), 8 bits or 12 in 16.
@@ -61,13 +144,9 @@ class Rendering:
         def band(begin: int, end: int) -> None:
             # Each band is rendered with what the optics smear into it, and stands for itself.
             rows = np.arange(begin - HALO_PX, end + HALO_PX)
-            origin, direction, valid = self._band_rays(eye, rows)
-            shape = valid.shape
-            part, distance = np.empty(shape), np.empty(shape)
-            edge = np.empty(shape, dtype=np.int64)
-            view = (self._scene, self._deck(row), rotation, centre, origin, direction)
-            _raycast.render(*view, valid, part, distance, edge)
-            _raycast.smooth(*view, part, distance, edge, _EDGE_RAYS)
+            origin, direction, pixel = self._band_rays(eye, rows)
+            view = _View(self._scene, self._deck(row), centre + origin @ rotation.T, direction @ rotation.T, pixel)
+            part = view.light()
             inner = slice(HALO_PX if begin else 0, len(part) - (HALO_PX if end < camera.height_px else 0))
             light[begin + inner.start : begin + inner.stop] = part[inner]
 
@@ -81,10 +160,12 @@ class Rendering:
         A point in the sky, or of a pixel outside the camera's domain, is not meaningful.
         """
         rotation, centre = self._camera(row)
-        rays = self.truth.rig.eyes[int(self.traverse.image_eye[row])].camera.unproject(uv_px)
+        camera = self.truth.rig.eyes[int(self.traverse.image_eye[row])].camera
+        rays, beside = camera.unproject(uv_px), camera.unproject(uv_px + [1, 0])
+        pixel = np.linalg.norm(beside.direction - rays.direction, axis=1)
         origin, direction = centre + rays.origin_m @ rotation.T, rays.direction @ rotation.T
-        distance = np.empty(len(uv_px))
-        _raycast.hits(self._scene, self._deck(row), origin, direction, distance)
+        traced = _trace(self._scene, self._deck(row), origin, direction, pixel, lit=False)
+        distance = traced.distance_m
         hit = np.isfinite(distance) & rays.valid
         return origin + np.where(hit, distance, 0.0)[:, None] * direction, hit
 
@@ -99,26 +180,32 @@ class Rendering:
         pose = self.truth.world_T_mast[stop]
         return make_deck(self.truth.rig.mast_height_m, pose, seen=self.options.deck)
 
-    def _band_rays(self, eye: int, rows: IntArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Lines of sight of whole rows, a margin on both sides included, in the camera frame."""
+    def _band_rays(self, eye: int, rows: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Lines of sight of whole rows, a margin on both sides included, in the camera frame.
+
+        Origins (1 or h w, 3), directions (h, w, 3) and the pixels' widths (h, w) in radians, 0 where there is
+        no line of sight.
+        """
         camera = self.truth.rig.eyes[eye].camera
         if sum(e.camera.width_px * e.camera.height_px for e in self.truth.rig.eyes) > _KEPT_PX:
             return self._sight(eye, rows)
-        if eye not in self._rays:
-            self._rays[eye] = self._sight(eye, np.arange(-HALO_PX, camera.height_px + HALO_PX))
-        origin, direction, valid = self._rays[eye]
+        if eye not in self._sights:
+            self._sights[eye] = self._sight(eye, np.arange(-HALO_PX, camera.height_px + HALO_PX))
+        origin, direction, pixel = self._sights[eye]
         part = slice(int(rows[0]) + HALO_PX, int(rows[-1]) + HALO_PX + 1)
         if len(origin) > 1:
-            origin = origin.reshape(*valid.shape, 3)[part].reshape(-1, 3)
-        return origin, direction[part], valid[part]
+            origin = origin.reshape(*pixel.shape, 3)[part].reshape(-1, 3)
+        return origin, direction[part], pixel[part]
 
-    def _sight(self, eye: int, rows: IntArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    def _sight(self, eye: int, rows: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         camera = self.truth.rig.eyes[eye].camera
         columns = np.arange(-HALO_PX, camera.width_px + HALO_PX)
         v, u = np.meshgrid(rows.astype(float), columns.astype(float), indexing="ij")
         rays = camera.unproject(np.stack([u, v], axis=-1).reshape(-1, 2))
         origin = rays.origin_m if camera.pupil_moves else rays.origin_m[:1]
-        return np.ascontiguousarray(origin), rays.direction.reshape(*u.shape, 3), rays.valid.reshape(u.shape)
+        direction = rays.direction.reshape(*u.shape, 3)
+        pixel = np.linalg.norm(np.diff(direction, axis=1, append=direction[:, -2:-1]), axis=2)
+        return np.ascontiguousarray(origin), direction, np.where(rays.valid.reshape(u.shape), pixel, 0.0)
 
 
 def render(rig: Rig, options: RenderOptions | None = None, *, seed: int = 0) -> Rendering:

@@ -1,17 +1,21 @@
 """The world that is rendered, drawn by seed: nested grids of ground, rocks, and the plates of a deck."""
 
+from dataclasses import dataclass, replace
+
 import gtsam
 import numpy as np
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import affine_transform, shift
 from scipy.spatial.transform import Rotation
 
 from pancam_graph.geometry import FloatArray, IntArray
 from pancam_graph.simulate._options import RenderOptions
-from pancam_graph.simulate._raycast import Deck, Grids, Scene, heights, noises
+from pancam_graph.simulate import _rays
+from pancam_graph.simulate._rays import Deck, Grids, Scene, heights
 
 __all__ = ["make_deck", "make_scene", "slopes"]
 
 _MIPS = 8
+_SQUARINGS = 7
 _FINE_STEP_M, _FINE_REACH_M, _FINE_NODES = 0.03, 22.0, 9e6
 _MID_STEP_M, _MID_REACH_M, _MID_NODES = 0.25, 150.0, 4e6
 _FAR_NODES = 1024
@@ -31,44 +35,47 @@ Level = tuple[FloatArray, FloatArray, FloatArray]
 
 def make_scene(options: RenderOptions, xy_m: FloatArray, rng: np.random.Generator) -> Scene:
     """A world around stops at x and y (n, 2)."""
-    key = int(rng.integers(2**20))
+    noise = _Noise(_rays.make_lattice(rng), int(rng.integers(2**20)))
     low, high = xy_m.min(axis=0), xy_m.max(axis=0)
     reach = _FAR_REACH * options.ridge_m + np.max(high - low)
     middle = 0.5 * (low + high)
     far_frame = (middle - reach, 2 * reach / _FAR_NODES, (_FAR_NODES, _FAR_NODES))
     mid_frame = _frame(low - _MID_REACH_M, high + _MID_REACH_M, _MID_STEP_M, _MID_NODES)
     fine_frame = _frame(low - _FINE_REACH_M, high + _FINE_REACH_M, _FINE_STEP_M, _FINE_NODES)
-    far = _far(_nodes(far_frame), middle, options.ridge_m + float(np.max(high - low)) / 2, key)
-    mid = _mid(_nodes(mid_frame), _finer(far, far_frame, mid_frame), key + 100)
-    fine = _fine(_nodes(fine_frame), _finer(mid, mid_frame, fine_frame), fine_frame[1], key + 200)
+    far = _far(_nodes(far_frame), middle, options.ridge_m + float(np.max(high - low)) / 2, noise)
+    mid = _mid(_nodes(mid_frame), _finer(far, far_frame, mid_frame), noise.after(100))
+    fine = _fine(_nodes(fine_frame), _finer(mid, mid_frame, fine_frame), fine_frame[1], noise.after(200))
     frames, levels = (fine_frame, mid_frame, far_frame), (fine, mid, far)
-    arrays, shape, frame_m = _pyramids(levels, frames)
-    slope = np.array(
-        [_steepest(level[0].reshape(f[2]), f[1]) for level, f in zip(levels, frames, strict=True)]
-    )
     az, el = options.sun_azimuth_rad, options.sun_elevation_rad
-    empty = np.zeros((0, 17))
+    sun = np.array([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)])
+    grids = [level[0].reshape(frame[2]) for level, frame in zip(levels, frames, strict=True)]
+    surface, surface_shape, frame_m = _pyramids(levels, frames, _shades(grids, frames, sun))
+    ceiling, ceiling_shape = _ceilings(grids)
+    starts = np.cumsum([0, *[g.size for g in grids[:-1]]])
     scene = Scene(
-        height_m=arrays[0],
-        albedo=arrays[1],
-        outcrop=arrays[2],
-        shape=shape,
+        height_m=np.concatenate([g.ravel() for g in grids]).astype(np.float32),
+        ceiling_m=ceiling,
+        surface=surface,
+        height_shape=np.array([(at, *g.shape[::-1]) for at, g in zip(starts, grids, strict=True)]),
+        ceiling_shape=ceiling_shape,
+        surface_shape=surface_shape,
         frame_m=frame_m,
-        slope=slope,
-        top_m=float(max(level[0].max() for level in levels)),
-        rough_m=2 * float(np.abs(fine[0] - _finer(mid, mid_frame, fine_frame)[0]).max()),
-        tall_m=0.0,
-        rocks=empty,
+        steep=max(_steepest(g, f[1]) for g, f in zip(grids, frames, strict=True)),
+        top_m=float(max(g.max() for g in grids)),
+        rocks=np.zeros((0, 17)),
         forms=_forms(rng),
         cells=np.zeros(2, dtype=np.int64),
         cell_rocks=np.zeros(0, dtype=np.int64),
-        cell_top_m=np.full(1, -np.inf),
+        cell_top_m=np.full(2, -np.inf),
+        shaded=np.zeros(2, dtype=np.int64),
+        shaded_rocks=np.zeros(0, dtype=np.int64),
         cell_frame_m=np.array([*(low - _ROCK_REACH_M), _ROCK_CELL_M]),
         cell_shape=(1, 1),
         rock_top_m=-1e9,
-        sun=np.array([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)]),
+        lattice=noise.lattice,
+        sun=sun,
         haze_m=9000.0,
-        key=key,
+        key=noise.key,
     )
     return _with_rocks(scene, options, xy_m, low - _ROCK_REACH_M, high + _ROCK_REACH_M, rng)
 
@@ -102,6 +109,22 @@ def make_deck(mast_height_m: float, world_T_mast: gtsam.Pose3, *, seen: bool) ->
 Frame = tuple[FloatArray, float, tuple[int, int]]
 
 
+@dataclass(frozen=True)
+class _Noise:
+    """Fractal noise of one world."""
+
+    lattice: Grids
+    key: int
+
+    def __call__(
+        self, x: FloatArray, y: FloatArray, longest_m: float, shortest_m: float, gain: float, which: int
+    ) -> FloatArray:
+        return _rays.noises(self.lattice, x, y, longest_m, shortest_m, gain, self.key + which)
+
+    def after(self, more: int) -> "_Noise":
+        return replace(self, key=self.key + more)
+
+
 def _frame(low: FloatArray, high: FloatArray, step: float, most: float) -> Frame:
     step = max(step, float(np.sqrt(np.prod(high - low) / most)))
     across, deep = (int(n) for n in np.ceil((high - low) / step))
@@ -114,11 +137,16 @@ def _nodes(frame: Frame) -> Nodes:
     return (x + first[0]).ravel(), (y + first[1]).ravel()
 
 
+def _at_nodes(grid: FloatArray, frame: Frame, other: Frame, order: int = 1) -> FloatArray:
+    """A grid interpolated at the nodes of another, which lies within it."""
+    ratio = other[1] / frame[1]
+    offset = (other[0] - frame[0])[::-1] / frame[1]
+    return affine_transform(grid, [ratio, ratio], offset, output_shape=other[2], order=order)
+
+
 def _finer(level: Level, frame: Frame, finer: Frame) -> Level:
     """A level at the nodes of a finer one, smoothly interpolated."""
-    x, y = _nodes(finer)
-    at = np.stack([(y - frame[0][1]) / frame[1], (x - frame[0][0]) / frame[1]])
-    height, albedo, outcrop = (map_coordinates(a.reshape(frame[2]), at, order=3) for a in level)
+    height, albedo, outcrop = (_at_nodes(a.reshape(frame[2]), frame, finer, 3).ravel() for a in level)
     return height, albedo, outcrop
 
 
@@ -127,73 +155,112 @@ def _rise(value: FloatArray, low: float, high: float) -> FloatArray:
     return np.asarray(t * t * (3 - 2 * t))
 
 
-def _far(nodes: Nodes, middle: FloatArray, ridge_m: float, key: int) -> Level:
+def _far(nodes: Nodes, middle: FloatArray, ridge_m: float, noise: _Noise) -> Level:
     """Plains with a crater's rim around: eroded, higher here and lower there."""
     x, y = nodes
     dx, dy = x - middle[0], y - middle[1]
     away = np.hypot(dx, dy)
-    bend = noises(dx, dy, 1.2 * ridge_m, 0.1 * ridge_m, 0.5, key)
+    bend = noise(dx, dy, 1.2 * ridge_m, 0.1 * ridge_m, 0.5, 0)
     crest = ridge_m * (1 + 0.35 * bend)
-    gullies = noises(x, y, 0.25 * ridge_m, 0.012 * ridge_m, 0.52, key + 20)
+    gullies = noise(x, y, 0.25 * ridge_m, 0.012 * ridge_m, 0.52, 20)
     size = (
         _RIDGE_SIZE
         * ridge_m
-        * np.clip(0.75 + 1.5 * noises(dx, dy, 0.8 * ridge_m, 0.2 * ridge_m, 0.5, key + 10), 0.15, 2)
+        * np.clip(0.75 + 1.5 * noise(dx, dy, 0.8 * ridge_m, 0.2 * ridge_m, 0.5, 10), 0.15, 2)
     )
     ridge = size * np.exp(-(((away - crest) / (0.22 * ridge_m)) ** 2)) * (1 + 0.55 * gullies)
     # Ground drops a little away from the drive, so that the plains are seen and not only their edge.
-    plains = 0.02 * ridge_m * 0.25 * noises(x, y, 300.0, 25.0, 0.5, key + 30) * _rise(away, 20, 300)
-    albedo = 0.21 * (1 + 0.5 * noises(x, 1.7 * y, 260.0, 12.0, 0.65, key + 40))
+    plains = 0.02 * ridge_m * 0.25 * noise(x, y, 300.0, 25.0, 0.5, 30) * _rise(away, 20, 300)
+    albedo = 0.21 * (1 + 0.5 * noise(x, 1.7 * y, 260.0, 12.0, 0.65, 40))
     albedo *= 1 - 0.25 * _rise(away, 150, 500) * (away < crest) + 0.15 * _rise(away, 0.8 * ridge_m, ridge_m)
-    outcrop = _rise(noises(x, y, 60.0, 8.0, 0.5, key + 60), 0.05, 0.35)
+    outcrop = _rise(noise(x, y, 60.0, 8.0, 0.5, 60), 0.05, 0.35)
     return ridge + plains, np.clip(albedo, 0.08, 0.45), outcrop
 
 
-def _mid(nodes: Nodes, far: Level, key: int) -> Level:
+def _mid(nodes: Nodes, far: Level, noise: _Noise) -> Level:
     """Undulations of metres, patches of dust, sand and bare rock."""
     x, y = nodes
-    height = far[0] + 1.1 * noises(x, y, 26.0, 1.0, 0.52, key)
-    outcrop = _rise(0.6 * (far[2] - 0.3) + noises(x, y, 11.0, 0.5, 0.62, key + 20), 0.02, 0.30)
-    dust = noises(x, y, 14.0, 0.7, 0.62, key + 40)
+    height = far[0] + 1.1 * noise(x, y, 26.0, 1.0, 0.52, 0)
+    outcrop = _rise(0.6 * (far[2] - 0.3) + noise(x, y, 11.0, 0.5, 0.62, 20), 0.02, 0.30)
+    dust = noise(x, y, 14.0, 0.7, 0.62, 40)
     return height, np.clip(far[1] * (1 + 0.28 * dust + 0.22 * outcrop), 0.10, 0.33), outcrop
 
 
-def _fine(nodes: Nodes, mid: Level, step: float, key: int) -> Level:
+def _fine(nodes: Nodes, mid: Level, step: float, noise: _Noise) -> Level:
     """Decimetres: wind ripples where there is sand, steps and joints where there is rock."""
     x, y = nodes
-    outcrop = np.clip(mid[2] + 0.9 * noises(x, y, 0.8, 0.1, 0.6, key) * mid[2], 0, 1)
-    sand = (1 - outcrop) * _rise(noises(x, y, 7.0, 1.5, 0.5, key + 20), 0.08, 0.4)
-    warp = 0.35 * noises(x, y, 2.2, 0.5, 0.5, key + 40)
+    outcrop = np.clip(mid[2] + 0.9 * noise(x, y, 0.8, 0.1, 0.6, 0) * mid[2], 0, 1)
+    sand = (1 - outcrop) * _rise(noise(x, y, 7.0, 1.5, 0.5, 20), 0.08, 0.4)
+    warp = 0.35 * noise(x, y, 2.2, 0.5, 0.5, 40)
     phase = 2 * np.pi * (0.83 * x + 0.55 * y + warp) / 0.21
     wave = 0.5 + 0.5 * np.sin(phase + 0.5 * np.sin(phase))
-    rough = noises(x, y, 0.7, 0.09, 0.55, key + 60)
+    rough = noise(x, y, 0.7, 0.09, 0.55, 60)
     height = mid[0] + 0.035 * rough * (1 - 0.6 * sand) + 0.011 * sand * wave + 0.025 * outcrop
-    albedo = mid[1] * (1 + 0.22 * noises(x, y, 0.6, 2.4 * step, 0.68, key + 80) + 0.12 * (outcrop - mid[2]))
+    albedo = mid[1] * (1 + 0.22 * noise(x, y, 0.6, 2.4 * step, 0.68, 80) + 0.12 * (outcrop - mid[2]))
     return height, albedo * (1 + 0.08 * sand * (wave - 0.5)), outcrop
 
 
+def _shades(grids: list[FloatArray], frames: tuple[Frame, ...], sun: FloatArray) -> list[FloatArray]:
+    """Per node of each grid, the height up to which ground keeps the sun away."""
+    across = float(np.hypot(sun[0], sun[1]))
+    towards, rise = sun[1::-1] / max(across, 1e-9), sun[2] / max(across, 1e-9)
+    shades: list[FloatArray] = []
+    for grid, frame in reversed(list(zip(grids, frames, strict=True))):
+        reached, nodes = np.ptp(grid) / (rise * frame[1]), 1.0
+        shade = shift(grid, -towards, order=1, mode="nearest") - rise * frame[1]
+        while nodes < min(reached, max(grid.shape)):
+            # The highest of the next 2n nodes: of n, and of n from there.
+            further = shift(shade, -nodes * towards, order=1, mode="nearest") - nodes * rise * frame[1]
+            shade, nodes = np.maximum(shade, further), 2 * nodes
+        if shades:
+            shade = np.maximum(shade, _at_nodes(shades[0], before, frame))
+        shades.insert(0, shade)
+        before = frame
+    return shades
+
+
 def _pyramids(
-    levels: tuple[Level, ...], frames: tuple[Frame, ...]
-) -> tuple[list[Grids], IntArray, FloatArray]:
-    """All grids of all levels, each followed by its halvings, one after the other."""
+    levels: tuple[Level, ...], frames: tuple[Frame, ...], shades: list[FloatArray]
+) -> tuple[Grids, IntArray, FloatArray]:
+    """What the nodes of all grids carry, each grid followed by its halvings."""
     shape, frame_m = np.zeros((len(levels), _MIPS, 3), dtype=np.int64), np.zeros((len(levels), _MIPS, 3))
-    parts: list[list[FloatArray]] = [[], [], []]
+    parts: list[Grids] = []
     start = 0
-    for i, (level, (first, finest, whole)) in enumerate(zip(levels, frames, strict=True)):
-        grids: list[FloatArray] = [a.reshape(whole) for a in level]
-        size = whole
+    for i, (level, (first, finest, whole), shade) in enumerate(zip(levels, frames, shades, strict=True)):
+        height, albedo, outcrop = (a.reshape(whole) for a in level)
+        slope_y, slope_x = np.gradient(height, finest)
+        grid = np.stack([slope_x, slope_y, albedo, outcrop, shade], axis=-1).astype(np.float32)
         corner, step = first.astype(float), finest
         for mip in range(_MIPS):
-            deep, across = size
+            deep, across = grid.shape[:2]
             shape[i, mip], frame_m[i, mip] = (start, across, deep), (*corner, step)
             start += deep * across
-            for part, grid in zip(parts, grids, strict=True):
-                part.append(grid.ravel())
+            parts.append(grid.reshape(-1, _rays.CHANNELS))
             corner, step = corner + step / 2, 2 * step
-            size = (deep // 2, across // 2)
-            even = [g[: deep // 2 * 2, : across // 2 * 2] for g in grids]
-            grids = [0.25 * (g[::2, ::2] + g[1::2, ::2] + g[::2, 1::2] + g[1::2, 1::2]) for g in even]
-    return [np.concatenate(part).astype(np.float32) for part in parts], shape, frame_m
+            even = grid[: deep // 2 * 2, : across // 2 * 2]
+            grid = 0.25 * (even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2])
+    return np.concatenate(parts).ravel(), shape, frame_m
+
+
+def _ceilings(grids: list[FloatArray]) -> tuple[Grids, IntArray]:
+    """Per mesh of each grid the height that it does not exceed, and per square of four, of sixteen ..."""
+    shape = np.zeros((len(grids), _SQUARINGS, 3), dtype=np.int64)
+    parts: list[Grids] = []
+    start = 0
+    for i, grid in enumerate(grids):
+        # As rounded as the heights themselves.
+        g = grid.astype(np.float32)
+        top = np.maximum(np.maximum(g[1:, 1:], g[1:, :-1]), np.maximum(g[:-1, 1:], g[:-1, :-1]))
+        for squaring in range(_SQUARINGS):
+            shape[i, squaring] = (start, *top.shape[::-1])
+            start += top.size
+            parts.append(top.ravel())
+            odd = [(0, n % 2) for n in top.shape]
+            top = np.pad(top, odd, constant_values=-np.inf)
+            top = np.maximum(
+                np.maximum(top[::2, ::2], top[1::2, ::2]), np.maximum(top[::2, 1::2], top[1::2, 1::2])
+            )
+    return np.concatenate(parts), shape
 
 
 def _steepest(height_m: FloatArray, step: float) -> float:
@@ -240,7 +307,7 @@ def _with_rocks(
     # Twice as many, of which half are left where they cluster.
     size = _diameters(options.rock_abundance, 2 * float(np.prod(high - low)), rng)
     xy = low + rng.random((len(size), 2)) * (high - low)
-    field = noises(xy[:, 0], xy[:, 1], 9.0, 0.5, 0.6, scene.key + 300)
+    field = _Noise(scene.lattice, scene.key)(xy[:, 0], xy[:, 1], 9.0, 0.5, 0.6, 300)
     away = np.min([np.linalg.norm(xy - s, axis=1) for s in stops_m], axis=0)
     kept = (rng.random(len(size)) < np.clip(0.45 + 1.3 * field, 0.06, 1)) & (away > _CLEAR_M + size)
     kept &= size > _ROCK_RAD * away
@@ -262,30 +329,47 @@ def _with_rocks(
     rocks[:, 14] = np.where(bright, rng.uniform(0.19, 0.24, n), rng.uniform(0.12, 0.19, n))
     rocks[:, 15] = axes[:, :2].max(axis=1)
     rocks[:, 16] = rng.integers(2**20, size=n)
-    # A rock's top may be over lower ground than its middle.
-    tall_m = float((rocks[:, 12] - heights(scene, xy) + scene.slope[0] * rocks[:, 15]).max())
-    return _sorted_into_cells(scene._replace(rocks=rocks, tall_m=tall_m), low, high)
+    return _sorted_into_cells(scene._replace(rocks=rocks), low, high)
 
 
 def _sorted_into_cells(scene: Scene, low: FloatArray, high: FloatArray) -> Scene:
-    """Rocks by the cells that they, and the dim ground around them, reach into."""
+    """Rocks by the cells that they reach into, and by those that they shade."""
     across, deep = (int(c) for c in np.ceil((high - low) / _ROCK_CELL_M))
-    reach = 1.6 * scene.rocks[:, 15:16]
-    first = np.floor((scene.rocks[:, :2] - reach - low) / _ROCK_CELL_M).astype(np.int64)
-    last = np.floor((scene.rocks[:, :2] + reach - low) / _ROCK_CELL_M).astype(np.int64)
-    first, last = np.clip(first, 0, [across - 1, deep - 1]), np.clip(last, 0, [across - 1, deep - 1])
-    wide = last - first + 1
-    counts = wide.prod(axis=1)
-    rock = np.repeat(np.arange(len(counts)), counts)
-    nth = np.arange(len(rock)) - np.repeat(np.cumsum(counts) - counts, counts)
-    cell = (first[rock, 1] + nth // wide[rock, 0]) * across + first[rock, 0] + nth % wide[rock, 0]
+    rocks, shape = scene.rocks, (across, deep)
+    xy, radius = rocks[:, :2], rocks[:, 15:16]
+    cell, rock = _cells_of(xy - radius - low, xy + radius - low, shape)
     order = np.argsort(cell, kind="stable")
-    top = np.full(across * deep, -np.inf)
-    np.maximum.at(top, cell, scene.rocks[rock, 12])
+    top = np.full((deep, across), -np.inf)
+    np.maximum.at(top.reshape(-1), cell, rocks[rock, 12])
+    padded = np.pad(top, [(0, -n % _rays.BLOCK) for n in top.shape], constant_values=-np.inf)
+    blocks = padded.reshape(len(padded) // _rays.BLOCK, _rays.BLOCK, -1, _rays.BLOCK).max(axis=(1, 3))
+    # The shadow ends on ground that may lie lower than the rock's own.
+    lower = rocks[:, 12] - heights(scene, xy) + 0.5 * radius[:, 0]
+    tip = xy - lower[:, None] * scene.sun[:2] / scene.sun[2]
+    margin = _rays.DIM_FOOT * radius
+    shaded, shading = _cells_of(
+        np.minimum(xy - margin, tip - radius) - low, np.maximum(xy + margin, tip + radius) - low, shape
+    )
+    by_cell = np.argsort(shaded, kind="stable")
+    bounds = np.arange(across * deep + 1)
     return scene._replace(
-        cells=np.searchsorted(cell[order], np.arange(across * deep + 1)),
+        cells=np.searchsorted(cell[order], bounds),
         cell_rocks=rock[order],
-        cell_top_m=top,
-        cell_shape=(across, deep),
+        cell_top_m=np.concatenate([top.ravel(), blocks.ravel()]),
+        shaded=np.searchsorted(shaded[by_cell], bounds),
+        shaded_rocks=shading[by_cell],
+        cell_shape=shape,
         rock_top_m=float(top.max()),
     )
+
+
+def _cells_of(low: FloatArray, high: FloatArray, shape: tuple[int, int]) -> tuple[IntArray, IntArray]:
+    """Cells, and which of the boxes from `low` to `high` (n, 2) reaches into each: all pairs."""
+    across, deep = shape
+    first = np.clip(np.floor(low / _ROCK_CELL_M).astype(np.int64), 0, [across - 1, deep - 1])
+    last = np.clip(np.floor(high / _ROCK_CELL_M).astype(np.int64), 0, [across - 1, deep - 1])
+    wide = last - first + 1
+    counts = wide.prod(axis=1)
+    box = np.repeat(np.arange(len(counts)), counts)
+    nth = np.arange(len(box)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return (first[box, 1] + nth // wide[box, 0]) * across + first[box, 0] + nth % wide[box, 0], box

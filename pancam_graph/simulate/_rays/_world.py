@@ -1,0 +1,79 @@
+"""What rays may meet, as arrays that the compiled loops read."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pancam_graph.geometry import FloatArray, IntArray
+
+__all__ = ["ALBEDO", "CHANNELS", "OUTCROP", "SHADE", "SLOPE_X", "SLOPE_Y", "Deck", "Grids", "Scene"]
+
+Grids = NDArray[np.float32]
+
+SLOPE_X, SLOPE_Y, ALBEDO, OUTCROP, SHADE = range(5)
+"""What a node of the ground has beside its height: slopes, reflectance, 0 soil to 1 bare rock, and the height
+up to which other ground keeps the sun away."""
+CHANNELS = 5
+
+
+class Scene(NamedTuple):
+    """Everything fixed to the world."""
+
+    height_m: Grids
+    """Heights of the nodes of all grids, one grid after the other; x runs fastest."""
+    ceiling_m: Grids
+    """Heights that the ground in a square of 2^k x 2^k meshes does not exceed, for all k of all grids."""
+    surface: Grids
+    """CHANNELS numbers per node of all mips of all grids."""
+    height_shape: IntArray
+    """(levels, 3): where a grid starts in `height_m`, its nodes along x and along y."""
+    ceiling_shape: IntArray
+    """(levels, squarings, 3): the same for `ceiling_m`."""
+    surface_shape: IntArray
+    """(levels, mips, 3): the same for `surface`. A mip halves the one before."""
+    frame_m: FloatArray
+    """(levels, mips, 3): x and y of a grid's first node, and its step."""
+    steep: float
+    """A slope that hardly any ground exceeds."""
+    top_m: float
+    """Height of the highest ground."""
+    rocks: FloatArray
+    """(rocks, 17): centre, world to unit ball (9, by rows), top, form, albedo, radius from above, key."""
+    forms: FloatArray
+    """(forms, planes, 4): unit normal and distance of the planes that cut a ball into a rock's form."""
+    cells: IntArray
+    """(cells + 1,) where the rocks over a cell start in `cell_rocks`; x runs fastest."""
+    cell_rocks: IntArray
+    """Rocks of all cells."""
+    cell_top_m: FloatArray
+    """Height of the highest rock over a cell, and after all cells, over blocks of them."""
+    shaded: IntArray
+    """(cells + 1,) the same for `shaded_rocks`."""
+    shaded_rocks: IntArray
+    """Rocks whose shadow, or dim foot, reaches into a cell."""
+    cell_frame_m: FloatArray
+    """(3,) x and y of the corner of the first cell, and the width of a cell."""
+    cell_shape: tuple[int, int]
+    """Cells along x and along y."""
+    rock_top_m: float
+    """Height of the highest rock."""
+    lattice: Grids
+    """(side, side, 2) random slopes at the nodes of all noise."""
+    sun: FloatArray
+    """(3,) unit vector to the sun."""
+    haze_m: float
+    """Distance at which 63 % of the light is the haze's."""
+    key: int
+    """Which fine detail."""
+
+
+class Deck(NamedTuple):
+    """The rover's deck as one mast sees it: flat plates that move along with the mast."""
+
+    rotation: FloatArray
+    """(3, 3) world_R_mast."""
+    centre_m: FloatArray
+    """(3,) of the mast in the world."""
+    plates_m: FloatArray
+    """(plates, corners, 3): convex, anticlockwise, in the mast frame; none where there is no deck."""
