@@ -32,6 +32,7 @@ _OVERLAP = 0.2  # of neighbouring frames, as a share of the widest eye's field
 _BELOW_HORIZON = 0.4  # where the row looks, as a share of the field down
 _BAND_PX = 128  # rows that one thread renders at a time
 _KEPT_PX = 8_000_000  # lines of sight that are kept from image to image
+_RIM_PIXEL_RAD = 1e-3  # width of a pixel whose neighbour sees nothing
 _EDGE_RAYS = 2  # along each side of a pixel that lies on an edge
 
 
@@ -57,7 +58,7 @@ def _trace(
 ) -> _Traced:
     """Follow rays; `below` and `over` name rays under them, of these or of others with their distances."""
     n = len(direction)
-    out = _Traced(*(np.empty(n) for _ in range(3)), np.empty(n, dtype=np.int64))
+    out = _Traced(np.empty(n), np.empty(n), np.empty(n), np.empty(n, dtype=np.int64))
     below = np.full(n, -1) if below is None else below
     rays = (origin_m, np.ascontiguousarray(direction), pixel_rad, below)
     _rays.trace(scene, deck, *rays, *(over or (rays[1], out.ground_m)), lit, *out)
@@ -81,7 +82,9 @@ class _View:
         below = np.arange(columns, len(pixel) + columns)
         below[-columns:] = -1
         traced = _trace(self.scene, self.deck, self.origin_m, direction, pixel, below)
-        rough = np.flatnonzero(_edges(traced.edge.reshape(rows, columns), traced.distance_m.reshape(rows, columns)))
+        rough = np.flatnonzero(
+            _edges(traced.edge.reshape(rows, columns), traced.distance_m.reshape(rows, columns))
+        )
         light = traced.light
         steps = (np.arange(_EDGE_RAYS) + 0.5) / _EDGE_RAYS - 0.5
         down = 0.5 * (direction[rough + columns] - direction[rough - columns])
@@ -145,7 +148,9 @@ class Rendering:
             # Each band is rendered with what the optics smear into it, and stands for itself.
             rows = np.arange(begin - HALO_PX, end + HALO_PX)
             origin, direction, pixel = self._band_rays(eye, rows)
-            view = _View(self._scene, self._deck(row), centre + origin @ rotation.T, direction @ rotation.T, pixel)
+            view = _View(
+                self._scene, self._deck(row), centre + origin @ rotation.T, direction @ rotation.T, pixel
+            )
             part = view.light()
             inner = slice(HALO_PX if begin else 0, len(part) - (HALO_PX if end < camera.height_px else 0))
             light[begin + inner.start : begin + inner.stop] = part[inner]
@@ -161,8 +166,9 @@ class Rendering:
         """
         rotation, centre = self._camera(row)
         camera = self.truth.rig.eyes[int(self.traverse.image_eye[row])].camera
-        rays, beside = camera.unproject(uv_px), camera.unproject(uv_px + [1, 0])
+        rays, beside = camera.unproject(uv_px), camera.unproject(uv_px + np.array([1.0, 0.0]))
         pixel = np.linalg.norm(beside.direction - rays.direction, axis=1)
+        pixel = np.where(rays.valid & beside.valid, pixel, _RIM_PIXEL_RAD)
         origin, direction = centre + rays.origin_m @ rotation.T, rays.direction @ rotation.T
         traced = _trace(self._scene, self._deck(row), origin, direction, pixel, lit=False)
         distance = traced.distance_m
@@ -204,8 +210,11 @@ class Rendering:
         rays = camera.unproject(np.stack([u, v], axis=-1).reshape(-1, 2))
         origin = rays.origin_m if camera.pupil_moves else rays.origin_m[:1]
         direction = rays.direction.reshape(*u.shape, 3)
+        valid = rays.valid.reshape(u.shape)
         pixel = np.linalg.norm(np.diff(direction, axis=1, append=direction[:, -2:-1]), axis=2)
-        return np.ascontiguousarray(origin), direction, np.where(rays.valid.reshape(u.shape), pixel, 0.0)
+        beside = np.append(valid[:, 1:], valid[:, -2:-1], axis=1)
+        pixel = np.where(valid, np.where(beside, pixel, _RIM_PIXEL_RAD), 0.0)
+        return np.ascontiguousarray(origin), direction, pixel
 
 
 def render(rig: Rig, options: RenderOptions | None = None, *, seed: int = 0) -> Rendering:

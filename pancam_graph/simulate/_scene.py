@@ -1,6 +1,7 @@
 """The world that is rendered, drawn by seed: nested grids of ground, rocks, and the plates of a deck."""
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import gtsam
 import numpy as np
@@ -8,8 +9,8 @@ from scipy.ndimage import affine_transform, shift
 from scipy.spatial.transform import Rotation
 
 from pancam_graph.geometry import FloatArray, IntArray
-from pancam_graph.simulate._options import RenderOptions
 from pancam_graph.simulate import _rays
+from pancam_graph.simulate._options import RenderOptions
 from pancam_graph.simulate._rays import Deck, Grids, Scene, heights
 
 __all__ = ["make_deck", "make_scene", "slopes"]
@@ -137,11 +138,14 @@ def _nodes(frame: Frame) -> Nodes:
     return (x + first[0]).ravel(), (y + first[1]).ravel()
 
 
-def _at_nodes(grid: FloatArray, frame: Frame, other: Frame, order: int = 1) -> FloatArray:
+def _at_nodes(grid: FloatArray, frame: Frame, other: Frame, order: Literal[1, 3] = 1) -> FloatArray:
     """A grid interpolated at the nodes of another, which lies within it."""
     ratio = other[1] / frame[1]
     offset = (other[0] - frame[0])[::-1] / frame[1]
-    return affine_transform(grid, [ratio, ratio], offset, output_shape=other[2], order=order)
+    out: FloatArray = affine_transform(
+        grid, np.array([ratio, ratio]), offset, output_shape=other[2], order=order
+    )
+    return out
 
 
 def _finer(level: Level, frame: Frame, finer: Frame) -> Level:
@@ -183,7 +187,7 @@ def _mid(nodes: Nodes, far: Level, noise: _Noise) -> Level:
     height = far[0] + 1.1 * noise(x, y, 26.0, 1.0, 0.52, 0)
     outcrop = _rise(0.6 * (far[2] - 0.3) + noise(x, y, 11.0, 0.5, 0.62, 20), 0.02, 0.30)
     dust = noise(x, y, 14.0, 0.7, 0.62, 40)
-    return height, np.clip(far[1] * (1 + 0.28 * dust + 0.22 * outcrop), 0.10, 0.33), outcrop
+    return height, np.clip(far[1] * (1 + 0.22 * dust + 0.12 * outcrop), 0.10, 0.33), outcrop
 
 
 def _fine(nodes: Nodes, mid: Level, step: float, noise: _Noise) -> Level:
@@ -205,6 +209,7 @@ def _shades(grids: list[FloatArray], frames: tuple[Frame, ...], sun: FloatArray)
     across = float(np.hypot(sun[0], sun[1]))
     towards, rise = sun[1::-1] / max(across, 1e-9), sun[2] / max(across, 1e-9)
     shades: list[FloatArray] = []
+    around: Frame | None = None
     for grid, frame in reversed(list(zip(grids, frames, strict=True))):
         reached, nodes = np.ptp(grid) / (rise * frame[1]), 1.0
         shade = shift(grid, -towards, order=1, mode="nearest") - rise * frame[1]
@@ -212,10 +217,10 @@ def _shades(grids: list[FloatArray], frames: tuple[Frame, ...], sun: FloatArray)
             # The highest of the next 2n nodes: of n, and of n from there.
             further = shift(shade, -nodes * towards, order=1, mode="nearest") - nodes * rise * frame[1]
             shade, nodes = np.maximum(shade, further), 2 * nodes
-        if shades:
-            shade = np.maximum(shade, _at_nodes(shades[0], before, frame))
+        if around is not None:
+            shade = np.maximum(shade, _at_nodes(shades[0], around, frame))
         shades.insert(0, shade)
-        before = frame
+        around = frame
     return shades
 
 

@@ -52,5 +52,8 @@ def panel(lattice: Grids, plate: int, x: float, y: float, rim: float, foot: floa
     gap = min(min(a - i, 1 - (a - i)) * 0.105, min(b - j, 1 - (b - j)) * 0.062)
     cell = 0.185 + 0.02 * ((hashed(int(i), int(j), plate) & 0xFF) / 255.0 - 0.5)
     line = min(1.0, max(0.0, (0.0025 - gap) / max(foot, 0.001) + 0.5))
-    dust = 0.012 * noise(lattice, x * 14, y * 14, 5 + plate)[0] + 0.02 * noise(lattice, x * 3, y * 3, 9 + plate)[0]
+    dust = (
+        0.012 * noise(lattice, x * 14, y * 14, 5 + plate)[0]
+        + 0.02 * noise(lattice, x * 3, y * 3, 9 + plate)[0]
+    )
     return cell + dust + 0.16 * line * ((hashed(int(i) + 7, int(j), plate) >> 8 & 3) > 0)

@@ -70,7 +70,8 @@ def sample(
 ) -> tuple[float, float, float, float, float]:
     """What the ground carries around a place, over a round footprint: the channels in their order."""
     last = scene.surface_shape.shape[1] - 1
-    mip = math.log2(max(foot / scene.frame_m[level, 0, 2], 1.0))
+    wider = foot / scene.frame_m[level, 0, 2]
+    mip = math.log2(wider) if wider > 1 else 0.0
     first = min(int(mip), last)
     part = mip - first
     c0 = c1 = c2 = c3 = c4 = 0.0
@@ -110,7 +111,7 @@ def march_start(
     A ray that rises above the other by more than the ground does sideways between them is free as long as
     the other was.
     """
-    across, other = math.hypot(dx, dy), math.hypot(ex, ey)
+    across, other = math.sqrt(dx * dx + dy * dy), math.sqrt(ex * ex + ey * ey)
     rise, aside = dz * other - ez * across, abs(dx * ey - dy * ex)
     if dx * ex + dy * ey <= 0 or rise < scene.steep * aside:
         return NEAREST_M
@@ -123,9 +124,9 @@ def march(
 ) -> float:
     """Distance along a ray to the ground, not before `start`; infinite in the sky.
 
-    Squares of meshes that lie wholly below the ray are passed in one step (Tevs, Ihrke and Seidel 2008, Maximum
-    mipmaps for fast, accurate, and scalable dynamic height field rendering); in a mesh the ray meets a
-    bilinear surface, which is a quadratic equation.
+    Squares of meshes that lie wholly below the ray are passed in one step (Tevs, Ihrke and Seidel 2008,
+    Maximum mipmaps for fast, accurate, and scalable dynamic height field rendering); in a mesh the ray meets
+    a bilinear surface, which is a quadratic equation.
     """
     dx = dx if abs(dx) > 1e-12 else 1e-12
     dy = dy if abs(dy) > 1e-12 else 1e-12
@@ -160,7 +161,7 @@ def march(
             i = min(max(int((ox + beyond * dx - x0) / size), 0), wide_c - 1)
             j = min(max(int((oy + beyond * dy - y0) / size), 0), deep_c - 1)
             end_i, end_j = (x0 + (i + to_i) * size - ox) * per_x, (y0 + (j + to_j) * size - oy) * per_y
-            end = max(min(min(end_i, end_j), leave), beyond)
+            end = max(min(end_i, end_j, leave), beyond)
             if min(oz + t * dz, oz + end * dz) > scene.ceiling_m[start_c + j * wide_c + i]:
                 t = end
                 # In another square of the next size: that may be free as a whole.

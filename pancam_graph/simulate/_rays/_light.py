@@ -61,22 +61,25 @@ def of_ground(
     along: float,
     sun: float,
     sky: float,
+    here: tuple[float, float, float, float, float],
 ) -> float:
     """Radiance of the ground over a footprint `across` wide and `along` long in the direction (ux, uy).
 
-    Detail is averaged along the footprint, not around it: far ground, seen at a glance, would be smeared
-    sideways.
+    `here` is a sample of the middle. Detail is averaged along the footprint, not around it: far ground, seen
+    at a glance, would be smeared sideways.
     """
     step = scene.frame_m[level, 0, 2]
     taps = min(max(int(0.5 * along / max(across, step) + 0.5), 1), _MAX_TAPS)
     foot = max(across, along / taps)
-    gx = gy = albedo = outcrop = lit = 0.0
-    for n in range(taps):
-        shift = ((n + 0.5) / taps - 0.5) * along
-        a, b, c, d, e = sample(scene, level, x + shift * ux, y + shift * uy, foot)
-        gx, gy, albedo, outcrop, lit = gx + a, gy + b, albedo + c, outcrop + d, lit + e
-    gx, gy, albedo, outcrop = gx / taps, gy / taps, albedo / taps, outcrop / taps
-    lit = sunlit(lit / taps, z, along)
+    gx, gy, albedo, outcrop, lit = here
+    if taps > 1 or foot > step:
+        gx = gy = albedo = outcrop = lit = 0.0
+        for n in range(taps):
+            shift = ((n + 0.5) / taps - 0.5) * along
+            a, b, c, d, e = sample(scene, level, x + shift * ux, y + shift * uy, foot)
+            gx, gy, albedo, outcrop, lit = gx + a, gy + b, albedo + c, outcrop + d, lit + e
+        gx, gy, albedo, outcrop, lit = gx / taps, gy / taps, albedo / taps, outcrop / taps, lit / taps
+    lit = sunlit(lit, z, along)
     rough = 1 - 0.6 * outcrop if level == 0 else 1.4
     length, px, py, vx, vy, k = 2.4 * step, x, y, ux, uy, scene.key
     c, s = 1.0, 0.0

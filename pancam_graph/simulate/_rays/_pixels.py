@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable
 
-
 from pancam_graph.geometry import FloatArray, IntArray
 from pancam_graph.simulate._rays._compiling import SOURCES, entry, inlined
 from pancam_graph.simulate._rays._deck import RIM_M, hit_deck, panel
@@ -33,7 +32,7 @@ def _trace(
     start: float,
     lit: bool,
 ) -> tuple[float, float, int, float]:
-    """Radiance (if asked for) and distance of a ray, a number that changes at edges, distance of the ground."""
+    """Radiance (if `lit`) and distance of a ray, a number that changes at edges, the ground's distance."""
     ground = math.inf
     for _ in range(2):
         ground = march(scene, ox, oy, oz, dx, dy, dz, start)
@@ -50,7 +49,7 @@ def _trace(
         sx, sy, sz = scene.sun
         cover, over = 0.0, 0.0
         if plate < 0:
-            slope_x, slope_y, _, _, shade_m = sample(scene, level, x, y, 0.0)
+            slope_x, slope_y, albedo, outcrop, shade_m = sample(scene, level, x, y, 0.0)
             over = 0.0 if rock < 0 else z - height_at(scene, level, x, y)
             if over < TALLEST_M:
                 near, cover, nx, ny, nz, size, number = hit_stones(
@@ -64,9 +63,9 @@ def _trace(
                 dark = hit_deck(deck, x, y, z + lift, sx, sy, sz, _DECK_REACH_M)[1] >= 0
             sun = 0.0 if dark else 1.0
             if plate >= 0:
-                albedo = panel(scene.lattice, plate, plate_x, plate_y, rim, across / max(0.15, abs(dz)))
+                painted = panel(scene.lattice, plate, plate_x, plate_y, rim, across / max(0.15, abs(dz)))
                 r = deck.rotation
-                light = reflected(scene, r[0, 2], r[1, 2], r[2, 2], albedo, sun, 1.0)
+                light = reflected(scene, r[0, 2], r[1, 2], r[2, 2], painted, sun, 1.0)
                 key = 2 + plate + 16 * (rim < RIM_M)
             elif rock >= 0:
                 sun *= sunlit(shade_m, z, across)
@@ -75,14 +74,26 @@ def _trace(
             else:
                 key = 0
                 if cover < 1:
-                    flat = math.hypot(dx, dy) + 1e-12
+                    flat = math.sqrt(dx * dx + dy * dy) + 1e-12
                     facing = (slope_x * dx + slope_y * dy - dz) / math.sqrt(
                         1 + slope_x * slope_x + slope_y * slope_y
                     )
                     along = across / max(facing, 0.02)
                     sun_left, sky_left = stone_shade(scene, x, y, z, math.sqrt(across * along))
+                    here = (slope_x, slope_y, albedo, outcrop, shade_m)
                     light = of_ground(
-                        scene, level, x, y, z, dx / flat, dy / flat, across, along, sun * sun_left, sky * sky_left
+                        scene,
+                        level,
+                        x,
+                        y,
+                        z,
+                        dx / flat,
+                        dy / flat,
+                        across,
+                        along,
+                        sun * sun_left,
+                        sky * sky_left,
+                        here,
                     )
             key += 1 if dark else 0
             if cover > 0:
@@ -136,7 +147,17 @@ def _tracing(sources: int) -> Callable[..., None]:
                 bx, by, bz = below_direction[n, 0], below_direction[n, 1], below_direction[n, 2]
                 start = march_start(scene, dx, dy, dz, bx, by, bz, below_m[n])
             light[i], distance_m[i], edge[i], ground_m[i] = _trace(
-                scene, deck, origin_m[o, 0], origin_m[o, 1], origin_m[o, 2], dx, dy, dz, pixel_rad[i], start, lit
+                scene,
+                deck,
+                origin_m[o, 0],
+                origin_m[o, 1],
+                origin_m[o, 2],
+                dx,
+                dy,
+                dz,
+                pixel_rad[i],
+                start,
+                lit,
             )
 
     return trace

@@ -16,9 +16,17 @@ DIM_FOOT = 1.6
 
 @part
 def through_form(
-    forms: FloatArray, form: int, ax: float, ay: float, az: float, bx: float, by: float, bz: float
+    forms: FloatArray,
+    form: int,
+    planes: int,
+    ax: float,
+    ay: float,
+    az: float,
+    bx: float,
+    by: float,
+    bz: float,
 ) -> tuple[float, float, int]:
-    """Where the ray a + t b enters and leaves a form, and through which plane it enters (-1: the ball).
+    """Where the ray a + t b enters and leaves the first planes of a form, and through which (-1: the ball).
 
     It enters at infinity where it misses.
     """
@@ -28,7 +36,7 @@ def through_form(
         return math.inf, 0.0, -1
     root = math.sqrt(inside)
     enter, leave, face = (-ab - root) / bb, (-ab + root) / bb, -1
-    for k in range(forms.shape[1]):
+    for k in range(planes):
         nx, ny, nz = forms[form, k, 0], forms[form, k, 1], forms[form, k, 2]
         towards = nx * bx + ny * by + nz * bz
         out = nx * ax + ny * ay + nz * az - forms[form, k, 3]
@@ -63,7 +71,7 @@ def _cut(
     bx = rocks[n, 3] * dx + rocks[n, 4] * dy + rocks[n, 5] * dz
     by = rocks[n, 6] * dx + rocks[n, 7] * dy + rocks[n, 8] * dz
     bz = rocks[n, 9] * dx + rocks[n, 10] * dy + rocks[n, 11] * dz
-    enter, _, face = through_form(forms, int(rocks[n, 13]), ax, ay, az, bx, by, bz)
+    enter, _, face = through_form(forms, int(rocks[n, 13]), forms.shape[1], ax, ay, az, bx, by, bz)
     return (enter if enter > 1e-6 else math.inf), face
 
 
@@ -96,7 +104,10 @@ def hit_rocks(
         size = BLOCK * cell if block else cell
         beyond = t + 1e-9 * (1 + t)
         i = min(max(int((ox + beyond * dx - x0) / size), 0), (wide_b if block else wide) - 1)
-        j = min(max(int((oy + beyond * dy - y0) / size), 0), (deep + BLOCK - 1) // BLOCK - 1 if block else deep - 1)
+        j = min(
+            max(int((oy + beyond * dy - y0) / size), 0),
+            (deep + BLOCK - 1) // BLOCK - 1 if block else deep - 1,
+        )
         end_i, end_j = (x0 + (i + to_i) * size - ox) * per_x, (y0 + (j + to_j) * size - oy) * per_y
         leave = max(min(end_i, end_j), beyond)
         at = first_b + j * wide_b + i if block else j * wide + i
@@ -133,7 +144,8 @@ def rock_shade(scene: Scene, x: float, y: float, z: float, but: int) -> tuple[bo
             rock = scene.shaded_rocks[n]
             if rock == but:
                 continue
-            away = math.hypot(x - scene.rocks[rock, 0], y - scene.rocks[rock, 1]) / scene.rocks[rock, 15]
+            px, py = x - scene.rocks[rock, 0], y - scene.rocks[rock, 1]
+            away = math.sqrt(px * px + py * py) / scene.rocks[rock, 15]
             if away < DIM_FOOT:
                 sky *= 1 - 0.5 * min(1.0, (DIM_FOOT - away) / 0.9)
             if not dark and z < scene.rocks[rock, 12]:

@@ -18,7 +18,8 @@ _CELL_M = 0.12  # the coarsest grid's: stones up to 4 cm; what is larger is a ro
 _CLASSES = 6
 _RADIUS = 0.16  # of the largest, over the width of its cell
 _TALL = 0.15  # how far the tallest rises over the ground, over the same
-_SMALLEST = 0.7  # radius of the largest of a class below which the class is left out, over the pixel's width
+_SMALLEST = 1.0  # radius of the largest of a class below which the class is left out, over the pixel's width
+_ROUND = 2.0  # half axes, over the pixel's width, up to which a stone is as good as an ellipsoid
 _SHARE = 0.45  # of cells with a stone, on average
 TALLEST_M = _TALL * _CELL_M
 _BYTE = 1 / 255.0
@@ -26,7 +27,7 @@ _BYTE = 1 / 255.0
 
 @part
 def _place(i: int, j: int, cell: float, key: int) -> tuple[float, float, float, float]:
-    """Centre and radius of what may be a cell's stone (no radius: no stone), and how likely it is not there."""
+    """Centre of what may be a cell's stone, its radius (none: no stone), and how unlikely it is there."""
     h = hashed(i, j, key)
     chance = (h & 0xFF) * _BYTE
     radius = _RADIUS * cell / math.sqrt(1 + 3 * (h >> 8 & 0xFF) * _BYTE)
@@ -74,7 +75,7 @@ def hit_stones(
     """
     dx = dx if abs(dx) > 1e-12 else 1e-12
     dy = dy if abs(dy) > 1e-12 else 1e-12
-    across = math.hypot(dx, dy)
+    across = math.sqrt(dx * dx + dy * dy)
     closing = max(slope_x * dx + slope_y * dy - dz, 0.02)
     best, cover, nx, ny, nz, size, number = far, 0.0, 0.0, 0.0, 1.0, 0.0, 0
     cell = 2 * _CELL_M
@@ -86,7 +87,7 @@ def hit_stones(
         if reach <= 0:
             break
         x, y = ox + (far - reach) * dx, oy + (far - reach) * dy
-        i, j = int(math.floor(x / cell)), int(math.floor(y / cell))
+        i, j = math.floor(x / cell), math.floor(y / cell)
         next_i, next_j = ((i + (dx > 0)) * cell - x) / dx, ((j + (dy > 0)) * cell - y) / dy
         key, passed = scene.key + 60 + 2 * n, 0.0
         while passed < reach:
@@ -96,11 +97,12 @@ def hit_stones(
                 along, side, up, c, s, depth, which = _stone(scene.lattice, i, j, cx, cy, chance, radius, key)
             if along > 0:
                 form = which % len(scene.forms)
+                planes = scene.forms.shape[1] if along > _ROUND * pixel_m else 0
                 cz = height_at(scene, level_at(scene, cx, cy), cx, cy) + depth
                 px, py, pz = ox - cx, oy - cy, oz - cz
                 ax, ay, az = (c * px + s * py) / along, (c * py - s * px) / side, pz / up
                 bx, by, bz = (c * dx + s * dy) / along, (c * dy - s * dx) / side, dz / up
-                enter, leave, face = through_form(scene.forms, form, ax, ay, az, bx, by, bz)
+                enter, leave, face = through_form(scene.forms, form, planes, ax, ay, az, bx, by, bz)
                 if enter < best:
                     # A chord as long as a pixel is wide in the form's own units: half in, half out.
                     chord = (leave - enter) * math.sqrt(bx * bx + by * by + bz * bz)
@@ -138,7 +140,7 @@ def stone_shade(scene: Scene, x: float, y: float, z: float, pixel_m: float) -> t
         if _RADIUS * cell < _SMALLEST * pixel_m:
             break
         reach = min(_TALL * cell / rise, 3 * cell)
-        i, j = int(math.floor(x / cell)), int(math.floor(y / cell))
+        i, j = math.floor(x / cell), math.floor(y / cell)
         next_i, next_j = ((i + (dx > 0)) * cell - x) / dx, ((j + (dy > 0)) * cell - y) / dy
         key, passed = scene.key + 60 + 2 * n, 0.0
         while passed < reach:
