@@ -2,6 +2,7 @@
 
 from pancam_graph.simulate._drive import TelemetryStart as TelemetryStart
 from pancam_graph.simulate._drive import Truth as Truth
+from pancam_graph.simulate._options import DriveOptions as DriveOptions
 from pancam_graph.simulate._options import RenderOptions as RenderOptions
 from pancam_graph.simulate._options import SimulationOptions as SimulationOptions
 from pancam_graph.simulate._points import Simulation as Simulation
