@@ -10,6 +10,7 @@ import cv2
 import gtsam
 import numpy as np
 import pytest
+from small_worlds import smaller_worlds
 
 from pancam_graph.cameras import Pinhole
 from pancam_graph.errors import InputError
@@ -17,7 +18,6 @@ from pancam_graph.geometry import FloatArray
 from pancam_graph.io import read_image, read_traverse, write_rendering
 from pancam_graph.rigs import TEMPLATES, Rig, rig_template
 from pancam_graph.simulate import Rendering, RenderOptions, render
-from pancam_graph.simulate import _scene as scene_module
 
 STEREO = RenderOptions(
     stops=2, pans=2, sweep_rad=0.6, spacing_m=0.7, heading_change_rad=0.0, sensor_noise=0.0
@@ -27,15 +27,7 @@ STEREO = RenderOptions(
 @pytest.fixture(scope="module", autouse=True)
 def small_world() -> Iterator[None]:
     """The same ground and rocks over less of it."""
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in (
-            ("_FINE_REACH_M", 6.0),
-            ("_MID_STEP_M", 0.5),
-            ("_MID_REACH_M", 25.0),
-            ("_FAR_NODES", 128),
-            ("_ROCK_REACH_M", 15.0),
-        ):
-            patch.setattr(scene_module, name, value)
+    with smaller_worlds():
         yield
 
 
@@ -76,9 +68,19 @@ def stereo(small_world: None) -> Rendering:
     return render(coarse(rig_template("mer-navcam"), 0.375), STEREO, seed=4)
 
 
-def shifts(rendering: Rendering, a: int, b: int, half: int = 6) -> FloatArray:
+@pytest.fixture(scope="module")
+def stereo_images(stereo: Rendering) -> dict[int, FloatArray]:
+    return {row: stereo.image(row).astype(np.float32) for row in (0, 1, 4)}
+
+
+@pytest.fixture(scope="module")
+def tiny(small_world: None) -> Rendering:
+    return render(cropped(rig_template("mer-navcam"), 64, 48), replace(STEREO, bits=12), seed=3)
+
+
+def shifts(rendering: Rendering, images: dict[int, FloatArray], a: int, b: int, half: int = 6) -> FloatArray:
     """How far patches of image b lie from where the truth puts those of image a, pixels (n, 2)."""
-    image, other = (rendering.image(row).astype(np.float32) for row in (a, b))
+    image, other = images[a], images[b]
     rng, size, out = np.random.default_rng(0), image.shape[0], []
     near = np.stack(np.meshgrid(np.arange(-half, half + 1), np.arange(-half, half + 1)), axis=-1)
     for at in rng.integers(half, size - half, (400, 2)):
@@ -107,8 +109,10 @@ def shifts(rendering: Rendering, a: int, b: int, half: int = 6) -> FloatArray:
 
 
 @pytest.mark.parametrize(("a", "b"), [(0, 1), (0, 4)], ids=["both eyes", "two stops"])
-def test_images_show_each_point_where_the_truth_has_it(stereo: Rendering, a: int, b: int) -> None:
-    found = shifts(stereo, a, b)
+def test_images_show_each_point_where_the_truth_has_it(
+    stereo: Rendering, stereo_images: dict[int, FloatArray], a: int, b: int
+) -> None:
+    found = shifts(stereo, stereo_images, a, b)
     assert len(found) > 80
     assert np.abs(np.median(found, axis=0)).max() < 0.02
     assert np.median(np.abs(found)) < 0.1
@@ -162,8 +166,10 @@ def test_the_deck_moves_along_with_the_mast() -> None:
     )
 
 
-def test_folder_is_read_back_without_observations_and_with_the_truth_apart(tmp_path: Path) -> None:
-    rendering = render(cropped(rig_template("mer-navcam"), 64, 48), replace(STEREO, bits=12), seed=3)
+def test_folder_is_read_back_without_observations_and_with_the_truth_apart(
+    tiny: Rendering, tmp_path: Path
+) -> None:
+    rendering = tiny
     write_rendering(rendering, tmp_path / "out")
     traverse = read_traverse(tmp_path / "out")
     assert traverse.observations is None
@@ -179,22 +185,20 @@ def test_folder_is_read_back_without_observations_and_with_the_truth_apart(tmp_p
     assert 2e-4 < np.abs(off).max() < 6e-3  # telemetry of 1.3 mrad
 
 
-def test_an_interrupted_folder_is_not_there(tmp_path: Path) -> None:
+def test_an_interrupted_folder_is_not_there(tiny: Rendering, tmp_path: Path) -> None:
     def stop(done: int, _total: int) -> None:
         if done == 2:
             raise KeyboardInterrupt
 
-    rendering = render(cropped(rig_template("mer-navcam"), 32, 32), STEREO)
     with pytest.raises(KeyboardInterrupt):
-        write_rendering(rendering, tmp_path / "out", progress=stop)
+        write_rendering(tiny, tmp_path / "out", progress=stop)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_with_files_is_left_alone(tmp_path: Path) -> None:
+def test_a_folder_with_files_is_left_alone(tiny: Rendering, tmp_path: Path) -> None:
     (tmp_path / "mine").write_text("text")
-    rendering = render(cropped(rig_template("mer-navcam"), 32, 32), STEREO)
     with pytest.raises(InputError, match="expected a new or empty folder"):
-        write_rendering(rendering, tmp_path)
+        write_rendering(tiny, tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["mine"]
 
 
