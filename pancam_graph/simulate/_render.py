@@ -33,6 +33,7 @@ _BELOW_HORIZON = 0.4  # where the row looks, as a share of the field down
 _BAND_PX = 128  # rows that one thread renders at a time
 _KEPT_PX = 8_000_000  # lines of sight that are kept from image to image
 _RIM_PIXEL_RAD = 1e-3  # width of a pixel whose neighbour sees nothing
+_SEEN = 0.03  # contrast of neighbours from which on an edge between them is smoothed
 _EDGE_RAYS = 2  # along each side of a pixel that lies on an edge
 
 
@@ -82,8 +83,9 @@ class _View:
         below = np.arange(columns, len(pixel) + columns)
         below[-columns:] = -1
         traced = _trace(self.scene, self.deck, self.origin_m, direction, pixel, below)
+        shape = rows, columns
         rough = np.flatnonzero(
-            _edges(traced.edge.reshape(rows, columns), traced.distance_m.reshape(rows, columns))
+            _edges(traced.edge.reshape(shape), traced.distance_m.reshape(shape), traced.light.reshape(shape))
         )
         light = traced.light
         steps = (np.arange(_EDGE_RAYS) + 0.5) / _EDGE_RAYS - 0.5
@@ -102,21 +104,23 @@ class _View:
             (direction, traced.ground_m),
         )
         light[rough] = again.light.reshape(-1, rays).mean(axis=1)
-        return light.reshape(rows, columns)
+        return light.reshape(shape)
 
 
-def _edges(edge: IntArray, distance_m: FloatArray) -> BoolArray:
-    """Which pixels (h, w) lie on an edge of the picture; none of the outermost, none beside one not seen."""
+def _edges(edge: IntArray, distance_m: FloatArray, light: FloatArray) -> BoolArray:
+    """Which pixels (h, w) lie on an edge that is seen; none of the outermost, none beside one not traced."""
     out = np.zeros(edge.shape, dtype=bool)
-    here, away = edge[1:-1, 1:-1], distance_m[1:-1, 1:-1]
-    rough, whole = np.zeros(here.shape, dtype=bool), here != -2
+    inner = slice(1, -1), slice(1, -1)
+    rough, whole = out[inner], edge[inner] != -2
     for a, b in ((0, 1), (2, 1), (1, 0), (1, 2)):
-        window = slice(a, a + len(here)), slice(b, b + here.shape[1])
-        there, far = edge[window], distance_m[window]
+        beside = slice(a, a + len(rough)), slice(b, b + rough.shape[1])
+        far, away = distance_m[beside], distance_m[inner]
         with np.errstate(invalid="ignore"):  # the sky from the sky
-            rough |= (there != here) | (np.abs(far - away) > 0.04 * away + 0.02 * far)
-        whole &= there != -2
-    out[1:-1, 1:-1] = rough & whole
+            other = (edge[beside] != edge[inner]) | (np.abs(far - away) > 0.04 * away + 0.02 * far)
+        sharp = np.abs(light[beside] - light[inner]) > _SEEN * (light[beside] + light[inner])
+        rough |= other & sharp
+        whole &= edge[beside] != -2
+    rough &= whole
     return out
 
 

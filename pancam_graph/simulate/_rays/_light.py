@@ -80,7 +80,7 @@ def of_ground(
             gx, gy, albedo, outcrop, lit = gx + a, gy + b, albedo + c, outcrop + d, lit + e
         gx, gy, albedo, outcrop, lit = gx / taps, gy / taps, albedo / taps, outcrop / taps, lit / taps
     lit = sunlit(lit, z, along)
-    rough = 1 - 0.6 * outcrop if level == 0 else 1.4
+    rough = 1 - 0.6 * outcrop if level == 0 else 0.8
     length, px, py, vx, vy, k = 2.4 * step, x, y, ux, uy, scene.key
     c, s = 1.0, 0.0
     while length > 2 * across and length > _FINEST_M and length * _AVERAGED > along:
@@ -128,7 +128,7 @@ def of_stone(
     sky: float,
 ) -> float:
     """Radiance of a pebble's surface of that normal."""
-    albedo = 0.12 + 0.12 * (number & 0xFF) / 255.0
+    albedo = 0.11 + 0.11 * (number & 0xFF) / 255.0
     length, key = 0.8 * size, number >> 8
     while length > 2 * pixel_m and length > _FINEST_M:
         weight = min(1.0, length / pixel_m - 2)
