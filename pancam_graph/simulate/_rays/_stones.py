@@ -147,7 +147,7 @@ def stone_shade(scene: Scene, x: float, y: float, z: float, pixel_m: float) -> t
             cx, cy, radius, chance = _place(i, j, cell, key)
             px, py, along = x - cx, y - cy, 0.0
             if abs(px * dy - py * dx) < 1.5 * radius or px * px + py * py < 6 * radius * radius:
-                along, side, up, c, s, depth, _ = _stone(scene.lattice, i, j, cx, cy, chance, radius, key)
+                along, side, up, c, s, depth, which = _stone(scene.lattice, i, j, cx, cy, chance, radius, key)
             if along > 0:
                 u, v = (c * px + s * py) / along, (c * py - s * px) / side
                 away = u * u + v * v
@@ -156,10 +156,14 @@ def stone_shade(scene: Scene, x: float, y: float, z: float, pixel_m: float) -> t
                 if abs(px * dy - py * dx) < along:
                     w = (z - height_at(scene, level_at(scene, cx, cy), cx, cy) - depth) / up
                     bx, by, bz = (c * dx + s * dy) / along, (c * dy - s * dx) / side, rise / up
-                    ab, bb = u * bx + v * by + w * bz, bx * bx + by * by + bz * bz
-                    inside = 1 - (away + w * w) + ab * ab / bb
-                    if inside > 0 and (ab < 0 or away + w * w < 1):
-                        sun = min(sun, 1 - min(1.0, 2 * math.sqrt(inside) * side / (1.5 * pixel_m)))
+                    # The form itself, not its ball, or a dark ring would lie around what planes cut off.
+                    planes = scene.forms.shape[1] if along > _ROUND * pixel_m else 0
+                    enter, leave, _ = through_form(
+                        scene.forms, which % len(scene.forms), planes, u, v, w, bx, by, bz
+                    )
+                    if enter < leave and leave > 0:
+                        chord = (leave - max(enter, 0.0)) * math.sqrt(bx * bx + by * by + bz * bz)
+                        sun = min(sun, 1 - min(1.0, chord * side / (1.5 * pixel_m)))
             passed = min(next_i, next_j)
             if next_i < next_j:
                 i, next_i = i + (1 if dx > 0 else -1), next_i + cell / abs(dx)
