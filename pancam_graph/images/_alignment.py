@@ -11,6 +11,7 @@ from pancam_graph.images._match import match_in_windows
 from pancam_graph.images._options import FrontEndOptions
 from pancam_graph.images._pairs import Segments
 from pancam_graph.images._terrain import Sighting, Terrain
+from pancam_graph.matching import Refusal
 
 __all__ = ["Alignment", "Ties", "align_stops", "fit_pose", "telemetry_alignment", "whitened_distance"]
 
@@ -88,8 +89,8 @@ def align_stops(
     a: int,
     b: int,
     options: FrontEndOptions,
-) -> Alignment | None:
-    """Stop b relative to stop a, from features whose descriptors agree; None where that could be chance.
+) -> Alignment | Refusal:
+    """Stop b relative to stop a, from features whose descriptors agree; why not, where that could be chance.
 
     Each point of a's terrain is looked for among the first sightings of b's, around where telemetry has it;
     what most of these matches say corrects the pose, and the search is repeated in the smaller windows.
@@ -100,7 +101,7 @@ def align_stops(
     for _ in range(_ROUNDS):
         ties, half_width = _matched(terrain, features, feature_of, (a, b), found, options)
         if len(ties) < options.min_pair_matches:
-            return None
+            return Refusal.FEW_ALIKE
         start_px = float(np.median(half_width))
         found = fit_pose(terrain, ties, prior, found, start_px)
         distance = whitened_distance(terrain, ties, found.world_T_mast)
@@ -109,7 +110,7 @@ def align_stops(
         expected, spread = float(chance.sum()), float(np.sqrt(np.sum(chance * (1 - chance))))
         agreeing = np.count_nonzero(distance < _AGREE_SIGMAS)
         if agreeing < max(options.min_pair_matches, expected + _CHANCE_SIGMAS * spread):
-            return None
+            return Refusal.CHANCE
     return found
 
 

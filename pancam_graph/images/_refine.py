@@ -1,7 +1,5 @@
 """Sub-pixel positions by least-squares matching of the patches around the features of a track."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from pancam_graph.cameras import Camera
@@ -11,7 +9,6 @@ from pancam_graph.images._pairs import FAR_M, PairGeometry
 from pancam_graph.images._patches import HALF_WIDTH_PX, align_patches
 from pancam_graph.images._splines import Splines
 from pancam_graph.images._verify import epipolar_px
-from pancam_graph.io.image_files import GreyImage
 from pancam_graph.threads import in_parallel
 from pancam_graph.traverse import Traverse
 
@@ -26,7 +23,7 @@ _MAX_MAGNIFICATION = 2.0
 
 def refine_tracks(
     traverse: Traverse,
-    images: Sequence[GreyImage | None],
+    spline: Splines,
     image: IntArray,
     track: IntArray,
     uv_px: FloatArray,
@@ -40,7 +37,6 @@ def refine_tracks(
     where it would move by more than a pixel, near the image's edge, and between images whose scales
     differ by more than a factor of 2.
     """
-    spline = Splines(images)
     refined = np.zeros(len(image), dtype=bool)
     found = uv_px.copy()
     first = np.searchsorted(track, track)

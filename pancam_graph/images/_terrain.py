@@ -2,17 +2,18 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import gtsam
 import numpy as np
 from scipy.spatial import cKDTree
 
 from pancam_graph.cameras import Camera
-from pancam_graph.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.geometry import BoolArray, FloatArray, IntArray, pose_arrays
 from pancam_graph.solution import Solution
 from pancam_graph.traverse import Observations, Traverse
 
-__all__ = ["Sighting", "Terrain", "terrain_of"]
+__all__ = ["Sighting", "Terrain", "terrain_arrays", "terrain_from"]
 
 _NEAREST_INVERSE_M = 1e-7
 _NEIGHBOURS = 12
@@ -158,17 +159,11 @@ class Terrain:
         return R[0], centre[0]
 
 
-def terrain_of(solution: Solution) -> Terrain:
-    """The points that a solution of single stops places, each with its surface."""
+def terrain_arrays(solution: Solution) -> dict[str, FloatArray | IntArray]:
+    """What `terrain_from` needs to build the terrain of a solution of single stops."""
     t, final = solution.traverse, solution.final
     obs = t.observations
     assert obs is not None
-    frames = tuple(
-        replace(f, pan_rad=float(pan), tilt_rad=float(tilt))
-        for f, (pan, tilt) in zip(t.frames, final.pan_tilt_rad, strict=True)
-    )
-    stops = tuple(replace(s, world_T_mast=pose) for s, pose in zip(t.stops, final.world_T_mast, strict=True))
-    refined = replace(t, frames=frames, stops=stops)
     # Observations are sorted by track, then image.
     tracks, first = np.unique(obs.track, return_index=True)
     landmark = np.searchsorted(solution.landmark_track, tracks).clip(max=len(solution.landmark_track) - 1)
@@ -181,21 +176,47 @@ def terrain_of(solution: Solution) -> Terrain:
     ahead = np.array([_forward(e.camera) for e in t.rig.eyes])[t.image_eye[image]]
     axis = np.einsum("nij,nj->ni", final.world_R_camera[image], ahead)
     depth = np.einsum("ni,ni->n", axis, to_point)
-    inverse = 1 / np.maximum(depth, 1e-3)
     sigma = _sigma_inverse_m(solution, tracks, to_point, image)
     good = (depth > 1e-3) & np.isfinite(sigma)
+    world_R_mast, world_t_mast = pose_arrays(final.world_T_mast)
+    return {
+        "pan_tilt_rad": final.pan_tilt_rad,
+        "world_R_mast": world_R_mast,
+        "world_t_mast": world_t_mast,
+        "track": tracks[good],
+        "row": first[good],
+        "inverse_depth": 1 / depth[good],
+        "sigma_inverse_m": sigma[good],
+    }
+
+
+def terrain_from(
+    traverse: Traverse,
+    *,
+    pan_tilt_rad: FloatArray,
+    world_R_mast: FloatArray,
+    world_t_mast: FloatArray,
+    **columns: Any,
+) -> Terrain:
+    """The points that a solution of the traverse places, each with its surface; see `terrain_arrays`."""
+    frames = tuple(
+        replace(f, pan_rad=float(pan), tilt_rad=float(tilt))
+        for f, (pan, tilt) in zip(traverse.frames, pan_tilt_rad, strict=True)
+    )
+    stops = tuple(
+        replace(s, world_T_mast=gtsam.Pose3(gtsam.Rot3(R), t))
+        for s, R, t in zip(traverse.stops, world_R_mast, world_t_mast, strict=True)
+    )
     terrain = Terrain(
-        traverse=refined,
-        track=tracks[good],
-        row=first[good],
-        inverse_depth=inverse[good],
-        sigma_inverse_m=sigma[good],
-        slope=np.zeros((int(good.sum()), 2)),
+        traverse=replace(traverse, frames=frames, stops=stops),
+        **columns,
+        slope=np.zeros((len(columns["track"]), 2)),
     )
     slope = terrain.slope.copy()
+    world_R_camera, _ = terrain.traverse.camera_poses()
     for i in np.unique(terrain.image):
         rows = np.flatnonzero(terrain.image == i)
-        slope[rows] = _slopes(terrain, rows, final.world_R_camera[i])
+        slope[rows] = _slopes(terrain, rows, world_R_camera[i])
     return replace(terrain, slope=slope)
 
 

@@ -79,6 +79,7 @@ def observation_table(solution: Solution) -> str:
         ("observations", "found in the images, or given"),
         ("used", "observations that took part"),
         ("inliers (%)", "share of the observations that took part"),
+        ("came back", "of those used: set aside in between, and let in again when they fitted"),
         ("outliers", "contradict the other observations of their point by more than noise explains"),
         ("single", "of points that no other image sees"),
         ("behind", "of points that came to lie behind the camera"),
@@ -93,6 +94,7 @@ def observation_table(solution: Solution) -> str:
     np.minimum.at(lowest, track, stop)
     np.maximum.at(highest, track, stop)
     several, reason = lowest != highest, np.array(solution.reason)
+    came_back = np.zeros(len(observations), dtype=bool) if solution.came_back is None else solution.came_back
     rows = []
     for name, which in (
         ("one stop", ~several),
@@ -103,7 +105,14 @@ def observation_table(solution: Solution) -> str:
         used, found = int(np.sum(solution.used & own)), int(own.sum())
         counts = [int(np.sum(own & (reason == why))) for why in ("outlier", "single", "behind", "outside")]
         share = fixed(100 * used / found, 1) if found else ""
-        numbers = [str(int(which.sum())), str(found), str(used), share, *(str(c) for c in counts)]
+        numbers = [
+            str(int(which.sum())),
+            str(found),
+            str(used),
+            share,
+            str(int(np.sum(came_back & own))),
+            *(str(c) for c in counts),
+        ]
         rows.append((name, *numbers))
     return table("Observations", columns, rows, texts=1)
 
