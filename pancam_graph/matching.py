@@ -56,7 +56,7 @@ class PairMatching:
 
 @dataclass(frozen=True, kw_only=True)
 class StopMatching:
-    """Patches of the terrain of one stop, sought in the images of another. They are kept, or not for a reason."""
+    """Patches of the terrain of one stop, sought in the images of another. Kept, or not for a reason."""
 
     a: int
     """Row of the stop that places the terrain."""

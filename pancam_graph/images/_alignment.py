@@ -179,19 +179,6 @@ def _comparable(terrain: Terrain, image: int, seen: Sighting, margin_px: FloatAr
     return np.asarray(seen.valid & on & alike & (margin_px < size.max() / 4))
 
 
-def sightings(terrain: Terrain, ties: Ties, world_T_mast: gtsam.Pose3) -> Sighting:
-    """How the images of the ties should see their points, in the ties' order."""
-    order = np.lexsort((ties.image, terrain.image[ties.row]))
-    first, second = terrain.image[ties.row[order]], ties.image[order]
-    changes = np.flatnonzero((np.diff(first) != 0) | (np.diff(second) != 0)) + 1
-    parts = [
-        terrain.sighting(ties.row[k], int(ties.image[k[0]]), world_T_mast) for k in np.split(order, changes)
-    ]
-    back = np.argsort(order)
-    names = vars(parts[0])
-    return Sighting(**{name: np.concatenate([getattr(p, name) for p in parts])[back] for name in names})
-
-
 def whitened_distance(
     terrain: Terrain, ties: Ties, world_T_mast: gtsam.Pose3, noise_px: float = 1.0
 ) -> FloatArray:
@@ -204,7 +191,7 @@ def _whitened(
     terrain: Terrain, ties: Ties, world_T_mast: gtsam.Pose3, noise_px: float
 ) -> tuple[FloatArray, FloatArray, Sighting]:
     """Residuals (n, 2), and what takes them to unit covariance (n, 2, 2)."""
-    seen = sightings(terrain, ties, world_T_mast)
+    seen = terrain.sighting(ties.row, ties.image, world_T_mast)
     noise = np.square(noise_px * np.maximum(seen.zoom, 1.0))[:, None, None] * np.eye(2)
     covariance = noise + seen.covariance_px2(np.zeros((6, 6)), terrain.sigma_inverse_m[ties.row])
     return ties.uv_px - seen.uv_px, np.linalg.inv(np.linalg.cholesky(covariance)), seen

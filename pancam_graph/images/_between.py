@@ -105,9 +105,9 @@ class StopMatcher:
     def ties(self, one: int, other: int) -> StopTies:
         """Points of stop `one` in images of stop `other`.
 
-        Features that look alike correct where the stops stand relative to each other; then the patch around a
-        point is sought in the images where the corrected pose has it, warped by the surface there, and matched
-        by least squares.
+        Features that look alike correct where the stops stand relative to each other; then the patch around
+        a point is sought in the images where the corrected pose has it, warped by the surface there, and
+        matched by least squares.
         """
         alignment = align_stops(self.terrain, self.features, self.feature_of, one, other, self.options)
         if isinstance(alignment, Refusal):

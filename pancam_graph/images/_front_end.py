@@ -37,8 +37,8 @@ def find_observations(
     their standard deviations), and only where the camera models leave a place for them; then each pair's
     geometry is corrected by what most of its matches say, the matching is repeated in the narrower
     windows, and what is far from its epipolar line is left out. Stops that see in stereo are tied by the
-    terrain that each of them places (see `StopMatcher`). The same files give the same observations to the last
-    bit.
+    terrain that each of them places (see `StopMatcher`). The same files give the same observations to the
+    last bit.
 
     Left out are what the user's masks cover, missing and saturated pixels, and sky (see `find_masks`).
     Between stops, so is the rover itself, and matches that stand still relative to the mast are dropped; at

@@ -264,6 +264,7 @@ class Steps:
             solution = solve(traverse)
             # A solve finds one factor for all noise: the ties' is stated in the units of the others'.
             unit = np.median(observations.sigma_px / solution.sigma_px)
+            self.tell("terrain of the stops", 1, 1)
             return {**terrain_arrays(solution), "unit": np.array(unit)}
 
         columns = observations.image, observations.track, observations.uv_px, observations.sigma_px, feature

@@ -111,41 +111,67 @@ class Terrain:
         R, centre = (p[image] for p in self._poses)
         return np.asarray(centre + (origin + ray / np.maximum(inverse, _NEAREST_INVERSE_M)[:, None]) @ R.T)
 
-    def sighting(self, rows: IntArray, image: int, world_T_mast: gtsam.Pose3) -> Sighting:
-        """How `image` sees rows of one image of another stop, if its mast is at that pose."""
-        points = self.points_m(rows)
-        first = int(self.image[rows[0]])
-        R_a, centre_a = (p[first] for p in self._poses)
-        camera = self.camera(image)
-        mast_R, mast_t = self._mast_T_camera(image)
+    @cached_property
+    def _world_m(self) -> FloatArray:
+        """(n, 3) all points."""
+        points = np.empty((len(self.row), 3))
+        for i in np.unique(self.image):
+            rows = np.flatnonzero(self.image == i)
+            points[rows] = self.points_m(rows)
+        return points
+
+    @cached_property
+    def _along(self) -> FloatArray:
+        """(n, 3) how the points move with their depths, in the world."""
+        R, centre = (p[self.image] for p in self._poses)
+        axis = np.einsum("nij,nj->ni", R, self._forward[self.traverse.image_eye[self.image]])
+        to_a = self._world_m - centre
+        return np.asarray(to_a / np.maximum(np.einsum("ni,ni->n", to_a, axis), 1e-12)[:, None])
+
+    @cached_property
+    def _forward(self) -> FloatArray:
+        """Axes (eyes, 3) of their cameras, in their frames."""
+        return np.array([_forward(eye.camera) for eye in self.traverse.rig.eyes])
+
+    def sighting(self, rows: IntArray, image: IntArray | int, world_T_mast: gtsam.Pose3) -> Sighting:
+        """How `image`, of another stop, sees each of the rows, if its mast is at that pose.
+
+        One image for all rows, or one for each.
+        """
+        t, points, first = self.traverse, self._world_m[rows], self.image[rows]
+        image = np.broadcast_to(image, rows.shape)
+        eye = t.image_eye[image]
+        mast_R, mast_t = (x[image] for x in self._mast_T_cameras)
         R_m, t_m = world_T_mast.rotation().matrix(), world_T_mast.translation()
         in_mast = (points - t_m) @ R_m
-        uv, d_point, valid = camera.project_with_jacobian((in_mast - mast_t) @ mast_R)
-        d_mast = d_point @ mast_R.T
+        in_camera = np.einsum("nji,nj->ni", mast_R, in_mast - mast_t)
+        uv, d_point = np.empty((len(rows), 2)), np.empty((len(rows), 2, 3))
+        valid = np.empty(len(rows), dtype=bool)
+        for e in np.unique(eye).tolist():
+            k = np.flatnonzero(eye == e)
+            uv[k], d_point[k], valid[k] = t.rig.eyes[e].camera.project_with_jacobian(in_camera[k])
+        d_mast = d_point @ np.swapaxes(mast_R, 1, 2)
         # A turn of the mast by w takes what it sees by -w x p, a shift by -v.
         d_pose = np.concatenate([np.cross(d_mast, in_mast[:, None]), -d_mast], axis=2)
-        to_a = points - centre_a
-        range_a = np.linalg.norm(to_a, axis=1)
-        along = to_a / np.maximum((to_a @ R_a) @ _forward(self.camera(first)), 1e-12)[:, None]
         inverse = np.maximum(self.inverse_depth[rows], _NEAREST_INVERSE_M)
-        d_world = d_mast @ R_m.T
-        d_inverse = np.einsum("nij,nj->ni", d_world, -along / inverse[:, None] ** 2)
-        to_b = points - (R_m @ mast_t + t_m)
+        d_inverse = np.einsum("nij,nj->ni", d_mast @ R_m.T, -self._along[rows] / inverse[:, None] ** 2)
+        to_a = points - self._poses[1][first]
+        to_b = (in_mast - mast_t) @ R_m.T
+        range_a = np.linalg.norm(to_a, axis=1)
         range_b = np.maximum(np.linalg.norm(to_b, axis=1), 1e-9)
-        focal = [float(c.pinhole.calibration_matrix[0, 0]) for c in (self.camera(first), camera)]
         return Sighting(
             uv_px=uv,
             d_pose=d_pose,
             d_inverse_depth=d_inverse,
             cosine=np.einsum("ni,ni->n", to_a, to_b) / np.maximum(range_a * range_b, 1e-12),
-            zoom=focal[1] / focal[0] * range_a / range_b,
+            zoom=self._focal_px[eye] / self._focal_px[t.image_eye[first]] * range_a / range_b,
             valid=valid,
         )
 
     def affine(self, rows: IntArray, image: int, world_T_mast: gtsam.Pose3) -> FloatArray:
         """Derivative (n, 2, 2) of the pixel in `image` by the pixel of one other image, on the surface."""
         camera = self.camera(image)
-        mast_R, mast_t = self._mast_T_camera(image)
+        mast_R, mast_t = (x[image] for x in self._mast_T_cameras)
         R_m, t_m = world_T_mast.rotation().matrix(), world_T_mast.translation()
         pixels = []
         for shift in ((-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0)):
@@ -153,10 +179,15 @@ class Terrain:
             pixels.append(camera.project((in_mast - mast_t) @ mast_R)[0])
         return np.stack([pixels[1] - pixels[0], pixels[3] - pixels[2]], -1) / 2
 
-    def _mast_T_camera(self, image: int) -> tuple[FloatArray, FloatArray]:
+    @cached_property
+    def _mast_T_cameras(self) -> tuple[FloatArray, FloatArray]:
         t = self.traverse
-        R, centre = t.rig.mast_T_camera(t.pan_tilt_rad[t.image_frame[[image]]], t.image_eye[[image]])
-        return R[0], centre[0]
+        return t.rig.mast_T_camera(t.pan_tilt_rad[t.image_frame], t.image_eye)
+
+    @cached_property
+    def _focal_px(self) -> FloatArray:
+        """Focal lengths (eyes,)."""
+        return np.array([e.camera.pinhole.calibration_matrix[0, 0] for e in self.traverse.rig.eyes])
 
 
 def terrain_arrays(solution: Solution) -> dict[str, FloatArray | IntArray]:

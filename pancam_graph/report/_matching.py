@@ -10,15 +10,15 @@ from pancam_graph.traverse import Traverse
 __all__ = ["matching_section"]
 
 _PAIR_CAPTION = (
-    "Pairs of images that overlap by pointing. Candidates are features that are each other's best where the "
-    "geometry leaves a place for them; refused are those off their epipolar lines under the rig's geometry, "
-    "corrected by what most of the pair's say, and between stops those that stand still relative to the mast. "
-    "A pair that is refused as a whole gives nothing."
+    "Pairs of images that overlap by pointing. Candidates are features that are each other's best where "
+    "the geometry leaves a place for them; refused are those off their epipolar lines under the rig's "
+    "geometry, corrected by what most of the pair's say, and between stops those that stand still relative "
+    "to the mast. A pair that is refused as a whole gives nothing."
 )
 _STOP_CAPTION = (
-    "Patches of the terrain that one stop places, sought in the images of another, one row for each direction. "
-    "Each patch counts once for every image that may show it. The noise is that of a coordinate of those kept, "
-    "measured from their scatter about the pose that most agree on."
+    "Patches of the terrain that one stop places, sought in the images of another, one row for each "
+    "direction. Each patch counts once for every image that may show it. The noise is that of a coordinate "
+    "of those kept, measured from their scatter about the pose that most agree on."
 )
 
 
@@ -28,13 +28,15 @@ def matching_section(traverse: Traverse) -> str:
     if found is None:
         return ""
     notes = "".join(f"<li>{escape(line)}</li>" for line in found.summary())
-    between = (
-        f'{_stop_table(found, traverse)}\n<p class="caption">{_STOP_CAPTION}</p>\n' if found.stops else ""
-    )
+    between = _stop_table(found, traverse) + _caption(_STOP_CAPTION) if found.stops else ""
     return (
         f'<section>\n<h2>Matching</h2>\n<ul class="notes">{notes}</ul>\n{between}'
-        f'{_pair_table(found, traverse)}\n<p class="caption">{_PAIR_CAPTION}</p>\n</section>'
+        f"{_pair_table(found, traverse)}{_caption(_PAIR_CAPTION)}</section>"
     )
+
+
+def _caption(text: str) -> str:
+    return f'\n<p class="caption">{escape(text)}</p>\n'
 
 
 def _pair_table(found: Matching, traverse: Traverse) -> str:

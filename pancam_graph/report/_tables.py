@@ -79,11 +79,11 @@ def observation_table(solution: Solution) -> str:
         ("observations", "found in the images, or given"),
         ("used", "observations that took part"),
         ("inliers (%)", "share of the observations that took part"),
-        ("came back", "of those used: set aside in between, and let in again when they fitted"),
         ("outliers", "contradict the other observations of their point by more than noise explains"),
         ("single", "of points that no other image sees"),
         ("behind", "of points that came to lie behind the camera"),
         ("outside", "beyond what the camera's model describes"),
+        ("came back", "of those used: set aside in between, and let in again when they fitted"),
     )
     traverse, observations = solution.traverse, solution.traverse.observations
     if observations is None or not len(observations):
@@ -105,14 +105,8 @@ def observation_table(solution: Solution) -> str:
         used, found = int(np.sum(solution.used & own)), int(own.sum())
         counts = [int(np.sum(own & (reason == why))) for why in ("outlier", "single", "behind", "outside")]
         share = fixed(100 * used / found, 1) if found else ""
-        numbers = [
-            str(int(which.sum())),
-            str(found),
-            str(used),
-            share,
-            str(int(np.sum(came_back & own))),
-            *(str(c) for c in counts),
-        ]
+        counts.append(int(np.sum(came_back & own)))
+        numbers = [str(int(which.sum())), str(found), str(used), share, *(str(c) for c in counts)]
         rows.append((name, *numbers))
     return table("Observations", columns, rows, texts=1)
 
