@@ -58,7 +58,7 @@ def test_patches_are_found_from_afar_and_through_an_unknown_affine_map() -> None
     uv_a = rng.uniform(70, 150, (300, 2))
     truth = (uv_a - middle) @ affine.T + middle + shift
     start = truth + rng.uniform(-4, 4, truth.shape)
-    found, fit = start.copy(), np.empty((300, 4))
+    found, fit = start.copy(), np.empty((300, 5))
     unknown = np.tile(np.eye(2), (300, 1, 1))
     reach = np.full((300, 2), 6, dtype=np.int64)
     pictures = coefficients(image_a), coefficients(image_b)
@@ -96,7 +96,10 @@ def seen_rows(terrain: Terrain, mast: gtsam.Pose3) -> Ties:
         for j in np.flatnonzero(terrain.traverse.image_stop == 1).tolist():
             seen = terrain.sighting(rows, j, mast)
             on = seen.valid & terrain.camera(j).contains(seen.uv_px)
-            parts.append(Ties(row=rows[on], image=np.full(int(on.sum()), j), uv_px=seen.uv_px[on]))
+            count = int(on.sum())
+            parts.append(
+                Ties(row=rows[on], image=np.full(count, j), uv_px=seen.uv_px[on], sigma_px=np.ones(count))
+            )
     return Ties.concatenate(parts)
 
 

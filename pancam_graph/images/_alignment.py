@@ -49,6 +49,8 @@ class Ties:
     """(n,)"""
     uv_px: FloatArray
     """(n, 2)"""
+    sigma_px: FloatArray
+    """(n,) standard deviation of each coordinate."""
 
     @staticmethod
     def concatenate(parts: "list[Ties]") -> "Ties":
@@ -58,11 +60,17 @@ class Ties:
             row=np.concatenate([empty, *(p.row for p in parts)]),
             image=np.concatenate([empty, *(p.image for p in parts)]),
             uv_px=np.concatenate([np.empty((0, 2)), *(p.uv_px for p in parts)]),
+            sigma_px=np.concatenate([np.empty(0), *(p.sigma_px for p in parts)]),
         )
 
     def select(self, rows: BoolArray | IntArray) -> "Ties":
         """Some of the ties."""
-        return Ties(row=self.row[rows], image=self.image[rows], uv_px=self.uv_px[rows])
+        return Ties(
+            row=self.row[rows],
+            image=self.image[rows],
+            uv_px=self.uv_px[rows],
+            sigma_px=self.sigma_px[rows],
+        )
 
     def __len__(self) -> int:
         """Number of ties."""
@@ -150,6 +158,7 @@ def _matched(
                     row=rows[matches.a],
                     image=np.full(len(matches), j, dtype=np.int64),
                     uv_px=other.uv_px[matches.b],
+                    sigma_px=np.maximum(seen.zoom[matches.a], 1.0),
                 )
             )
             widths.append(radius[matches.a])
@@ -179,20 +188,18 @@ def _comparable(terrain: Terrain, image: int, seen: Sighting, margin_px: FloatAr
     return np.asarray(seen.valid & on & alike & (margin_px < size.max() / 4))
 
 
-def whitened_distance(
-    terrain: Terrain, ties: Ties, world_T_mast: gtsam.Pose3, noise_px: float = 1.0
-) -> FloatArray:
+def whitened_distance(terrain: Terrain, ties: Ties, world_T_mast: gtsam.Pose3) -> FloatArray:
     """How far ties (n,) are from where they should be, in units of what noise and depths leave open."""
-    residual, root, _ = _whitened(terrain, ties, world_T_mast, noise_px)
+    residual, root, _ = _whitened(terrain, ties, world_T_mast)
     return np.asarray(np.linalg.norm(np.einsum("nij,nj->ni", root, residual), axis=1))
 
 
 def _whitened(
-    terrain: Terrain, ties: Ties, world_T_mast: gtsam.Pose3, noise_px: float
+    terrain: Terrain, ties: Ties, world_T_mast: gtsam.Pose3
 ) -> tuple[FloatArray, FloatArray, Sighting]:
     """Residuals (n, 2), and what takes them to unit covariance (n, 2, 2)."""
     seen = terrain.sighting(ties.row, ties.image, world_T_mast)
-    noise = np.square(noise_px * np.maximum(seen.zoom, 1.0))[:, None, None] * np.eye(2)
+    noise = np.square(ties.sigma_px)[:, None, None] * np.eye(2)
     covariance = noise + seen.covariance_px2(np.zeros((6, 6)), terrain.sigma_inverse_m[ties.row])
     return ties.uv_px - seen.uv_px, np.linalg.inv(np.linalg.cholesky(covariance)), seen
 
@@ -203,7 +210,6 @@ def fit_pose(
     prior: Alignment,
     start: Alignment,
     start_scale: float,
-    noise_px: float = 1.0,
 ) -> Alignment:
     """The pose that brings most ties onto their points, against the prior.
 
@@ -215,7 +221,7 @@ def fit_pose(
     pose, columns = start.world_T_mast, prior.root.shape[1]
     information = np.eye(columns)
     for scale in [*shrinking, *[1.0] * _FINAL_STEPS]:
-        residual, root, seen = _whitened(terrain, ties, pose, noise_px)
+        residual, root, seen = _whitened(terrain, ties, pose)
         r = np.einsum("nij,nj->ni", root, residual)
         J = root @ seen.d_pose @ prior.root
         weight = (scale**2 / (scale**2 + np.sum(r * r, axis=1))) ** 2 * seen.valid

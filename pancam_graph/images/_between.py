@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -37,12 +37,14 @@ _MIN_CORRELATION = 0.75
 _MIN_LEAD = 0.05
 _MAX_MOVE_PX = 1.5
 _MAX_TURN_COSINE = float(np.cos(np.deg2rad(75.0)))
-_SMALLEST_STRETCH = 0.6
+_SMALLEST_STRETCH = 0.5
 _LARGEST_STRETCH = 4.0
 _SLACK_PX = 1.5
 _FIT_SCALE = 4.0
 _FITS = 4
+_MAX_RETURN_PX = 0.3
 _LEAST_NOISE_PX = 0.05
+_GROUP, _MOST_GROUPS = 100, 6
 _COUNTS = ("a", "b", "sought", "unlike", "ambiguous", "unstable", "masked", "off_pose", "kept", "refusal")
 
 
@@ -67,14 +69,17 @@ class StopTies:
     """What the images of one stop see of another's terrain, and what became of the other patches."""
 
     ties: Ties
-    noise_px: float
-    """Of each coordinate."""
     report: StopMatching
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All of it, to be kept."""
         counts = [int(getattr(self.report, name)) for name in _COUNTS]
-        return {**vars(self.ties), "noise_px": np.array(self.noise_px), "counts": np.array(counts)}
+        noise_px = np.array(self.report.noise_px)
+        return {
+            **vars(self.ties),
+            "noise_px": noise_px,
+            "counts": np.array(counts),
+        }
 
     @staticmethod
     def of_arrays(arrays: Mapping[str, NDArray[Any]]) -> "StopTies":
@@ -82,8 +87,7 @@ class StopTies:
         counts = dict(zip(_COUNTS, arrays["counts"].tolist(), strict=True))
         refusal, noise_px = Refusal(counts.pop("refusal")), float(arrays["noise_px"])
         return StopTies(
-            ties=Ties(**{name: arrays[name] for name in ("row", "image", "uv_px")}),
-            noise_px=noise_px,
+            ties=Ties(**{name: arrays[name] for name in ("row", "image", "uv_px", "sigma_px")}),
             report=StopMatching(**counts, noise_px=noise_px, refusal=refusal),
         )
 
@@ -128,20 +132,19 @@ class StopMatcher:
         ties = ties.select(shown)
         if len(ties) < self.options.min_pair_matches:
             return _nothing(one, other, sought, Refusal.FEW_GUIDED)
-        prior = telemetry_alignment(self.terrain, one, other)
-        noise_px = self.options.max_epipolar_px / self.options.epipolar_scales
-        for _ in range(_FITS):
-            alignment = fit_pose(self.terrain, ties, prior, alignment, _FIT_SCALE, noise_px)
-            distance = whitened_distance(self.terrain, ties, alignment.world_T_mast, noise_px)
-            # The median of a length in two directions is 1.177 sigma. Wrong ties must not widen it.
-            noise_px *= min(1.0, max(float(np.median(distance)) / 1.177, _LEAST_NOISE_PX / noise_px))
-        distance = whitened_distance(self.terrain, ties, alignment.world_T_mast, noise_px)
-        good = distance < self.options.epipolar_scales
-        off_pose, ties = int(np.count_nonzero(~good)), ties.select(good)
+        found = len(ties)
+        ties = _measured(self.terrain, ties, (one, other), alignment, self.options)
         report = StopMatching(
-            a=one, b=other, **vars(sought), off_pose=off_pose, kept=len(ties), noise_px=noise_px
+            a=one,
+            b=other,
+            **vars(sought),
+            off_pose=found - len(ties),
+            kept=len(ties),
+            noise_px=float(np.sqrt(np.mean(ties.sigma_px**2))) if len(ties) else 0.0,
         )
-        return StopTies(ties=ties, noise_px=noise_px, report=report)
+        # What other images of a stop say of a point errs alike, by its own patch: it counts but once.
+        _, of, times = np.unique(ties.row, return_inverse=True, return_counts=True)
+        return StopTies(ties=replace(ties, sigma_px=ties.sigma_px * np.sqrt(times[of])), report=report)
 
     @cached_property
     def _chosen(self) -> BoolArray:
@@ -150,7 +153,7 @@ class StopMatcher:
 
 def _nothing(one: int, other: int, sought: "_Sought", refusal: Refusal) -> StopTies:
     report = StopMatching(a=one, b=other, **vars(sought), off_pose=0, kept=0, noise_px=0.0, refusal=refusal)
-    return StopTies(ties=Ties.concatenate([]), noise_px=0.0, report=report)
+    return StopTies(ties=Ties.concatenate([]), report=report)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,6 +192,30 @@ def _spread(terrain: Terrain) -> BoolArray:
     return chosen
 
 
+def _measured(
+    terrain: Terrain, ties: Ties, stops: tuple[int, int], alignment: Alignment, options: FrontEndOptions
+) -> Ties:
+    """Those ties that lie where most others want the pose, with standard deviations from their scatter.
+
+    `ties.sigma_px` need only say which are better placed than which. Ties of far terrain, which looks the
+    same from both stops, are several times as good as those of near terrain, and those are what places the
+    stop: so the scatter is measured in groups of about equals.
+    """
+    prior, n = telemetry_alignment(terrain, *stops), len(ties)
+    groups = np.array_split(np.argsort(ties.sigma_px, kind="stable"), np.clip(n // _GROUP, 1, _MOST_GROUPS))
+    worse = np.maximum(ties.sigma_px / max(float(np.median(ties.sigma_px)), 1e-12), 1.0)
+    ties = replace(ties, sigma_px=options.max_epipolar_px / options.epipolar_scales * worse)
+    for _ in range(_FITS):
+        alignment = fit_pose(terrain, ties, prior, alignment, _FIT_SCALE)
+        distance, sigma_px = whitened_distance(terrain, ties, alignment.world_T_mast), ties.sigma_px.copy()
+        for group in groups:
+            # The median of a length in two directions is 1.177 sigma. Wrong ties must not widen it.
+            sigma_px[group] *= min(1.0, float(np.median(distance[group])) / 1.177)
+        ties = replace(ties, sigma_px=np.maximum(sigma_px, _LEAST_NOISE_PX))
+    distance = whitened_distance(terrain, ties, alignment.world_T_mast)
+    return ties.select(distance < options.epipolar_scales)
+
+
 def _found(
     terrain: Terrain,
     spline: Splines,
@@ -223,24 +250,35 @@ def _found(
     if not len(k):
         return _Sought(), Ties.concatenate([])
     level = np.clip(np.rint(2 * np.log2(np.sqrt(stretch[k, 0] * stretch[k, 1]))), 0, 4).astype(np.int64)
-    uv, fit = seen.uv_px[k].copy(), np.empty((len(k), 4))
+    start, uv, fit = terrain.uv_px[rows[k]], seen.uv_px[k].copy(), np.empty((len(k), 5))
+    first, second_at = spline(int(terrain.image[rows[0]])), partial(spline, image)
     for blur in np.unique(level).tolist():
         part = np.flatnonzero(level == blur)
-        uv[part], fit[part] = _aligned(
-            spline(int(terrain.image[rows[0]])),
-            spline(image, blur),
-            (terrain.uv_px[rows[k[part]]], affine[k[part]], reach[k[part]], uv[part]),
-        )
-    at_start, correlation, second, moved = fit.T
+        patches = start[part], affine[k[part]], reach[k[part]], uv[part]
+        uv[part], fit[part] = _aligned(first, second_at(blur), patches)
+    at_start, correlation, second, moved, spread = fit.T
     alike = (correlation > _MIN_CORRELATION) & (correlation >= at_start)
     only = alike & (correlation - second > _MIN_LEAD)
     good = only & (moved < _MAX_MOVE_PX * stretch[k, 0])
     good &= np.all((uv > margin) & (uv < size - 1 - margin), axis=1)
+    # And back: the surface around an edge that hides other terrain from there has another patch.
+    for blur in np.unique(level[good]).tolist():
+        part = np.flatnonzero(good & (level == blur))
+        inverse: FloatArray = np.asarray(np.linalg.inv(affine[k[part]]))
+        patches = uv[part], inverse, np.zeros((len(part), 2), dtype=np.int64), start[part]
+        back, _ = _aligned(second_at(blur), first, patches)
+        good[part] = np.linalg.norm(back - start[part], axis=1) < _MAX_RETURN_PX
     count = [int(np.count_nonzero(x)) for x in (alike, only, good)]
     sought = _Sought(
         sought=len(k), unlike=len(k) - count[0], ambiguous=count[0] - count[1], unstable=count[1] - count[2]
     )
-    return sought, Ties(row=rows[k[good]], image=np.full(count[2], image, dtype=np.int64), uv_px=uv[good])
+    ties = Ties(
+        row=rows[k[good]],
+        image=np.full(count[2], image, dtype=np.int64),
+        uv_px=uv[good],
+        sigma_px=spread[good],
+    )
+    return sought, ties
 
 
 def _reach(
@@ -268,7 +306,7 @@ def _aligned(
 ) -> tuple[FloatArray, FloatArray]:
     """Pixels in b (n, 2) and what `align_patches` says of them, for its `uv_a`, `affine`, `reach`, `uv_b`."""
     uv_a, affine, reach, start = patches
-    uv_b, fit = start.copy(), np.empty((len(uv_a), 4))
+    uv_b, fit = start.copy(), np.empty((len(uv_a), 5))
     in_parallel(
         lambda first, last: align_patches(
             first, last, image_a, image_b, uv_a, affine, reach, _STEPS, uv_b, fit

@@ -61,7 +61,7 @@ def _refine_pair(
     rows = np.flatnonzero(usable)
     image_a, image_b = spline(pair.a), spline(pair.b)
     own_a, own_affine, position = uv_a[rows], affine[rows], uv_b[rows]
-    reach, fit = np.zeros((len(rows), 2), dtype=np.int64), np.empty((len(rows), 4))
+    reach, fit = np.zeros((len(rows), 2), dtype=np.int64), np.empty((len(rows), 5))
     in_parallel(
         lambda first, last: align_patches(
             first, last, image_a, image_b, own_a, own_affine, reach, _STEPS, position, fit
@@ -69,7 +69,7 @@ def _refine_pair(
         len(rows),
         grain=_GRAIN,
     )
-    at_start, correlation, _, moved = fit.T
+    at_start, correlation, _, moved, _ = fit.T
     good = moved < _MAX_SHIFT_PX * np.maximum(magnification[rows], 1.0)
     good &= (correlation > _MIN_CORRELATION) & (correlation >= at_start)
     found, refined = uv_b.copy(), np.zeros(len(uv_b), dtype=bool)

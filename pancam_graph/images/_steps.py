@@ -294,9 +294,8 @@ class Steps:
 
         directed = [d for a, b in self.stop_pairs for d in ((a, b), (b, a))]
         found = in_order(tie, directed, tell)
-        sigma_px = [np.full(len(f.ties), f.noise_px * unit) for f in found]
         ties = Ties.concatenate([f.ties for f in found])
-        return joined(observations, terrain, ties, np.concatenate(sigma_px)), [f.report for f in found]
+        return joined(observations, terrain, ties, unit * ties.sigma_px), [f.report for f in found]
 
     def _clear(self, image: IntArray, track: IntArray, uv_px: FloatArray) -> BoolArray:
         """Whether no pixel is left out within a patch around each observation."""

@@ -29,10 +29,10 @@ class Steps:
 
     def table(self) -> str:
         """Lines of step, wall-clock and processor seconds, the sum last."""
-        total = tuple(sum(column) for column in zip(*self.seconds.values(), strict=True))
+        wall_s, processor_s = (sum(column) for column in zip(*self.seconds.values(), strict=True))
         rows = [("step", "wall (s)", "processor (s)")]
         rows += [(name, f"{w:.1f}", f"{p:.1f}") for name, (w, p) in self.seconds.items()]
-        rows.append(("all", *(f"{t:.1f}" for t in total)))
+        rows.append(("all", f"{wall_s:.1f}", f"{processor_s:.1f}"))
         widths = [max(len(row[i]) for row in rows) for i in range(3)]
         return "\n".join(
             f"{name:<{widths[0]}}  {wall:>{widths[1]}}  {processor:>{widths[2]}}"
