@@ -15,7 +15,7 @@ from pancam_graph._explicit import ExplicitSolver
 from pancam_graph._optimise import Iteration, Outcome
 from pancam_graph._problem import Problem, Solver, reach_m
 from pancam_graph._reduced import ReducedSystem
-from pancam_graph._rejection import screen
+from pancam_graph._rejection import Screening, screen
 from pancam_graph.cameras import carry_to_pinhole
 from pancam_graph.errors import InputError, SolveError
 from pancam_graph.geometry import BoolArray, FloatArray
@@ -76,6 +76,7 @@ class Adjustment:
         self.warnings = [*traverse.warnings, *self.start.warnings]
         self.noise = self.observations.noise
         self.reason = np.full(len(self.observations), "", dtype=object)
+        self.set_aside = np.zeros(len(self.observations), dtype=bool)
         given = self.start.cameras if options.model in {"free", "projective"} else None
         self.solver = self._new_solver(on_iteration, is_near=given is not None)
         self.sharing = (options.sharing or traverse.sharing or Sharing()).for_model(options.model)
@@ -201,7 +202,7 @@ class Adjustment:
             cutoff_sigma=self.options.outlier_sigma,
             min_scale=1.0,  # errors of telemetry are common to a frame: a small median must not exclude one
         )
-        self.problem = replace(p, landmarks=screening.landmarks, accepted=screening.accepted)
+        self._adopt(screening)
 
     def _screening_rounds(self) -> None:
         """Robust adjustment and screening in turn, until the same observations stay.
@@ -255,8 +256,12 @@ class Adjustment:
             cutoff_sigma=cutoff_sigma,
             min_scale=1.0 if self.observations.origin == "given" else 0.05,
         )
-        self.problem = replace(p, landmarks=screening.landmarks, accepted=screening.accepted)
+        self._adopt(screening)
         return screening.scale
+
+    def _adopt(self, screening: Screening) -> None:
+        self.problem = replace(self.problem, landmarks=screening.landmarks, accepted=screening.accepted)
+        self.set_aside[self.problem.measurements.row[~screening.accepted]] = True
 
     def _final_rounds(self) -> Outcome:
         """Least squares over what was kept, until neither noise scale nor carried pixels move any more."""
@@ -379,6 +384,7 @@ class Adjustment:
             stop_covariance=found.stop_covariance,
             angle_sigma_rad=found.angle_sigma_rad,
             landmark_covariance_m2=found.landmark_covariance_m2,
+            came_back=used & self.set_aside,
             refined=p.template.refined(p.values, found.rig_sigmas),
             warnings=(*self.warnings, *self._late_warnings(used), *connection_warnings(t, used)),
         )

@@ -4,6 +4,7 @@ import argparse
 import logging
 import shutil
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -136,6 +137,8 @@ def print_summary(solution: Solution, where: str) -> None:
             f"{'converged' if solution.converged else 'NOT converged'}: RMS {solution.rms_initial_px:.3f} -> "
             f"{solution.rms_final_px:.3f} px over {used} of {total} observations; {where}\n"
         )
+        for line in _of_images(solution):
+            sys.stdout.write(f"{line}\n")
         if solution.cross_validation is not None:
             sys.stdout.write(f"{_of_cross_validation(solution.cross_validation)}\n")
         return
@@ -150,6 +153,8 @@ def print_summary(solution: Solution, where: str) -> None:
     console.print(table)
     state = "converged" if solution.converged else "[bold red]not converged[/]"
     console.print(f"{state}: {solution.stop_reason}; {solution.seconds.solve:.1f} s")
+    for line in _of_images(solution):
+        console.print(line, highlight=False)
     warnings = solution.warnings
     if solution.cross_validation is not None:
         console.print(_of_cross_validation(solution.cross_validation), highlight=False)
@@ -157,6 +162,18 @@ def print_summary(solution: Solution, where: str) -> None:
     for warning in warnings:
         console.print(f"[yellow]warning[/] {warning}", highlight=False)
     console.print(f"results in [bold]{where}[/]", highlight=False)
+
+
+def _of_images(solution: Solution) -> tuple[str, ...]:
+    """What was thrown away of what was found in images, and why; nothing for observations from elsewhere."""
+    if solution.traverse.matching is None:
+        return ()
+    why = [f"{count} {name}" for name, count in sorted(Counter(solution.reason).items()) if name and count]
+    if solution.came_back is not None:
+        why.append(f"{int(solution.came_back.sum())} of those used came back after they had been set aside")
+    left_out = int(np.count_nonzero(~solution.used))
+    inside = f"in the solve: {left_out} of {len(solution.used)} observations left out; {', '.join(why)}"
+    return (*solution.traverse.matching.summary(), inside)
 
 
 def _of_cross_validation(found: CrossValidation) -> str:

@@ -170,6 +170,8 @@ class Solution:
     """(observations, 2, 2) covariance each was weighted with in the end, where the input has covariances."""
     landmark_covariance_m2: FloatArray | None = None
     """(landmarks, 3, 3) of `final.landmarks_m`, all else marginalised; formal; where it was asked for."""
+    came_back: BoolArray | None = None
+    """(observations,) whether each took part in the end after it had been set aside; None: not followed."""
     refined: tuple[Refined, ...] = ()
     """Entries of the rig that were free (`Sharing`), in the order of quantity and owner."""
     method: str = "joint"

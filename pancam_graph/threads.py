@@ -1,8 +1,9 @@
-"""Ranges of items over all cores, for compiled loops that release the interpreter's lock."""
+"""Work over all cores: ranges of items for compiled loops, and tasks whose libraries release the lock."""
 
 import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from functools import cache
 from threading import local
@@ -12,10 +13,11 @@ from threadpoolctl import ThreadpoolController
 
 from pancam_graph.errors import InputError
 
-__all__ = ["blas_on_one_thread", "each", "in_parallel", "n_workers"]
+__all__ = ["blas_on_one_thread", "each", "in_order", "in_parallel", "n_workers"]
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
+_AHEAD = 2
 _VARIABLE = "PANCAM_GRAPH_THREADS"
 
 
@@ -85,6 +87,48 @@ def each(function: Callable[[_Item], _Result], items: Sequence[_Item]) -> list[_
 
     in_parallel(make, len(items), grain=1)
     return [made[i] for i in range(len(items))]
+
+
+def in_order(
+    function: Callable[[_Item], _Result],
+    items: Iterable[_Item],
+    done: Callable[[int, _Result], None] | None = None,
+) -> list[_Result]:
+    """function(item) of each item, on as many threads as there are workers; for tasks of a tenth of a second.
+
+    `done` is called in the caller's thread with each item's number and result, in their order. BLAS is held
+    to one thread, so that sums have the same order however many there are. The function may call
+    `in_parallel`, and must not call this one. Raises the exception of the first item that failed; on an
+    exception or interrupt, what has not begun is not begun, and what has is waited for.
+    """
+    results, workers = list[_Result](), n_workers()
+
+    def take(result: _Result) -> None:
+        results.append(result)
+        if done is not None:
+            done(len(results) - 1, result)
+
+    with blas_on_one_thread():
+        if workers == 1:
+            for item in items:
+                take(function(item))
+            return results
+        # Threads of its own: were they those of `in_parallel`, all could wait for ranges that none is left
+        # to do. Few items begin before their turn: an interrupt then loses and waits for little.
+        pool, waiting = (
+            ThreadPoolExecutor(workers, thread_name_prefix="pancam-graph-task"),
+            deque[Future[_Result]](),
+        )
+        try:
+            for item in items:
+                waiting.append(pool.submit(function, item))
+                if len(waiting) >= _AHEAD * workers:
+                    take(waiting.popleft().result())
+            while waiting:
+                take(waiting.popleft().result())
+        finally:
+            pool.shutdown(cancel_futures=True)
+    return results
 
 
 def blas_on_one_thread() -> AbstractContextManager[object]:

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from pancam_graph._noise import PixelNoise, mean_sigma_px
 from pancam_graph.errors import InputError
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray, compose, pose_arrays
+from pancam_graph.matching import Matching
 from pancam_graph.rigs import Rig
 from pancam_graph.sharing import Sharing
 
@@ -144,6 +145,8 @@ class Traverse:
     """Where image files are relative to; None for a traverse made in memory."""
     warnings: tuple[str, ...] = field(default=())
     """What a reader noticed and the user should know."""
+    matching: Matching | None = None
+    """What became of all that was found in the images; None for observations from elsewhere."""
 
     def __post_init__(self) -> None:
         """Check ids, references and ranges."""
@@ -227,9 +230,12 @@ class Traverse:
         mast_T_camera = self.rig.mast_T_camera(angles[self.image_frame], self.image_eye)
         return compose(stops_R[self.image_stop], stops_t[self.image_stop], *mast_T_camera)
 
-    def with_observations(self, observations: Observations, warnings: Sequence[str] = ()) -> "Traverse":
-        """The same traverse with observations, and perhaps more warnings."""
-        return replace(self, observations=observations, warnings=(*self.warnings, *warnings))
+    def with_observations(
+        self, observations: Observations, warnings: Sequence[str] = (), *, matching: Matching | None = None
+    ) -> "Traverse":
+        """The same traverse with other observations, and perhaps more warnings."""
+        warnings = (*self.warnings, *warnings)
+        return replace(self, observations=observations, warnings=warnings, matching=matching)
 
 
 def _require_unique(kind: str, ids: Sequence[str]) -> None:

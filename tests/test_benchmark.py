@@ -17,6 +17,7 @@ from benchmarks.cases import CASES, DEFAULT_CASES, GROWTH, Case, Size, chosen_ca
 from benchmarks.engines import ENGINES, Measured, NotRun, Setting, ceres_program, measure, solve_first_ever
 from benchmarks.peer import write_peer
 from benchmarks.report import CaseResult, Report, against_baseline, read_baseline, write_baseline
+from benchmarks.steps import Steps
 from pancam_graph import SimulationOptions, Traverse, read_traverse, simulate
 from pancam_graph.errors import InputError
 from pancam_graph.rigs import Rig, exomars_pancam, mer_navcam
@@ -440,3 +441,12 @@ def test_nothing_is_overwritten(
     assert run("--json", "old.json") == 2
     assert capsys.readouterr().err == "old.json: expected a new file, found one that is there\n"
     assert (tmp_path / "old.json").read_text() == "{}"
+
+
+def test_all_time_between_two_reports_belongs_to_the_step_that_reports() -> None:
+    wall, processor = iter([0.0, 2.0, 3.0, 7.0, 8.0]), iter([0.0, 4.0, 5.0, 5.5, 7.0])
+    steps = Steps(wall=lambda: next(wall), processor=lambda: next(processor))
+    for step in ("images", "masks", "masks", "images"):
+        steps.done(step, 1, 2)
+    assert steps.seconds == {"images": (3.0, 5.5), "masks": (5.0, 1.5)}
+    assert steps.table().splitlines()[-1].split() == ["all", "8.0", "7.0"]

@@ -26,10 +26,11 @@ from pancam_graph.cameras import Pinhole
 from pancam_graph.geometry import HEAD_R_FORWARD_CAMERA, FloatArray
 from pancam_graph.images import FrontEndOptions, _refine, _steps
 from pancam_graph.images._alignment import Ties, fit_pose, telemetry_alignment
+from pancam_graph.images._between import StopMatcher, StopTies
 from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._patches import align_patches
 from pancam_graph.images._splines import Splines
-from pancam_graph.images._terrain import Terrain, terrain_of
+from pancam_graph.images._terrain import Terrain, terrain_arrays, terrain_from
 from pancam_graph.rigs import Eye, Rig, rig_template
 from pancam_graph.threads import n_workers
 
@@ -57,7 +58,7 @@ def test_patches_are_found_from_afar_and_through_an_unknown_affine_map() -> None
     uv_a = rng.uniform(70, 150, (300, 2))
     truth = (uv_a - middle) @ affine.T + middle + shift
     start = truth + rng.uniform(-4, 4, truth.shape)
-    found, fit = start.copy(), np.empty((300, 4))
+    found, fit = start.copy(), np.empty((300, 5))
     unknown = np.tile(np.eye(2), (300, 1, 1))
     reach = np.full((300, 2), 6, dtype=np.int64)
     pictures = coefficients(image_a), coefficients(image_b)
@@ -84,7 +85,7 @@ def simulated() -> tuple[Terrain, tuple[gtsam.Pose3, ...]]:
     assert traverse.observations is not None
     order = np.lexsort((traverse.observations.image, traverse.observations.track))
     ordered = traverse.with_observations(traverse.observations.select(order))
-    return terrain_of(solve(ordered)), simulation.truth.world_T_mast
+    return terrain_from(ordered, **terrain_arrays(solve(ordered))), simulation.truth.world_T_mast
 
 
 def seen_rows(terrain: Terrain, mast: gtsam.Pose3) -> Ties:
@@ -95,7 +96,10 @@ def seen_rows(terrain: Terrain, mast: gtsam.Pose3) -> Ties:
         for j in np.flatnonzero(terrain.traverse.image_stop == 1).tolist():
             seen = terrain.sighting(rows, j, mast)
             on = seen.valid & terrain.camera(j).contains(seen.uv_px)
-            parts.append(Ties(row=rows[on], image=np.full(int(on.sum()), j), uv_px=seen.uv_px[on]))
+            count = int(on.sum())
+            parts.append(
+                Ties(row=rows[on], image=np.full(count, j), uv_px=seen.uv_px[on], sigma_px=np.ones(count))
+            )
     return Ties.concatenate(parts)
 
 
@@ -268,7 +272,61 @@ def test_the_same_on_any_number_of_threads_and_from_the_cache(
         assert again.warnings == small_found.warnings
         for name in ("image", "track", "uv_px", "sigma_px"):
             assert getattr(again.observations, name).tobytes() == getattr(before, name).tobytes()
-        monkeypatch.setattr(_steps, "tie_stops", not_again)
+        for name in ("find_features", "match_pair", "refine_tracks", "terrain_arrays"):
+            monkeypatch.setattr(_steps, name, not_again)
+        monkeypatch.setattr(StopMatcher, "ties", not_again)
+
+
+@pytest.mark.slow
+def test_ties_that_were_found_before_an_interrupt_are_kept(
+    small: tuple[Rendering, Traverse], small_found: Traverse, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", "1")
+    ties, done = StopMatcher.ties, list[tuple[int, int]]()
+
+    def interrupted(matcher: StopMatcher, one: int, other: int) -> StopTies:
+        if done == [(0, 1)]:
+            done.append((one, other))
+            raise KeyboardInterrupt
+        done.append((one, other))
+        return ties(matcher, one, other)
+
+    def not_again(*_: object) -> None:
+        raise AssertionError("what was kept is made anew")
+
+    monkeypatch.setattr(StopMatcher, "ties", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        find_observations(small[1], QUICK, cache=tmp_path)
+    assert len(list(tmp_path.glob("ties-*"))) == 1
+    monkeypatch.setattr(_steps, "terrain_arrays", not_again)
+    again = find_observations(small[1], QUICK, cache=tmp_path)
+    assert done == [(0, 1), (1, 0), (1, 0)]
+    assert again.matching == small_found.matching
+    assert again.observations is not None
+    assert small_found.observations is not None
+    for name in ("image", "track", "uv_px", "sigma_px"):
+        assert (
+            getattr(again.observations, name).tobytes() == getattr(small_found.observations, name).tobytes()
+        )
+
+
+def test_all_that_was_looked_at_is_accounted_for(small_found: Traverse) -> None:
+    found = small_found.matching
+    assert found is not None
+    assert {(s.a, s.b) for s in found.stops} == {(0, 1), (1, 0)}
+    for s in found.stops:
+        assert s.sought == s.kept + s.unlike + s.ambiguous + s.unstable + s.masked + s.off_pose
+        assert s.kept > 10
+        assert s.unlike > 0
+    for p in found.pairs:
+        assert bool(p.refusal) == (p.kept == 0)
+        if not p.refusal:
+            assert p.candidates == p.kept + p.rover + p.off_line
+    assert sum(p.off_line for p in found.pairs) > 0
+    observations = small_found.observations
+    assert observations is not None
+    tied = linking(small_found, np.searchsorted(observations.track, observations.track))
+    assert int(tied.sum()) == sum(s.kept for s in found.stops)
 
 
 def test_small_panoramas_place_the_second_stop(

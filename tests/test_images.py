@@ -195,11 +195,13 @@ def panorama_found(panorama: tuple[Traverse, Scene]) -> Traverse:
 
 def on_threads(number: int, traverse: Traverse) -> Traverse:
     threads = cv2.getNumThreads()
-    try:
-        cv2.setNumThreads(number)
-        return find_observations(traverse, QUICK)
-    finally:
-        cv2.setNumThreads(threads)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PANCAM_GRAPH_THREADS", str(number))
+        try:
+            cv2.setNumThreads(number)
+            return find_observations(traverse, QUICK)
+        finally:
+            cv2.setNumThreads(threads)
 
 
 def test_feature_positions_count_from_the_centre_of_the_first_pixel() -> None:

@@ -18,6 +18,8 @@ import pytest
 
 from pancam_graph import Frame, Image, Observations, Stop, Traverse
 from pancam_graph.geometry import FloatArray, rz
+from pancam_graph.matching import Matching, PairMatching, Refusal, StopMatching
+from pancam_graph.program import print_summary
 from pancam_graph.report import write_report
 from pancam_graph.report._figures import histogram_edges, make_corrections, make_histogram
 from pancam_graph.report._images import choose_images, image_residuals, magnification, vector_panels
@@ -425,7 +427,7 @@ def test_observation_table_counts_by_reason(solution: Solution) -> None:
         re.findall(r"<td[^>]*>([^<]*)</td>", row) for row in observation_table(solution).split("<tr>")[2:]
     ]
     assert [row[0] for row in cells] == ["one stop", "several stops", "all"]
-    numbers = np.array([[int(c) for c in (*row[1:4], *row[5:])] for row in cells])
+    numbers = np.array([[int(c) for c in (*row[1:4], *row[5:9])] for row in cells])
     assert (numbers[0] + numbers[1] == numbers[2]).all()
     assert (numbers[:2] > 0).all(axis=0)[:3].all()
     kinds = ("outlier", "single", "behind", "outside")
@@ -433,6 +435,66 @@ def test_observation_table_counts_by_reason(solution: Solution) -> None:
     assert numbers[2, 1:].tolist() == expected
     assert (numbers[:, 1] == numbers[:, 2:].sum(axis=1)).all()
     assert [float(row[4]) for row in cells] == pytest.approx(100 * numbers[:, 2] / numbers[:, 1], abs=0.06)
+
+
+def matched(solution: Solution) -> Solution:
+    """The same, as if its observations came from images."""
+    pairs = (
+        PairMatching(a=0, b=1, candidates=120, rover=0, off_line=20, kept=100),
+        PairMatching(a=0, b=2, candidates=50, rover=7, off_line=3, kept=40),
+        PairMatching(a=1, b=2, candidates=9, rover=0, off_line=0, kept=0, refusal=Refusal.FEW_ALIKE),
+        PairMatching(a=1, b=3, candidates=90, rover=0, off_line=0, kept=0, refusal=Refusal.CHANCE),
+    )
+    counts = {"sought": 300, "unlike": 40, "ambiguous": 30, "unstable": 20, "masked": 5, "off_pose": 10}
+    nothing = dict.fromkeys(counts, 0)
+    stops = (
+        StopMatching(a=0, b=1, **counts, kept=195, noise_px=0.1234),
+        StopMatching(a=1, b=0, **nothing, kept=0, noise_px=0.0, refusal=Refusal.CHANCE),
+    )
+    traverse = replace(solution.traverse, matching=Matching(pairs=pairs, stops=stops))
+    came_back = np.zeros(len(solution.used), dtype=bool)
+    came_back[np.flatnonzero(solution.used)[:3]] = True
+    return replace(solution, traverse=traverse, came_back=came_back)
+
+
+def test_page_says_what_was_thrown_away_and_why(solution: Solution, page: str) -> None:
+    assert "<h2>Matching</h2>" not in page
+    found = make_page(matched(solution))
+    parsed(found)
+    section = found[found.index("<h2>Matching</h2>") :]
+    section = section[: section.index("</section>")]
+    lines = [unescape(line) for line in re.findall("<li>(.*?)</li>", section)]
+    assert lines == [
+        "pairs of images: 2 of 4 matched; 1 too few look alike, 1 no more agree than by chance",
+        "their matches: 140 of 170 kept; 23 off their epipolar lines, 7 standing still relative to the mast",
+        "patches between stops: 195 of 300 kept; 40 unlike, 30 ambiguous, 20 unstable, 5 masked, "
+        "10 off the common pose",
+    ]
+    rows = [re.findall("<td[^>]*>(.*?)</td>", row) for row in re.findall("<tr>(.*?)</tr>", section)]
+    stops = [s.id for s in solution.traverse.stops]
+    images = [i.id for i in solution.traverse.images]
+    filled = [row for row in rows if row]
+    assert filled[0] == [*stops[:2], "", "300", "195", "40", "30", "20", "5", "10", "0.123"]
+    assert filled[1][:3] == [stops[1], stops[0], "no more agree than by chance"]
+    assert filled[3] == [images[0], images[2], "", "50", "40", "3", "7"]
+    assert filled[5] == [images[1], images[3], "no more agree than by chance", "90", "0", "0", "0"]
+    table = observation_table(matched(solution))
+    back = [re.findall("<td[^>]*>(.*?)</td>", row)[9] for row in re.findall("<tr>(<td.*?)</tr>", table)]
+    assert back[2] == "3"
+    assert int(back[0]) + int(back[1]) == 3
+
+
+def test_program_prints_what_was_thrown_away_and_why(
+    solution: Solution, capsys: pytest.CaptureFixture[str]
+) -> None:
+    print_summary(solution, "out")
+    assert len(capsys.readouterr().out.splitlines()) == 1
+    print_summary(matched(solution), "out")
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1:4] == list(matched(solution).traverse.matching.summary())
+    left_out = int(np.sum(~solution.used))
+    assert lines[4].startswith(f"in the solve: {left_out} of {len(solution.used)} observations left out")
+    assert lines[4].endswith("3 of those used came back after they had been set aside")
 
 
 def test_rig_table_says_what_was_free(solution: Solution, page: str) -> None:

@@ -2,12 +2,13 @@
 
 import multiprocessing
 import threading
+import time
 
 import numpy as np
 import pytest
 
 from pancam_graph.errors import InputError
-from pancam_graph.threads import each, in_parallel, n_workers
+from pancam_graph.threads import each, in_order, in_parallel, n_workers
 
 
 def ranges_of(n: int, grain: int) -> list[tuple[int, int]]:
@@ -96,3 +97,40 @@ def test_each_keeps_the_order(monkeypatch) -> None:
     monkeypatch.setenv("PANCAM_GRAPH_THREADS", "2")
     assert each(lambda x: 10 * x, [3, 1, 2]) == [30, 10, 20]
     assert each(lambda x: x, []) == []
+
+
+@pytest.mark.parametrize("threads", ["1", "2", "3"])
+def test_results_are_in_the_order_of_the_items(monkeypatch, threads) -> None:
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", threads)
+    told = []
+
+    def squared(item: int) -> int:
+        time.sleep(0.002 * (item % 3))
+        return item * item
+
+    found = in_order(squared, range(20), lambda k, result: told.append((k, result)))
+    assert found == [i * i for i in range(20)]
+    assert told == list(enumerate(found))
+
+
+@pytest.mark.parametrize("threads", ["1", "2"])
+def test_a_task_may_share_its_ranges_out_and_an_error_ends_the_rest(monkeypatch, threads) -> None:
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", threads)
+    begun = []
+
+    def task(item: int) -> int:
+        begun.append(item)
+        if item == 3:
+            raise ValueError(item)
+        return len(ranges_of(10, 1))
+
+    with pytest.raises(ValueError, match="3"):
+        in_order(task, range(100))
+    assert len(begun) < 10
+    assert in_order(task, range(3)) == [10, 10, 10]
+
+
+def test_two_tasks_run_at_once(monkeypatch) -> None:
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", "2")
+    both = threading.Barrier(2, timeout=10)
+    assert in_order(lambda _: both.wait() >= 0, range(2)) == [True, True]

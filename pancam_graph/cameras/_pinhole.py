@@ -80,14 +80,26 @@ class Pinhole(Camera):
         """Inverse of `distort`, and where it exists: here, everywhere."""
         return xy_distorted, np.ones(len(xy_distorted), dtype=bool)
 
-    def project_with_jacobian(self, points_m: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Pixels, derivatives and validity; see `Camera.project_with_jacobian` (thesis eq. 2.2, 2.3)."""
+    def _projected(
+        self, points_m: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray]:
+        """Pixels, normalised coordinates, depths, the derivative of `distort`, and validity."""
         valid = points_m[:, 2] > _MIN_DEPTH
         z = np.where(valid, points_m[:, 2], 1.0)
         xy = points_m[:, :2] / z[:, None]
         xy_distorted, d_distort = self.distort(xy)
         k = self.calibration_matrix
-        uv = xy_distorted @ k[:2, :2].T + k[:2, 2]
+        return xy_distorted @ k[:2, :2].T + k[:2, 2], xy, z, d_distort, valid
+
+    def project(self, points_m: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Pixels (n, 2) of points (n, 3) and their validity (n,); see `project_with_jacobian`."""
+        uv, *_, valid = self._projected(points_m)
+        return uv, valid
+
+    def project_with_jacobian(self, points_m: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Pixels, derivatives and validity; see `Camera.project_with_jacobian` (thesis eq. 2.2, 2.3)."""
+        uv, xy, z, d_distort, valid = self._projected(points_m)
+        k = self.calibration_matrix
         d_xy = np.zeros((len(z), 2, 3))
         d_xy[:, 0, 0] = d_xy[:, 1, 1] = 1 / z
         d_xy[:, :, 2] = -xy / z[:, None]
@@ -105,21 +117,30 @@ class Pinhole(Camera):
         d[:, 0, 3] = d[:, 1, 4] = 1.0
         return uv, d, valid
 
-    def unproject_with_jacobian(self, uv_px: FloatArray) -> tuple[Rays, FloatArray, FloatArray]:
-        """Rays and their derivatives; see `Camera.unproject_with_jacobian`."""
+    def _unprojected(self, uv_px: FloatArray) -> tuple[Rays, FloatArray, FloatArray, BoolArray]:
+        """Rays, their lengths to depth 1, the derivative of `distort` there, and where it is singular."""
         k = self.calibration_matrix
-        k_inverse = np.linalg.inv(k[:2, :2])
-        xy, valid = self.undistort((uv_px - k[:2, 2]) @ k_inverse.T)
-        _, d_distort = self.distort(xy)
-        singular = np.abs(np.linalg.det(d_distort)) < 1e-12
-        d_xy = np.linalg.inv(np.where(singular[:, None, None], np.eye(2), d_distort)) @ k_inverse
+        xy, valid = self.undistort((uv_px - k[:2, 2]) @ np.linalg.inv(k[:2, :2]).T)
+        _, d = self.distort(xy)
+        singular = np.abs(d[:, 0, 0] * d[:, 1, 1] - d[:, 0, 1] * d[:, 1, 0]) < 1e-12
         ray = np.column_stack([xy, np.ones(len(xy))])
         norm = np.linalg.norm(ray, axis=1)
-        direction = ray / norm[:, None]
-        d_ray = np.concatenate([d_xy, np.zeros((len(xy), 1, 2))], axis=1)
+        rays = Rays(origin_m=np.zeros((len(xy), 3)), direction=ray / norm[:, None], valid=valid & ~singular)
+        return rays, norm, d, singular
+
+    def unproject(self, uv_px: FloatArray) -> Rays:
+        """Rays of pixels (n, 2); see `Rays`."""
+        return self._unprojected(uv_px)[0]
+
+    def unproject_with_jacobian(self, uv_px: FloatArray) -> tuple[Rays, FloatArray, FloatArray]:
+        """Rays and their derivatives; see `Camera.unproject_with_jacobian`."""
+        rays, norm, d_distort, singular = self._unprojected(uv_px)
+        k_inverse = np.linalg.inv(self.calibration_matrix[:2, :2])
+        d_xy = np.linalg.inv(np.where(singular[:, None, None], np.eye(2), d_distort)) @ k_inverse
+        d_ray = np.concatenate([d_xy, np.zeros((len(norm), 1, 2))], axis=1)
+        direction = rays.direction
         along = np.einsum("ni,nij->nj", direction, d_ray)
         d_direction = (d_ray - direction[:, :, None] * along[:, None, :]) / norm[:, None, None]
-        rays = Rays(origin_m=np.zeros((len(xy), 3)), direction=direction, valid=valid & ~singular)
         return rays, np.zeros_like(d_direction), d_direction
 
 

@@ -11,6 +11,7 @@ from pancam_graph.images._match import match_in_windows
 from pancam_graph.images._options import FrontEndOptions
 from pancam_graph.images._pairs import Segments
 from pancam_graph.images._terrain import Sighting, Terrain
+from pancam_graph.matching import Refusal
 
 __all__ = ["Alignment", "Ties", "align_stops", "fit_pose", "telemetry_alignment", "whitened_distance"]
 
@@ -48,6 +49,8 @@ class Ties:
     """(n,)"""
     uv_px: FloatArray
     """(n, 2)"""
+    sigma_px: FloatArray
+    """(n,) standard deviation of each coordinate."""
 
     @staticmethod
     def concatenate(parts: "list[Ties]") -> "Ties":
@@ -57,11 +60,17 @@ class Ties:
             row=np.concatenate([empty, *(p.row for p in parts)]),
             image=np.concatenate([empty, *(p.image for p in parts)]),
             uv_px=np.concatenate([np.empty((0, 2)), *(p.uv_px for p in parts)]),
+            sigma_px=np.concatenate([np.empty(0), *(p.sigma_px for p in parts)]),
         )
 
     def select(self, rows: BoolArray | IntArray) -> "Ties":
         """Some of the ties."""
-        return Ties(row=self.row[rows], image=self.image[rows], uv_px=self.uv_px[rows])
+        return Ties(
+            row=self.row[rows],
+            image=self.image[rows],
+            uv_px=self.uv_px[rows],
+            sigma_px=self.sigma_px[rows],
+        )
 
     def __len__(self) -> int:
         """Number of ties."""
@@ -88,8 +97,8 @@ def align_stops(
     a: int,
     b: int,
     options: FrontEndOptions,
-) -> Alignment | None:
-    """Stop b relative to stop a, from features whose descriptors agree; None where that could be chance.
+) -> Alignment | Refusal:
+    """Stop b relative to stop a, from features whose descriptors agree; why not, where that could be chance.
 
     Each point of a's terrain is looked for among the first sightings of b's, around where telemetry has it;
     what most of these matches say corrects the pose, and the search is repeated in the smaller windows.
@@ -100,7 +109,7 @@ def align_stops(
     for _ in range(_ROUNDS):
         ties, half_width = _matched(terrain, features, feature_of, (a, b), found, options)
         if len(ties) < options.min_pair_matches:
-            return None
+            return Refusal.FEW_ALIKE
         start_px = float(np.median(half_width))
         found = fit_pose(terrain, ties, prior, found, start_px)
         distance = whitened_distance(terrain, ties, found.world_T_mast)
@@ -109,7 +118,7 @@ def align_stops(
         expected, spread = float(chance.sum()), float(np.sqrt(np.sum(chance * (1 - chance))))
         agreeing = np.count_nonzero(distance < _AGREE_SIGMAS)
         if agreeing < max(options.min_pair_matches, expected + _CHANCE_SIGMAS * spread):
-            return None
+            return Refusal.CHANCE
     return found
 
 
@@ -149,6 +158,7 @@ def _matched(
                     row=rows[matches.a],
                     image=np.full(len(matches), j, dtype=np.int64),
                     uv_px=other.uv_px[matches.b],
+                    sigma_px=np.maximum(seen.zoom[matches.a], 1.0),
                 )
             )
             widths.append(radius[matches.a])
@@ -178,33 +188,18 @@ def _comparable(terrain: Terrain, image: int, seen: Sighting, margin_px: FloatAr
     return np.asarray(seen.valid & on & alike & (margin_px < size.max() / 4))
 
 
-def sightings(terrain: Terrain, ties: Ties, world_T_mast: gtsam.Pose3) -> Sighting:
-    """How the images of the ties should see their points, in the ties' order."""
-    order = np.lexsort((ties.image, terrain.image[ties.row]))
-    first, second = terrain.image[ties.row[order]], ties.image[order]
-    changes = np.flatnonzero((np.diff(first) != 0) | (np.diff(second) != 0)) + 1
-    parts = [
-        terrain.sighting(ties.row[k], int(ties.image[k[0]]), world_T_mast) for k in np.split(order, changes)
-    ]
-    back = np.argsort(order)
-    names = vars(parts[0])
-    return Sighting(**{name: np.concatenate([getattr(p, name) for p in parts])[back] for name in names})
-
-
-def whitened_distance(
-    terrain: Terrain, ties: Ties, world_T_mast: gtsam.Pose3, noise_px: float = 1.0
-) -> FloatArray:
+def whitened_distance(terrain: Terrain, ties: Ties, world_T_mast: gtsam.Pose3) -> FloatArray:
     """How far ties (n,) are from where they should be, in units of what noise and depths leave open."""
-    residual, root, _ = _whitened(terrain, ties, world_T_mast, noise_px)
+    residual, root, _ = _whitened(terrain, ties, world_T_mast)
     return np.asarray(np.linalg.norm(np.einsum("nij,nj->ni", root, residual), axis=1))
 
 
 def _whitened(
-    terrain: Terrain, ties: Ties, world_T_mast: gtsam.Pose3, noise_px: float
+    terrain: Terrain, ties: Ties, world_T_mast: gtsam.Pose3
 ) -> tuple[FloatArray, FloatArray, Sighting]:
     """Residuals (n, 2), and what takes them to unit covariance (n, 2, 2)."""
-    seen = sightings(terrain, ties, world_T_mast)
-    noise = np.square(noise_px * np.maximum(seen.zoom, 1.0))[:, None, None] * np.eye(2)
+    seen = terrain.sighting(ties.row, ties.image, world_T_mast)
+    noise = np.square(ties.sigma_px)[:, None, None] * np.eye(2)
     covariance = noise + seen.covariance_px2(np.zeros((6, 6)), terrain.sigma_inverse_m[ties.row])
     return ties.uv_px - seen.uv_px, np.linalg.inv(np.linalg.cholesky(covariance)), seen
 
@@ -215,7 +210,6 @@ def fit_pose(
     prior: Alignment,
     start: Alignment,
     start_scale: float,
-    noise_px: float = 1.0,
 ) -> Alignment:
     """The pose that brings most ties onto their points, against the prior.
 
@@ -227,7 +221,7 @@ def fit_pose(
     pose, columns = start.world_T_mast, prior.root.shape[1]
     information = np.eye(columns)
     for scale in [*shrinking, *[1.0] * _FINAL_STEPS]:
-        residual, root, seen = _whitened(terrain, ties, pose, noise_px)
+        residual, root, seen = _whitened(terrain, ties, pose)
         r = np.einsum("nij,nj->ni", root, residual)
         J = root @ seen.d_pose @ prior.root
         weight = (scale**2 / (scale**2 + np.sum(r * r, axis=1))) ** 2 * seen.valid

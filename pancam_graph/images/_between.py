@@ -1,10 +1,12 @@
 """Ties between stops: where patches of the terrain of one stop lie in the images of another."""
 
-import logging
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.images._alignment import (
@@ -20,15 +22,12 @@ from pancam_graph.images._masks import pixels_at
 from pancam_graph.images._options import FrontEndOptions
 from pancam_graph.images._patches import HALF_WIDTH_PX, MAX_REACH_PX, Coefficients, align_patches
 from pancam_graph.images._splines import Splines
-from pancam_graph.images._terrain import Sighting, Terrain, terrain_of
-from pancam_graph.io.image_files import GreyImage
-from pancam_graph.solve import solve
+from pancam_graph.images._terrain import Sighting, Terrain
+from pancam_graph.matching import Refusal, StopMatching
 from pancam_graph.threads import in_parallel
 from pancam_graph.traverse import Observations, Traverse
 
-__all__ = ["near_stops", "stereo_stops", "tie_stops"]
-
-_LOG = logging.getLogger(__name__)
+__all__ = ["StopMatcher", "StopTies", "joined", "near_stops", "on_terrain", "stereo_stops"]
 
 _CELL_PX = 64.0
 _PER_CELL = 2
@@ -38,14 +37,15 @@ _MIN_CORRELATION = 0.75
 _MIN_LEAD = 0.05
 _MAX_MOVE_PX = 1.5
 _MAX_TURN_COSINE = float(np.cos(np.deg2rad(75.0)))
-_SMALLEST_STRETCH = 0.6
+_SMALLEST_STRETCH = 0.5
 _LARGEST_STRETCH = 4.0
 _SLACK_PX = 1.5
 _FIT_SCALE = 4.0
 _FITS = 4
+_MAX_RETURN_PX = 0.3
 _LEAST_NOISE_PX = 0.05
-
-Progress = Callable[[int, int], None]
+_GROUP, _MOST_GROUPS = 100, 6
+_COUNTS = ("a", "b", "sought", "unlike", "ambiguous", "unstable", "masked", "off_pose", "kept", "refusal")
 
 
 def stereo_stops(traverse: Traverse, pairs: Sequence[tuple[int, int]]) -> BoolArray:
@@ -64,57 +64,113 @@ def near_stops(traverse: Traverse, options: FrontEndOptions) -> BoolArray:
     return np.asarray((apart_m <= options.max_stop_distance_m) & ~np.eye(len(place), dtype=bool))
 
 
-def tie_stops(
-    traverse: Traverse,
-    images: Sequence[GreyImage | None],
-    usable: Sequence[BoolArray | None],
-    features: list[Features],
-    feature_of: IntArray,
-    stop_pairs: Sequence[tuple[int, int]],
-    options: FrontEndOptions,
-    progress: Progress | None = None,
-) -> tuple[Observations, list[str]]:
-    """Observations of the traverse with what pairs of stops see of each other's terrain added; warnings.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StopTies:
+    """What the images of one stop see of another's terrain, and what became of the other patches."""
 
-    The traverse has observations within stops, sorted by track, then image; `feature_of` says of which
-    feature each is, `usable` where each image (height, width) shows terrain. A solve of these places the
-    terrain of each stop. Features that look alike correct where stops stand relative to each other; then the
-    patch around a point of one stop is sought in the images of the other where the corrected poses have it,
-    warped by the surface there, and matched by least squares.
-    """
-    assert traverse.observations is not None
-    solution = solve(traverse)
-    terrain = terrain_of(solution)
-    terrain = terrain.select(_on_terrain(usable, terrain.image, terrain.uv_px))
-    spline = Splines(images)
-    chosen = _spread(terrain)
-    unit = float(np.median(traverse.observations.sigma_px / solution.sigma_px))
-    parts, sigmas, warnings = [], [np.empty(0)], list[str]()
-    for k, (a, b) in enumerate(stop_pairs):
-        names = traverse.stops[a].id, traverse.stops[b].id
-        count = 0
-        for one, other in ((a, b), (b, a)):
-            alignment = align_stops(terrain, features, feature_of, one, other, options)
-            if alignment is None:
-                continue
-            ties, noise_px = _between(terrain, spline, chosen, (one, other), alignment, options)
-            ties = ties.select(_on_terrain(usable, ties.image, ties.uv_px))
-            _LOG.info("%s in %s: %d ties, noise %.2f px", names[0], names[1], len(ties), noise_px)
-            count += len(ties)
-            parts.append(ties)
-            # A solve finds one factor for all noise: the ties' is stated in the units of the others'.
-            sigmas.append(np.full(len(ties), noise_px * unit))
-        if not count:
-            warnings.append(
-                f"stops {names[0]} and {names[1]}: no ties, although they may see the same terrain"
-            )
-        if progress is not None:
-            progress(k + 1, len(stop_pairs))
-    ties = Ties.concatenate(parts)
-    return _joined(traverse.observations, terrain, ties, np.concatenate(sigmas)), warnings
+    ties: Ties
+    report: StopMatching
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """All of it, to be kept."""
+        counts = [int(getattr(self.report, name)) for name in _COUNTS]
+        noise_px = np.array(self.report.noise_px)
+        return {
+            **vars(self.ties),
+            "noise_px": noise_px,
+            "counts": np.array(counts),
+        }
+
+    @staticmethod
+    def of_arrays(arrays: Mapping[str, NDArray[Any]]) -> "StopTies":
+        """From what `arrays` gave."""
+        counts = dict(zip(_COUNTS, arrays["counts"].tolist(), strict=True))
+        refusal, noise_px = Refusal(counts.pop("refusal")), float(arrays["noise_px"])
+        return StopTies(
+            ties=Ties(**{name: arrays[name] for name in ("row", "image", "uv_px", "sigma_px")}),
+            report=StopMatching(**counts, noise_px=noise_px, refusal=refusal),
+        )
 
 
-def _on_terrain(usable: Sequence[BoolArray | None], image: IntArray, uv_px: FloatArray) -> BoolArray:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StopMatcher:
+    """Finds the terrain of one stop in the images of another; for any number of threads."""
+
+    terrain: Terrain
+    """Its points are those that show in no mask."""
+    spline: Splines
+    usable: Sequence[BoolArray | None]
+    """Where each image (height, width) shows terrain."""
+    features: list[Features]
+    feature_of: IntArray
+    """Of which feature each of the terrain's observations is."""
+    options: FrontEndOptions
+
+    def ties(self, one: int, other: int) -> StopTies:
+        """Points of stop `one` in images of stop `other`.
+
+        Features that look alike correct where the stops stand relative to each other; then the patch around
+        a point is sought in the images where the corrected pose has it, warped by the surface there, and
+        matched by least squares.
+        """
+        alignment = align_stops(self.terrain, self.features, self.feature_of, one, other, self.options)
+        if isinstance(alignment, Refusal):
+            return _nothing(one, other, _Sought(), alignment)
+        t = self.terrain.traverse
+        ours, theirs = (np.flatnonzero(t.image_stop == s).tolist() for s in (one, other))
+        rows_of = {i: np.flatnonzero(self._chosen & (self.terrain.image == i)) for i in ours}
+        # Images of the second stop in the outer loop: theirs are blurred to several levels, each made once.
+        parts = [
+            _found(self.terrain, self.spline, rows, j, alignment, self.options)
+            for j in theirs
+            for rows in rows_of.values()
+            if len(rows)
+        ]
+        sought, ties = sum((part[0] for part in parts), _Sought()), Ties.concatenate([p[1] for p in parts])
+        shown = on_terrain(self.usable, ties.image, ties.uv_px)
+        sought += _Sought(masked=int(np.count_nonzero(~shown)))
+        ties = ties.select(shown)
+        if len(ties) < self.options.min_pair_matches:
+            return _nothing(one, other, sought, Refusal.FEW_GUIDED)
+        found = len(ties)
+        ties = _measured(self.terrain, ties, (one, other), alignment, self.options)
+        report = StopMatching(
+            a=one,
+            b=other,
+            **vars(sought),
+            off_pose=found - len(ties),
+            kept=len(ties),
+            noise_px=float(np.sqrt(np.mean(ties.sigma_px**2))) if len(ties) else 0.0,
+        )
+        # What other images of a stop say of a point errs alike, by its own patch: it counts but once.
+        _, of, times = np.unique(ties.row, return_inverse=True, return_counts=True)
+        return StopTies(ties=replace(ties, sigma_px=ties.sigma_px * np.sqrt(times[of])), report=report)
+
+    @cached_property
+    def _chosen(self) -> BoolArray:
+        return _spread(self.terrain)
+
+
+def _nothing(one: int, other: int, sought: "_Sought", refusal: Refusal) -> StopTies:
+    report = StopMatching(a=one, b=other, **vars(sought), off_pose=0, kept=0, noise_px=0.0, refusal=refusal)
+    return StopTies(ties=Ties.concatenate([]), report=report)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Sought:
+    """Counts of patches; see `StopMatching`."""
+
+    sought: int = 0
+    unlike: int = 0
+    ambiguous: int = 0
+    unstable: int = 0
+    masked: int = 0
+
+    def __add__(self, other: "_Sought") -> "_Sought":
+        return _Sought(**{name: value + getattr(other, name) for name, value in vars(self).items()})
+
+
+def on_terrain(usable: Sequence[BoolArray | None], image: IntArray, uv_px: FloatArray) -> BoolArray:
     """Which pixels (n, 2) of images (n,) show terrain."""
     found = np.zeros(len(image), dtype=bool)
     for i in np.unique(image).tolist():
@@ -136,36 +192,28 @@ def _spread(terrain: Terrain) -> BoolArray:
     return chosen
 
 
-def _between(
-    terrain: Terrain,
-    spline: Splines,
-    chosen: BoolArray,
-    stops: tuple[int, int],
-    alignment: Alignment,
-    options: FrontEndOptions,
-) -> tuple[Ties, float]:
-    """Patches of the first stop found in images of the second, and the noise of their pixels."""
-    t = terrain.traverse
-    ours, theirs = (np.flatnonzero(t.image_stop == s).tolist() for s in stops)
-    rows_of = {i: np.flatnonzero(chosen & (terrain.image == i)) for i in ours}
-    # Images of the second stop in the outer loop: theirs are blurred to several levels, each made once.
-    parts = [
-        _found(terrain, spline, rows, j, alignment, options)
-        for j in theirs
-        for rows in rows_of.values()
-        if len(rows)
-    ]
-    ties = Ties.concatenate(parts)
-    if len(ties) < options.min_pair_matches:
-        return Ties.concatenate([]), 0.0
-    prior, noise_px = telemetry_alignment(terrain, *stops), options.max_epipolar_px / options.epipolar_scales
+def _measured(
+    terrain: Terrain, ties: Ties, stops: tuple[int, int], alignment: Alignment, options: FrontEndOptions
+) -> Ties:
+    """Those ties that lie where most others want the pose, with standard deviations from their scatter.
+
+    `ties.sigma_px` need only say which are better placed than which. Ties of far terrain, which looks the
+    same from both stops, are several times as good as those of near terrain, and those are what places the
+    stop: so the scatter is measured in groups of about equals.
+    """
+    prior, n = telemetry_alignment(terrain, *stops), len(ties)
+    groups = np.array_split(np.argsort(ties.sigma_px, kind="stable"), np.clip(n // _GROUP, 1, _MOST_GROUPS))
+    worse = np.maximum(ties.sigma_px / max(float(np.median(ties.sigma_px)), 1e-12), 1.0)
+    ties = replace(ties, sigma_px=options.max_epipolar_px / options.epipolar_scales * worse)
     for _ in range(_FITS):
-        alignment = fit_pose(terrain, ties, prior, alignment, _FIT_SCALE, noise_px)
-        distance = whitened_distance(terrain, ties, alignment.world_T_mast, noise_px)
-        # The median of a length in two directions is 1.177 sigma. Wrong ties must not widen it.
-        noise_px *= min(1.0, max(float(np.median(distance)) / 1.177, _LEAST_NOISE_PX / noise_px))
-    distance = whitened_distance(terrain, ties, alignment.world_T_mast, noise_px)
-    return ties.select(distance < options.epipolar_scales), noise_px
+        alignment = fit_pose(terrain, ties, prior, alignment, _FIT_SCALE)
+        distance, sigma_px = whitened_distance(terrain, ties, alignment.world_T_mast), ties.sigma_px.copy()
+        for group in groups:
+            # The median of a length in two directions is 1.177 sigma. Wrong ties must not widen it.
+            sigma_px[group] *= min(1.0, float(np.median(distance[group])) / 1.177)
+        ties = replace(ties, sigma_px=np.maximum(sigma_px, _LEAST_NOISE_PX))
+    distance = whitened_distance(terrain, ties, alignment.world_T_mast)
+    return ties.select(distance < options.epipolar_scales)
 
 
 def _found(
@@ -175,7 +223,7 @@ def _found(
     image: int,
     alignment: Alignment,
     options: FrontEndOptions,
-) -> Ties:
+) -> tuple[_Sought, Ties]:
     """Patches around points of one image found in another."""
     seen = terrain.sighting(rows, image, alignment.world_T_mast)
     camera = terrain.camera(image)
@@ -188,7 +236,7 @@ def _found(
     inside &= seen.valid & (seen.cosine > _MAX_TURN_COSINE)
     rows, seen = rows[inside], seen.select(inside)
     if not len(rows):
-        return Ties.concatenate([])
+        return _Sought(), Ties.concatenate([])
     affine = terrain.affine(rows, image, alignment.world_T_mast)
     finite: BoolArray = np.asarray(np.isfinite(affine).all(axis=(1, 2)))
     stretch = np.linalg.svd(np.where(finite[:, None, None], affine, 0.0), compute_uv=False)
@@ -200,21 +248,37 @@ def _found(
     usable &= np.all(reach <= MAX_REACH_PX, axis=1)
     k = np.flatnonzero(usable)
     if not len(k):
-        return Ties.concatenate([])
+        return _Sought(), Ties.concatenate([])
     level = np.clip(np.rint(2 * np.log2(np.sqrt(stretch[k, 0] * stretch[k, 1]))), 0, 4).astype(np.int64)
-    uv, fit = seen.uv_px[k].copy(), np.empty((len(k), 4))
+    start, uv, fit = terrain.uv_px[rows[k]], seen.uv_px[k].copy(), np.empty((len(k), 5))
+    first, second_at = spline(int(terrain.image[rows[0]])), partial(spline, image)
     for blur in np.unique(level).tolist():
         part = np.flatnonzero(level == blur)
-        uv[part], fit[part] = _aligned(
-            spline(int(terrain.image[rows[0]])),
-            spline(image, blur),
-            (terrain.uv_px[rows[k[part]]], affine[k[part]], reach[k[part]], uv[part]),
-        )
-    at_start, correlation, second, moved = fit.T
-    good = (correlation > _MIN_CORRELATION) & (correlation >= at_start)
-    good &= (correlation - second > _MIN_LEAD) & (moved < _MAX_MOVE_PX * stretch[k, 0])
+        patches = start[part], affine[k[part]], reach[k[part]], uv[part]
+        uv[part], fit[part] = _aligned(first, second_at(blur), patches)
+    at_start, correlation, second, moved, spread = fit.T
+    alike = (correlation > _MIN_CORRELATION) & (correlation >= at_start)
+    only = alike & (correlation - second > _MIN_LEAD)
+    good = only & (moved < _MAX_MOVE_PX * stretch[k, 0])
     good &= np.all((uv > margin) & (uv < size - 1 - margin), axis=1)
-    return Ties(row=rows[k[good]], image=np.full(int(good.sum()), image, dtype=np.int64), uv_px=uv[good])
+    # And back: the surface around an edge that hides other terrain from there has another patch.
+    for blur in np.unique(level[good]).tolist():
+        part = np.flatnonzero(good & (level == blur))
+        inverse: FloatArray = np.asarray(np.linalg.inv(affine[k[part]]))
+        patches = uv[part], inverse, np.zeros((len(part), 2), dtype=np.int64), start[part]
+        back, _ = _aligned(second_at(blur), first, patches)
+        good[part] = np.linalg.norm(back - start[part], axis=1) < _MAX_RETURN_PX
+    count = [int(np.count_nonzero(x)) for x in (alike, only, good)]
+    sought = _Sought(
+        sought=len(k), unlike=len(k) - count[0], ambiguous=count[0] - count[1], unstable=count[1] - count[2]
+    )
+    ties = Ties(
+        row=rows[k[good]],
+        image=np.full(count[2], image, dtype=np.int64),
+        uv_px=uv[good],
+        sigma_px=spread[good],
+    )
+    return sought, ties
 
 
 def _reach(
@@ -242,7 +306,7 @@ def _aligned(
 ) -> tuple[FloatArray, FloatArray]:
     """Pixels in b (n, 2) and what `align_patches` says of them, for its `uv_a`, `affine`, `reach`, `uv_b`."""
     uv_a, affine, reach, start = patches
-    uv_b, fit = start.copy(), np.empty((len(uv_a), 4))
+    uv_b, fit = start.copy(), np.empty((len(uv_a), 5))
     in_parallel(
         lambda first, last: align_patches(
             first, last, image_a, image_b, uv_a, affine, reach, _STEPS, uv_b, fit
@@ -253,7 +317,7 @@ def _aligned(
     return uv_b, fit
 
 
-def _joined(obs: Observations, terrain: Terrain, ties: Ties, sigma_px: FloatArray) -> Observations:
+def joined(obs: Observations, terrain: Terrain, ties: Ties, sigma_px: FloatArray) -> Observations:
     """Observations with the ties added to their points' tracks."""
     image = np.concatenate([obs.image, ties.image])
     track = np.concatenate([obs.track, terrain.track[ties.row]])

@@ -9,6 +9,7 @@ from dataclasses import fields, is_dataclass
 from functools import cache
 from io import BytesIO
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import cv2
@@ -34,7 +35,7 @@ class Cache:
 
     So nothing here can be out of date: what depends on a changed image, rig, option, on another version of
     the code, of OpenCV, NumPy or SciPy, or on another kind of processor is asked for by another key. Files
-    that cannot be read are logged and made anew.
+    that cannot be read are logged and made anew. Any number of threads may ask, each for keys of its own.
     """
 
     def __init__(self, folder: Path | None) -> None:
@@ -42,6 +43,7 @@ class Cache:
         self._folder = folder
         self._used: set[Path] = set()
         self._begun = False
+        self._beginning = Lock()
 
     def recall(self, kind: str, key: str, make: Callable[[], Mapping[str, NDArray[Any]]]) -> Arrays:
         """The arrays that were kept, or those that `make` returns, which are kept from then on."""
@@ -67,9 +69,10 @@ class Cache:
         content = BytesIO()
         np.savez(content, **{_KEY: np.array(key)}, **arrays)  # type: ignore[arg-type]  # names of ours, none of its options
         try:
-            if not self._begun:
-                begin_cache(self._folder)
-                self._begun = True
+            with self._beginning:
+                if not self._begun:
+                    begin_cache(self._folder)
+                    self._begun = True
             whole_file(path, content.getvalue())
         except OSError as error:  # a full disk must not end what would work without
             _LOG.warning("%s: not kept: %s", path, error)

@@ -1,6 +1,5 @@
 """From image files to observations: masks, features, pairs, matches, tracks."""
 
-import logging
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,16 +9,17 @@ from pancam_graph.errors import InputError
 from pancam_graph.images._cache import Cache
 from pancam_graph.images._masks import ImageMask
 from pancam_graph.images._match import Matches
+from pancam_graph.images._match_pair import PairMatches
 from pancam_graph.images._options import FrontEndOptions
 from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._read import image_name, listed
 from pancam_graph.images._steps import Progress, Steps
 from pancam_graph.images._tracks import Links, join_tracks, spread_tracks
+from pancam_graph.matching import Matching, PairMatching, StopMatching
 from pancam_graph.traverse import Observations, Traverse
 
 __all__ = ["find_masks", "find_observations"]
 
-_LOG = logging.getLogger(__name__)
 _SURE_OVERLAP = 0.1
 _SURE_DEPTH_M = 3.0
 
@@ -37,8 +37,8 @@ def find_observations(
     their standard deviations), and only where the camera models leave a place for them; then each pair's
     geometry is corrected by what most of its matches say, the matching is repeated in the narrower
     windows, and what is far from its epipolar line is left out. Stops that see in stereo are tied by the
-    terrain that each of them places (see `tie_stops`). The same files give the same observations to the last
-    bit.
+    terrain that each of them places (see `StopMatcher`). The same files give the same observations to the
+    last bit.
 
     Left out are what the user's masks cover, missing and saturated pixels, and sky (see `find_masks`).
     Between stops, so is the rover itself, and matches that stand still relative to the mast are dropped; at
@@ -59,17 +59,14 @@ def find_observations(
     warnings = [*work.pictures.warnings, *work.over_exposed()]
     parts: list[Links] = []
     far = replace(options, min_depth_m=max(options.min_depth_m, _SURE_DEPTH_M))
-    for k, pair in enumerate(work.pairs):
-        matches = work.matches(pair)
-        names = traverse.images[pair.a].id, traverse.images[pair.b].id
-        _LOG.info("%s, %s: %d matches", *names, len(matches))
-        if len(matches):
-            parts.append(_links(pair, matches))
+    for pair, found in zip(work.pairs, work.matches, strict=True):
+        if len(found.matches):
+            parts.append(_links(pair, found.matches))
         elif np.mean(pair.overlap(far, widened=False)) > _SURE_OVERLAP:
+            names = traverse.images[pair.a].id, traverse.images[pair.b].id
             warnings.append(
                 f"images {names[0]} and {names[1]}: no matches, although they overlap by pointing"
             )
-        work.tell("matches", k + 1, len(work.pairs))
     image, feature, track = join_tracks(Links.concatenate(parts))
     unseen = [i for i in range(len(traverse.images)) if i not in set(image.tolist())]
     if not len(track):
@@ -103,11 +100,19 @@ def find_observations(
         sigma_px=np.where(refined, options.refined_sigma_px, as_found),
         origin="images",
     )
+    stops: list[StopMatching] = []
     if work.stop_pairs:
-        observations, apart = work.tied(observations, feature)
-        warnings += apart
+        observations, stops = work.tied(observations, feature)
+        untied = {(a, b) for a, b in work.stop_pairs} - {tuple(sorted((s.a, s.b))) for s in stops if s.kept}
+        warnings += [
+            f"stops {traverse.stops[a].id} and {traverse.stops[b].id}: no ties, although they may see the "
+            "same terrain"
+            for a, b in sorted(untied)
+        ]
     work.cache.forget_others()
-    return traverse.with_observations(observations, warnings)
+    pairs = tuple(_report(*found) for found in zip(work.pairs, work.matches, strict=True))
+    matching = Matching(pairs=pairs, stops=tuple(stops))
+    return traverse.with_observations(observations, warnings, matching=matching)
 
 
 def find_masks(
@@ -124,6 +129,18 @@ def find_masks(
     both. Raises as `find_observations` does.
     """
     return tuple(Steps(traverse, options, progress, Cache(cache)).masks)
+
+
+def _report(pair: PairGeometry, found: PairMatches) -> PairMatching:
+    return PairMatching(
+        a=pair.a,
+        b=pair.b,
+        candidates=found.candidates,
+        rover=found.rover,
+        off_line=found.off_line,
+        kept=len(found.matches),
+        refusal=found.refusal,
+    )
 
 
 def _links(pair: PairGeometry, matches: Matches) -> Links:

@@ -1,20 +1,26 @@
 """Matching features of two images within the windows that the geometry leaves open."""
 
+import math
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.images._features import DESCRIPTOR_NORM, Features
 from pancam_graph.images._options import FrontEndOptions
 from pancam_graph.images._pairs import Segments
+from pancam_graph.kernel import compiled
 
 __all__ = ["Matches", "match_in_windows"]
 
-_CELL_PX = 48.0
+Descriptors: TypeAlias = NDArray[np.uint8]
+
+_CELL_PX = 16.0
 _SAME_PLACE_PX = 3.0
 _SIZE_RATIO = 2.5
-_NONE = np.float32(np.inf)
+_NONE = np.int64(np.iinfo(np.int64).max)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,59 +57,118 @@ def match_in_windows(
     The best must be closer than `options.ratio` times the second best, where there is one at another
     place of the same window. Equal distances go to the feature listed first.
     """
-    best = np.full(len(features_a), -1, dtype=np.int64)
-    best_d2 = np.full(len(features_a), _NONE)  # squared distances are whole numbers, exact in float32
+    rows = np.flatnonzero(segments.valid)
+    if not len(rows) or not len(features_b):
+        return Matches.none()
+    corner, shape, order, begin = _gridded(features_b.uv_px)
+    best, best_d2 = np.full(len(features_a), -1, dtype=np.int64), np.zeros(len(features_a), dtype=np.int64)
     for_b = np.full(len(features_b), -1, dtype=np.int64)
-    for_b_d2 = np.full(len(features_b), _NONE)
     limit = (options.max_descriptor_distance * DESCRIPTOR_NORM) ** 2
-    by_v = np.argsort(features_b.uv_px[:, 1], kind="stable")
-    sorted_v = features_b.uv_px[by_v, 1]
-    d_a, d_b = (f.descriptor.astype(np.float32) for f in (features_a, features_b))
-    norm_a, norm_b = np.sum(d_a * d_a, axis=1), np.sum(d_b * d_b, axis=1)
-    for rows in _cells(segments):
-        window = segments.select(rows)
-        low, high = window.bounds_px()
-        near = by_v[np.searchsorted(sorted_v, low[1]) : np.searchsorted(sorted_v, high[1], side="right")]
-        near = np.sort(near[(features_b.uv_px[near, 0] >= low[0]) & (features_b.uv_px[near, 0] <= high[0])])
-        if not len(near):
-            continue
-        allowed = window.reach(features_b.uv_px[near])
-        size_ratio = (features_a.size_px[rows] * window.magnification)[:, None] / features_b.size_px[near]
-        allowed &= (size_ratio < _SIZE_RATIO) & (size_ratio > 1 / _SIZE_RATIO)
-        d2 = norm_a[rows, None] + norm_b[near] - 2 * (d_a[rows] @ d_b[near].T)
-        d2[~allowed] = _NONE
-
-        columns = np.arange(len(near))
-        # Best of b for each of a; the second best must be at another place.
-        first = d2.argmin(axis=1)
-        at = np.arange(len(rows))
-        d2_first = d2[at, first]
-        uv = features_b.uv_px[near]
-        apart = (np.abs(uv[:, 0] - uv[first, 0][:, None]) > _SAME_PLACE_PX) | (
-            np.abs(uv[:, 1] - uv[first, 1][:, None]) > _SAME_PLACE_PX
-        )
-        d2_second = np.where(apart, d2, _NONE).min(axis=1)
-        good = (d2_first <= limit) & (d2_first < options.ratio**2 * d2_second)
-        best[rows[good]] = near[first[good]]
-        best_d2[rows[good]] = d2_first[good]
-        # Best of a for each of b, over all cells; good or not, it takes part in the mutual check.
-        first_a = d2.argmin(axis=0)
-        d2_a = d2[first_a, columns]
-        row_a = rows[first_a]
-        better = (d2_a < for_b_d2[near]) | ((d2_a == for_b_d2[near]) & (d2_a < _NONE) & (row_a < for_b[near]))
-        for_b[near[better]] = row_a[better]
-        for_b_d2[near[better]] = d2_a[better]
+    _search(
+        rows,
+        (segments.far_px, segments.near_px, segments.far_radius_px, segments.near_radius_px),
+        features_a.size_px * segments.magnification,
+        features_a.descriptor,
+        features_b.uv_px[order],
+        features_b.size_px[order],
+        features_b.descriptor[order],
+        order,
+        corner,
+        shape,
+        begin,
+        limit,
+        options.ratio**2,
+        best,
+        best_d2,
+        for_b,
+    )
     found = np.flatnonzero(best >= 0)
     mutual = found[for_b[best[found]] == found]
     return Matches(a=mutual, b=best[mutual], distance=np.sqrt(best_d2[mutual]) / DESCRIPTOR_NORM)
 
 
-def _cells(segments: Segments) -> list[IntArray]:
-    """Rows of valid segments that start near each other, so that they share candidates."""
-    valid = np.flatnonzero(segments.valid)
-    if not len(valid):
-        return []
-    column, row = np.floor(segments.far_px[valid] / _CELL_PX).astype(np.int64).T
-    order = np.lexsort((valid, column, row))
-    changes = np.flatnonzero((np.diff(row[order]) != 0) | (np.diff(column[order]) != 0)) + 1
-    return np.split(valid[order], changes)
+def _gridded(uv_px: FloatArray) -> tuple[FloatArray, IntArray, IntArray, IntArray]:
+    """Pixels by cells of a grid: its corner (2,), its columns and rows, the order, where each cell begins."""
+    corner = uv_px.min(axis=0)
+    column, row = np.floor((uv_px - corner) / _CELL_PX).astype(np.int64).T
+    shape = np.array([column.max() + 1, row.max() + 1])
+    cell = row * shape[0] + column
+    order = np.argsort(cell, kind="stable")
+    return corner, shape, order, np.searchsorted(cell[order], np.arange(shape[0] * shape[1] + 1))
+
+
+@compiled
+def _search(
+    rows: IntArray,
+    windows: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+    size_a: FloatArray,
+    descriptor_a: Descriptors,
+    uv_b: FloatArray,
+    size_b: FloatArray,
+    descriptor_b: Descriptors,
+    name_b: IntArray,
+    corner: FloatArray,
+    shape: IntArray,
+    begin: IntArray,
+    limit: float,
+    ratio2: float,
+    best: IntArray,
+    best_d2: IntArray,
+    for_b: IntArray,
+) -> None:
+    """Best of b for `rows` of a, where it is good, and best of a for each of b, good or not.
+
+    `windows` are those of `Segments`, `size_a` is as b should show it. Those of b are in the order of their
+    cells (see `_gridded`), and `name_b` says which is which.
+    """
+    far, near, far_radius, near_radius = windows
+    inside, d2_inside = np.empty(len(uv_b), dtype=np.int64), np.empty(len(uv_b), dtype=np.int64)
+    for_b_d2 = np.full(len(uv_b), _NONE)
+    for a in rows:
+        u, v = far[a]
+        along_u, along_v = near[a, 0] - u, near[a, 1] - v
+        length2 = max(along_u * along_u + along_v * along_v, 1e-12)
+        r0, r1 = far_radius[a], near_radius[a]
+        left = math.floor((min(u - r0, u + along_u - r1) - corner[0]) / _CELL_PX)
+        right = math.floor((max(u + r0, u + along_u + r1) - corner[0]) / _CELL_PX)
+        top = math.floor((min(v - r0, v + along_v - r1) - corner[1]) / _CELL_PX)
+        bottom = math.floor((max(v + r0, v + along_v + r1) - corner[1]) / _CELL_PX)
+        left, right = max(left, 0), min(right, shape[0] - 1)
+        if left > right:
+            continue
+        count, first, first_d2 = 0, -1, _NONE
+        for row in range(max(top, 0), min(bottom, shape[1] - 1) + 1):
+            for b in range(begin[row * shape[0] + left], begin[row * shape[0] + right + 1]):
+                du, dv = uv_b[b, 0] - u, uv_b[b, 1] - v
+                t = min(max((du * along_u + dv * along_v) / length2, 0.0), 1.0)
+                du, dv = du - t * along_u, dv - t * along_v
+                radius = r0 + t * (r1 - r0)
+                if du * du + dv * dv > radius * radius:
+                    continue
+                size_ratio = size_a[a] / size_b[b]
+                if not 1 / _SIZE_RATIO < size_ratio < _SIZE_RATIO:
+                    continue
+                # Of 32 bits throughout, or the compiler makes no vectors of it.
+                total = np.int32(0)
+                for k in range(descriptor_a.shape[1]):
+                    change = np.int32(np.int32(descriptor_a[a, k]) - np.int32(descriptor_b[b, k]))
+                    total = np.int32(total + np.int32(change * change))
+                d2 = np.int64(total)
+                inside[count], d2_inside[count] = b, d2
+                count += 1
+                if d2 < first_d2 or (d2 == first_d2 and name_b[b] < name_b[first]):
+                    first, first_d2 = b, d2
+                if d2 < for_b_d2[b]:
+                    for_b_d2[b], for_b[name_b[b]] = d2, a
+        if first < 0 or first_d2 > limit:
+            continue
+        second_d2 = _NONE
+        for i in range(count):
+            b = inside[i]
+            if (
+                abs(uv_b[b, 0] - uv_b[first, 0]) > _SAME_PLACE_PX
+                or abs(uv_b[b, 1] - uv_b[first, 1]) > _SAME_PLACE_PX
+            ):
+                second_d2 = min(second_d2, d2_inside[i])
+        if second_d2 == _NONE or first_d2 < ratio2 * second_d2:
+            best[a], best_d2[a] = name_b[first], first_d2

@@ -1,8 +1,11 @@
 """All that happens to one pair of images: match, correct the geometry, match again, verify."""
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pancam_graph.geometry import BoolArray, FloatArray
 from pancam_graph.images._features import Features
@@ -10,8 +13,9 @@ from pancam_graph.images._match import Matches, match_in_windows
 from pancam_graph.images._options import FrontEndOptions
 from pancam_graph.images._pairs import PairGeometry, Segments
 from pancam_graph.images._verify import PairFit, epipolar_px, fit_pair
+from pancam_graph.matching import Refusal
 
-__all__ = ["match_pair"]
+__all__ = ["PairMatches", "match_pair"]
 
 _TRUE_PX = 1.0
 _CHANCE_SIGMAS = 4.0
@@ -19,21 +23,49 @@ _HORIZON_RAD = np.deg2rad(3.0)
 _DECK_PX = 3.0
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PairMatches:
+    """Verified matches of two images, and what became of the other candidates; see `PairMatching`."""
+
+    matches: Matches
+    candidates: int
+    rover: int
+    off_line: int = 0
+    refusal: Refusal = Refusal.NONE
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """All of it, to be kept."""
+        counts = [self.candidates, self.rover, self.off_line, int(self.refusal)]
+        return {**vars(self.matches), "counts": np.array(counts)}
+
+    @staticmethod
+    def of_arrays(arrays: Mapping[str, NDArray[Any]]) -> "PairMatches":
+        """From what `arrays` gave."""
+        candidates, rover, off_line, refusal = arrays["counts"].tolist()
+        return PairMatches(
+            matches=Matches(**{name: arrays[name] for name in ("a", "b", "distance")}),
+            candidates=candidates,
+            rover=rover,
+            off_line=off_line,
+            refusal=Refusal(refusal),
+        )
+
+
 def match_pair(
     pair: PairGeometry, features_a: Features, features_b: Features, options: FrontEndOptions
-) -> Matches:
+) -> PairMatches:
     """Verified matches of two images; none where what agrees could as well be chance.
 
     First the windows are as wide as telemetry is uncertain. The matches found correct the pair's geometry;
     then the windows are as wide as the correction is uncertain, which finds more matches, and the same ones
     wherever the pointing started from.
     """
-    nothing = Matches.none()
     start = PairFit(p=pair.no_correction, root=np.diag(pair.sigma))
     segments = pair.segments(features_a.uv_px, start.p, start.root, options.search_slack_px, options)
-    matches = _search(pair, features_a, features_b, segments, options)
+    found = _search(pair, features_a, features_b, segments, options)
+    matches = found.matches
     if len(matches) < options.min_pair_matches:
-        return nothing
+        return _refused(found, Refusal.FEW_ALIKE)
     half_width = segments.far_radius_px[matches.a]
     uv_a, uv_b = features_a.uv_px[matches.a], features_b.uv_px[matches.b]
     fit = fit_pair(pair, uv_a, uv_b, start, float(half_width.max()), options)
@@ -43,17 +75,25 @@ def match_pair(
     expected, spread = float(chance.sum()), float(np.sqrt(np.sum(chance * (1 - chance))))
     agreeing = np.count_nonzero(distance < _TRUE_PX)
     if agreeing < max(options.min_pair_matches, expected + _CHANCE_SIGMAS * spread):
-        return nothing
+        return _refused(found, Refusal.CHANCE)
 
     segments = pair.segments(features_a.uv_px, fit.p, fit.root, options.guided_slack_px, options)
-    matches = _search(pair, features_a, features_b, segments, options)
+    found = _search(pair, features_a, features_b, segments, options)
+    matches = found.matches
     if len(matches) < options.min_pair_matches:
-        return nothing
+        return _refused(found, Refusal.FEW_GUIDED)
     uv_a, uv_b = features_a.uv_px[matches.a], features_b.uv_px[matches.b]
     fit = fit_pair(pair, uv_a, uv_b, fit, options.guided_slack_px, options)
     distance, _ = epipolar_px(pair, fit.p, uv_a, uv_b, options)
-    matches = matches.select(distance < _threshold_px(distance, options))
-    return matches if len(matches) >= options.min_pair_matches else nothing
+    on_line = distance < _threshold_px(distance, options)
+    found = replace(found, matches=matches.select(on_line), off_line=int(np.count_nonzero(~on_line)))
+    if len(found.matches) < options.min_pair_matches:
+        return _refused(found, Refusal.FEW_ON_LINES)
+    return found
+
+
+def _refused(found: PairMatches, refusal: Refusal) -> PairMatches:
+    return replace(found, matches=Matches.none(), refusal=refusal)
 
 
 def _threshold_px(distance_px: FloatArray, options: FrontEndOptions) -> float:
@@ -68,12 +108,14 @@ def _search(
     features_b: Features,
     segments: Segments,
     options: FrontEndOptions,
-) -> Matches:
+) -> PairMatches:
     matches = match_in_windows(features_a, features_b, segments, options)
-    if pair.same_stop or not len(matches):
-        return matches
-    uv_a, uv_b = features_a.uv_px[matches.a], features_b.uv_px[matches.b]
-    return matches.select(~_on_rover(pair, uv_a, uv_b, options))
+    rover = np.zeros(len(matches), dtype=bool)
+    if not pair.same_stop and len(matches):
+        rover = _on_rover(pair, features_a.uv_px[matches.a], features_b.uv_px[matches.b], options)
+    return PairMatches(
+        matches=matches.select(~rover), candidates=len(matches), rover=int(np.count_nonzero(rover))
+    )
 
 
 def _on_rover(pair: PairGeometry, uv_a: FloatArray, uv_b: FloatArray, options: FrontEndOptions) -> BoolArray:

@@ -27,6 +27,7 @@ FAR_M = 1e7
 """Stands for infinity: a baseline of 100 m is 1e-5 rad there."""
 
 _DEPTHS = 16
+_AT_ONCE = 16_384  # points: few calls for few features, and what fits in the caches of a core for many
 _COARSE_FARTHEST_M = 200.0
 _DIFFERENCE = 1e-2
 MAX_TURN_RAD = float(np.deg2rad(30.0))
@@ -215,11 +216,12 @@ class PairGeometry:
         pixels, inside = np.empty((len(depths), n, 2)), np.empty((len(depths), n), dtype=bool)
         size = np.array([self.camera_b.width_px, self.camera_b.height_px])
         margin = far_radius[:, None]
-        for k, depth in enumerate(depths):
-            points = rays.origin_m + depth * rays.direction
-            pixels[k], seen = self.transfer(points, b_T_a)
-            inside[k] = seen & np.all((pixels[k] > -margin) & (pixels[k] < size - 1 + margin), axis=1)
-            inside[k] &= _alike(points, b_T_a)
+        for k in np.array_split(np.arange(len(depths)), max(1, len(depths) * n // _AT_ONCE)):
+            points = (rays.origin_m + depths[k, None, None] * rays.direction).reshape(-1, 3)
+            uv, seen = self.transfer(points, b_T_a)
+            pixels[k] = uv.reshape(len(k), n, 2)
+            on = np.all((pixels[k] > -margin) & (pixels[k] < size - 1 + margin), axis=2)
+            inside[k] = on & (seen & _alike(points, b_T_a)).reshape(len(k), n)
         first, last = inside.argmax(axis=0), len(depths) - 1 - inside[::-1].argmax(axis=0)
         row = np.arange(n)
         far_px, near_px = pixels[first, row], pixels[last, row]

@@ -83,9 +83,10 @@ def align_patches(
 
     `uv_a` (n, 2); `affine` (n, 2, 2) is the derivative of the pixel in b by that in a, and `uv_b` (n, 2) the
     pixel in b, both at the start; `uv_b` is moved. `reach` (n, 2) is how many pixels of a the search by
-    correlation goes from the start to either side, along u and v. `found` (n, 4) gets the correlation where
+    correlation goes from the start to either side, along u and v. `found` (n, 5) gets the correlation where
     the least-squares matching starts, where it ends, the second best of the search, and how far from its
-    start it ended, in pixels of b.
+    start it ended, in pixels of b; and there too, but for a factor that is the same for all, how uncertain
+    that makes the place that the patches still differ.
     """
     n_taps = _SIDE * _SIDE
     offset, weight = np.empty((n_taps, 2)), np.empty(n_taps)
@@ -196,3 +197,5 @@ def align_patches(
         uv_b[row, 0], uv_b[row, 1] = x, y
         found[row, 0], found[row, 1], found[row, 2] = at_start, correlation, second
         found[row, 3] = math.hypot(x - x_start, y - y_start)
+        # The standardised patches differ by 2 (1 - correlation): the noise of the fit's observations.
+        found[row, 4] = math.sqrt(max(1.0 - correlation, 0.0) * (inverse[0, 0] + inverse[1, 1]))

@@ -1,7 +1,5 @@
 """Sub-pixel positions by least-squares matching of the patches around the features of a track."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from pancam_graph.cameras import Camera
@@ -11,7 +9,6 @@ from pancam_graph.images._pairs import FAR_M, PairGeometry
 from pancam_graph.images._patches import HALF_WIDTH_PX, align_patches
 from pancam_graph.images._splines import Splines
 from pancam_graph.images._verify import epipolar_px
-from pancam_graph.io.image_files import GreyImage
 from pancam_graph.threads import in_parallel
 from pancam_graph.traverse import Traverse
 
@@ -26,7 +23,7 @@ _MAX_MAGNIFICATION = 2.0
 
 def refine_tracks(
     traverse: Traverse,
-    images: Sequence[GreyImage | None],
+    spline: Splines,
     image: IntArray,
     track: IntArray,
     uv_px: FloatArray,
@@ -40,7 +37,6 @@ def refine_tracks(
     where it would move by more than a pixel, near the image's edge, and between images whose scales
     differ by more than a factor of 2.
     """
-    spline = Splines(images)
     refined = np.zeros(len(image), dtype=bool)
     found = uv_px.copy()
     first = np.searchsorted(track, track)
@@ -65,7 +61,7 @@ def _refine_pair(
     rows = np.flatnonzero(usable)
     image_a, image_b = spline(pair.a), spline(pair.b)
     own_a, own_affine, position = uv_a[rows], affine[rows], uv_b[rows]
-    reach, fit = np.zeros((len(rows), 2), dtype=np.int64), np.empty((len(rows), 4))
+    reach, fit = np.zeros((len(rows), 2), dtype=np.int64), np.empty((len(rows), 5))
     in_parallel(
         lambda first, last: align_patches(
             first, last, image_a, image_b, own_a, own_affine, reach, _STEPS, position, fit
@@ -73,7 +69,7 @@ def _refine_pair(
         len(rows),
         grain=_GRAIN,
     )
-    at_start, correlation, _, moved = fit.T
+    at_start, correlation, _, moved, _ = fit.T
     good = moved < _MAX_SHIFT_PX * np.maximum(magnification[rows], 1.0)
     good &= (correlation > _MIN_CORRELATION) & (correlation >= at_start)
     found, refined = uv_b.copy(), np.zeros(len(uv_b), dtype=bool)

@@ -55,6 +55,12 @@ class _Windows:
         shown = np.where(spread > _TEXTURE * _noise(grey), spread, np.float32(np.inf))
         return _Windows(detail=detail, mean=mean, spread=shown)
 
+    def padded(self, margin: int) -> "_Windows":
+        """The same with a margin all around that shows nothing."""
+        detail, mean = (np.pad(x, margin) for x in (self.detail, self.mean))
+        shown = np.pad(self.spread, margin, constant_values=np.float32(np.inf))
+        return _Windows(detail=detail, mean=mean, spread=shown)
+
 
 def _window_mean(values: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(cv2.blur(values, (_WINDOW_PX, _WINDOW_PX)))
@@ -117,8 +123,9 @@ def _standing_still(
     coarse_a, coarse_b = (_Windows.of(_resized(x, small)) for x in greys)
     there_small = cv2.resize(there.astype(np.uint8), small, interpolation=cv2.INTER_NEAREST) > 0
     radius = int(np.ceil(reach_px * scale / _COARSER))
-    shift = _best_shift(coarse_a, coarse_b, there_small, (0, 0), radius)
+    shift = _best_shift(coarse_a, coarse_b.padded(radius), there_small, (0, 0), radius)
     a, b = (_Windows.of(x) for x in greys)
+    b = b.padded(_COARSER * (radius + 1) + 1)
     shift = _best_shift(a, b, there, (_COARSER * shift[0], _COARSER * shift[1]), _COARSER)
     alike = np.zeros(there.shape, dtype=bool)
     for du in (-1, 0, 1):
@@ -212,11 +219,14 @@ def _best_shift(
 
 
 def _correlation(a: _Windows, b: _Windows, shift: tuple[int, int]) -> NDArray[np.float32]:
-    """Correlation of each window of a with that of b, moved; 0 where either shows nothing."""
-    to = np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]]])
-    size = a.detail.shape[::-1]
-    detail, mean = (cv2.warpAffine(x, to, size, flags=cv2.INTER_NEAREST) for x in (b.detail, b.mean))
-    spread = cv2.warpAffine(b.spread, to, size, flags=cv2.INTER_NEAREST, borderValue=float("inf"))
+    """Correlation of each window of a with that of b, moved; 0 where either shows nothing.
+
+    b is `padded`, by at least as much as it is moved.
+    """
+    height, width = a.detail.shape
+    margin_v, margin_u = ((n - m) // 2 for n, m in zip(b.detail.shape, a.detail.shape, strict=True))
+    top, left = margin_v - shift[1], margin_u - shift[0]
+    detail, mean, spread = (x[top : top + height, left : left + width] for x in (b.detail, b.mean, b.spread))
     return np.asarray((_window_mean(a.detail * detail) - a.mean * mean) / (a.spread * spread))
 
 

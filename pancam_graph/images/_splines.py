@@ -2,6 +2,8 @@
 
 from collections import OrderedDict
 from collections.abc import Sequence
+from dataclasses import dataclass, field
+from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,24 +17,35 @@ _BLUR_PX = 0.7
 _CACHED_IMAGES = 48
 
 
+@dataclass(eq=False)
+class _Kept:
+    lock: Lock = field(default_factory=Lock)
+    coefficients: NDArray[np.float32] | None = None
+
+
 class Splines:
-    """Spline coefficients of images, the ones asked for last kept."""
+    """Spline coefficients of images, the ones asked for last kept; for any number of threads."""
 
     def __init__(self, images: Sequence[GreyImage | None]) -> None:
         """Of images that are there wherever coefficients are asked for."""
         self._images = images
-        self._kept = OrderedDict[tuple[int, int], NDArray[np.float32]]()
+        self._kept = OrderedDict[tuple[int, int], _Kept]()
+        self._lock = Lock()
 
     def __call__(self, row: int, half_octaves: int = 0) -> NDArray[np.float32]:
         """Coefficients (height, width) of an image; each half octave blurs it by a factor of sqrt(2) more."""
         key = row, half_octaves
-        if key not in self._kept:
-            grey = self._images[row]
-            assert grey is not None  # it has features
-            blurred = ndimage.gaussian_filter(grey.astype(np.float32), _BLUR_PX * 2 ** (half_octaves / 2))
-            coefficients = ndimage.spline_filter(blurred, 3, output=np.float32, mode="mirror")
-            self._kept[key] = np.ascontiguousarray(coefficients)
+        with self._lock:
+            kept = self._kept.setdefault(key, _Kept())
+            self._kept.move_to_end(key)
             if len(self._kept) > _CACHED_IMAGES:
                 self._kept.popitem(last=False)
-        self._kept.move_to_end(key)
-        return self._kept[key]
+        with kept.lock:  # who asks for the same at the same time waits for it
+            if kept.coefficients is None:
+                grey = self._images[row]
+                assert grey is not None  # it has features
+                blurred = ndimage.gaussian_filter(grey.astype(np.float32), _BLUR_PX * 2 ** (half_octaves / 2))
+                kept.coefficients = np.ascontiguousarray(
+                    ndimage.spline_filter(blurred, 3, output=np.float32, mode="mirror")
+                )
+            return kept.coefficients

@@ -5,23 +5,27 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any
 
 import numpy as np
 
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray
-from pancam_graph.images._between import near_stops, stereo_stops, tie_stops
+from pancam_graph.images._alignment import Ties
+from pancam_graph.images._between import StopMatcher, StopTies, joined, near_stops, on_terrain, stereo_stops
 from pancam_graph.images._cache import Arrays, Cache, digest
 from pancam_graph.images._features import Features, find_features
 from pancam_graph.images._masks import ImageMask, Reason, elevation_rad, mask_image, pixels_at
-from pancam_graph.images._match import Matches
-from pancam_graph.images._match_pair import match_pair
+from pancam_graph.images._match_pair import PairMatches, match_pair
 from pancam_graph.images._options import FrontEndOptions
 from pancam_graph.images._overlap import overlap_cells, overlapping_pairs
 from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._read import Pictures, image_name, read_pictures
 from pancam_graph.images._refine import refine_tracks
 from pancam_graph.images._rover import find_rover, rover_partners
+from pancam_graph.images._splines import Splines
+from pancam_graph.images._terrain import terrain_arrays, terrain_from
+from pancam_graph.matching import StopMatching
+from pancam_graph.solve import solve
+from pancam_graph.threads import in_order
 from pancam_graph.traverse import Observations, Traverse
 
 __all__ = ["Progress", "Steps"]
@@ -101,13 +105,13 @@ class Steps:
 
     @cached_property
     def masks(self) -> list[ImageMask | None]:
-        images = self.pictures.images
-        there = np.array([image is not None for image in images])
-        found: list[ImageMask | None] = []
-        for i in range(len(images)):
-            found.append(self._mask(i, there) if there[i] else None)
-            self.tell("masks", i + 1, len(images))
-        return found
+        there = np.array([image is not None for image in self.pictures.images])
+        self.picture_keys  # noqa: B018  made here, by one thread
+        return in_order(
+            lambda i: self._mask(i, there) if there[i] else None,
+            range(len(there)),
+            lambda i, _: self.tell("masks", i + 1, len(there)),
+        )
 
     def _mask(self, row: int, there: BoolArray) -> ImageMask:
         image = self.pictures.images[row]
@@ -149,21 +153,25 @@ class Steps:
     def features(self) -> list[Features]:
         """Of every image where it overlaps others; none for an image without a file."""
         world_R_camera, _ = self.traverse.camera_poses()
-        features = []
-        for i, (image, mask) in enumerate(zip(self.pictures.images, self.masks, strict=True)):
+        self.feature_keys  # noqa: B018  made here, by one thread
+
+        def find(i: int) -> Features:
+            image, mask = self.pictures.images[i], self.masks[i]
             if image is None or mask is None:
-                features.append(Features.none())
-            else:
-                camera = self.traverse.rig.eyes[int(self.traverse.image_eye[i])].camera
-                usable = mask.usable(between_stops=False)
-                up = world_R_camera[i].T @ _WORLD_UP
-                make = partial(
-                    _as_arrays, find_features, image, self.wanted[i], camera, up, self.options, usable=usable
-                )
-                features.append(Features(**self.cache.recall("features", self.feature_keys[i], make)))
-            _LOG.info("%s: %d features", self.traverse.images[i].id, len(features[i]))
+                return Features.none()
+            camera = self.traverse.rig.eyes[int(self.traverse.image_eye[i])].camera
+            usable, up = mask.usable(between_stops=False), world_R_camera[i].T @ _WORLD_UP
+
+            def make() -> Arrays:
+                return vars(find_features(image, self.wanted[i], camera, up, self.options, usable=usable))
+
+            return Features(**self.cache.recall("features", self.feature_keys[i], make))
+
+        def tell(i: int, found: Features) -> None:
+            _LOG.info("%s: %d features", self.traverse.images[i].id, len(found))
             self.tell("features", i + 1, len(self.wanted))
-        return features
+
+        return in_order(find, range(len(self.wanted)), tell)
 
     @cached_property
     def _off_rover(self) -> list[IntArray]:
@@ -176,20 +184,37 @@ class Steps:
             rows.append(np.flatnonzero(keep))
         return rows
 
-    def matches(self, pair: PairGeometry) -> Matches:
-        """Verified matches of a pair; those of two stops without the rover."""
+    @cached_property
+    def matches(self) -> list[PairMatches]:
+        """Verified matches of each pair; those of two stops without the rover."""
+        if any(not pair.same_stop for pair in self.pairs):
+            self._off_rover  # noqa: B018  made here, by one thread
+        self.features  # noqa: B018  the same
+
+        def tell(k: int, found: PairMatches) -> None:
+            pair = self.pairs[k]
+            names = self.traverse.images[pair.a].id, self.traverse.images[pair.b].id
+            _LOG.info("%s, %s: %d matches %s", *names, len(found.matches), found.refusal.text)
+            self.tell("matches", k + 1, len(self.pairs))
+
+        return in_order(self._matches, self.pairs, tell)
+
+    def _matches(self, pair: PairGeometry) -> PairMatches:
         a, b = self.features[pair.a], self.features[pair.b]
+        rows = None if pair.same_stop else (self._off_rover[pair.a], self._off_rover[pair.b])
 
         def make() -> Arrays:
-            if pair.same_stop:
-                return _as_arrays(match_pair, pair, a, b, self.options)
-            rows_a, rows_b = self._off_rover[pair.a], self._off_rover[pair.b]
-            found = match_pair(pair, a.select(rows_a), b.select(rows_b), self.options)
-            return {"a": rows_a[found.a], "b": rows_b[found.b], "distance": found.distance}
+            if rows is None:
+                return match_pair(pair, a, b, self.options).arrays()
+            found = match_pair(pair, a.select(rows[0]), b.select(rows[1]), self.options).arrays()
+            return {**found, "a": rows[0][found["a"]], "b": rows[1][found["b"]]}
 
-        rows = () if pair.same_stop else (self._off_rover[pair.a], self._off_rover[pair.b])
         key = digest("matches", self.feature_keys[pair.a], self.feature_keys[pair.b], rows)
-        return Matches(**self.cache.recall("matches", key, make))
+        return PairMatches.of_arrays(self.cache.recall("matches", key, make))
+
+    @cached_property
+    def _spline(self) -> Splines:
+        return Splines(self.pictures.images)
 
     def refined(self, image: IntArray, track: IntArray, uv_px: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Better positions, and which observations have one; see `refine_tracks`.
@@ -198,53 +223,79 @@ class Steps:
         around the first of its track, has pixels that are left out, it stays as it was found.
         """
         first = np.searchsorted(track, track)
-        found, refined = uv_px.copy(), np.zeros(len(image), dtype=bool)
         firsts = np.unique(image[first])
-        for k, origin in enumerate(firsts):
-            rows = np.flatnonzero(image[first] == origin)
+        rows_of = [np.flatnonzero(image[first] == origin) for origin in firsts]
+
+        def refine(rows: IntArray) -> Arrays:
             columns = image[rows], track[rows], uv_px[rows]
 
-            def make(columns: tuple[IntArray, IntArray, FloatArray] = columns) -> Arrays:
-                moved, good = refine_tracks(self.traverse, self.pictures.images, *columns, self.options)
+            def make() -> Arrays:
+                moved, good = refine_tracks(self.traverse, self._spline, *columns, self.options)
                 return {"uv_px": moved, "refined": good}
 
             pictures = [self.picture_keys[i] for i in np.unique(image[rows])]
-            kept = self.cache.recall("refined", digest("refined", pictures, columns), make)
-            found[rows], refined[rows] = kept["uv_px"], kept["refined"]
-            self.tell("refinement", k + 1, len(firsts))
+            return self.cache.recall("refined", digest("refined", pictures, columns), make)
+
+        self._spline  # noqa: B018  made here, by one thread
+        parts = in_order(refine, rows_of, lambda k, _: self.tell("refinement", k + 1, len(firsts)))
+        found, refined = uv_px.copy(), np.zeros(len(image), dtype=bool)
+        for rows, part in zip(rows_of, parts, strict=True):
+            found[rows], refined[rows] = part["uv_px"], part["refined"]
         clear = self._clear(image, track, found) & self._clear(image, track, uv_px)
         moved = refined & clear & clear[first] & (first != np.arange(len(first)))
         good = moved.copy()
         good[first[moved]] = True  # it stays where it was found: the others fit to it
         return np.where(moved[:, None], found, uv_px), good
 
-    def tied(self, observations: Observations, feature: IntArray) -> tuple[Observations, list[str]]:
-        """Observations within stops and those that `tie_stops` adds, and its warnings."""
+    def tied(self, observations: Observations, feature: IntArray) -> tuple[Observations, list[StopMatching]]:
+        """Observations within stops with what pairs of stops see of each other's terrain added.
+
+        They are sorted by track, then image; `feature` says of which feature each is. A solve of these places
+        the terrain of each stop. Each direction of each pair of stops is kept as soon as it is done.
+        """
+        traverse = self.traverse.with_observations(observations)
         usable = [
             None if mask is None else mask.usable(between_stops=True, margin_px=_PATCH_PX)
             for mask in self.masks
         ]
 
-        def make() -> Arrays:
-            found, warnings = tie_stops(
-                self.traverse.with_observations(observations),
-                self.pictures.images,
-                usable,
-                self.features,
-                feature,
-                self.stop_pairs,
-                self.options,
-                partial(self.tell, "ties between stops"),
-            )
-            names = ("image", "track", "uv_px", "sigma_px")
-            columns = {name: np.asarray(getattr(found, name)) for name in names}
-            return {**columns, "warnings": np.array(warnings, dtype=str)}
+        def place() -> Arrays:
+            self.tell("terrain of the stops", 0, 1)
+            solution = solve(traverse)
+            # A solve finds one factor for all noise: the ties' is stated in the units of the others'.
+            unit = np.median(observations.sigma_px / solution.sigma_px)
+            self.tell("terrain of the stops", 1, 1)
+            return {**terrain_arrays(solution), "unit": np.array(unit)}
 
         columns = observations.image, observations.track, observations.uv_px, observations.sigma_px, feature
-        key = digest("ties", self.picture_keys, self.mask_keys, self.traverse.stops, columns)
-        kept = self.cache.recall("ties", key, make)
-        warnings = [str(text) for text in kept.pop("warnings")]
-        return Observations(**kept, origin="images"), warnings
+        key = digest("terrain", self.picture_keys, self.mask_keys, self.traverse.stops, columns)
+        placed = self.cache.recall("terrain", key, place)
+        unit = float(placed.pop("unit"))
+        terrain = terrain_from(traverse, **placed)
+        terrain = terrain.select(on_terrain(usable, terrain.image, terrain.uv_px))
+        matcher = StopMatcher(
+            terrain=terrain,
+            spline=self._spline,
+            usable=usable,
+            features=self.features,
+            feature_of=feature,
+            options=self.options,
+        )
+
+        def tie(stops: tuple[int, int]) -> StopTies:
+            make = partial(_as_arrays, matcher, stops)
+            return StopTies.of_arrays(self.cache.recall("ties", digest("ties", key, stops), make))
+
+        def tell(k: int, found: StopTies) -> None:
+            report = found.report
+            names = self.traverse.stops[report.a].id, self.traverse.stops[report.b].id
+            _LOG.info("%s in %s: %d ties, noise %.2f px", *names, report.kept, report.noise_px)
+            self.tell("ties between stops", k + 1, len(directed))
+
+        directed = [d for a, b in self.stop_pairs for d in ((a, b), (b, a))]
+        found = in_order(tie, directed, tell)
+        ties = Ties.concatenate([f.ties for f in found])
+        return joined(observations, terrain, ties, unit * ties.sigma_px), [f.report for f in found]
 
     def _clear(self, image: IntArray, track: IntArray, uv_px: FloatArray) -> BoolArray:
         """Whether no pixel is left out within a patch around each observation."""
@@ -287,5 +338,5 @@ class Steps:
         return ""
 
 
-def _as_arrays(function: Callable[..., Features | Matches], *arguments: Any, **more: Any) -> Arrays:
-    return dict(vars(function(*arguments, **more)))
+def _as_arrays(matcher: StopMatcher, stops: tuple[int, int]) -> Arrays:
+    return matcher.ties(*stops).arrays()

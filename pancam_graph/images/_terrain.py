@@ -2,17 +2,18 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import gtsam
 import numpy as np
 from scipy.spatial import cKDTree
 
 from pancam_graph.cameras import Camera
-from pancam_graph.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.geometry import BoolArray, FloatArray, IntArray, pose_arrays
 from pancam_graph.solution import Solution
 from pancam_graph.traverse import Observations, Traverse
 
-__all__ = ["Sighting", "Terrain", "terrain_of"]
+__all__ = ["Sighting", "Terrain", "terrain_arrays", "terrain_from"]
 
 _NEAREST_INVERSE_M = 1e-7
 _NEIGHBOURS = 12
@@ -110,41 +111,67 @@ class Terrain:
         R, centre = (p[image] for p in self._poses)
         return np.asarray(centre + (origin + ray / np.maximum(inverse, _NEAREST_INVERSE_M)[:, None]) @ R.T)
 
-    def sighting(self, rows: IntArray, image: int, world_T_mast: gtsam.Pose3) -> Sighting:
-        """How `image` sees rows of one image of another stop, if its mast is at that pose."""
-        points = self.points_m(rows)
-        first = int(self.image[rows[0]])
-        R_a, centre_a = (p[first] for p in self._poses)
-        camera = self.camera(image)
-        mast_R, mast_t = self._mast_T_camera(image)
+    @cached_property
+    def _world_m(self) -> FloatArray:
+        """(n, 3) all points."""
+        points = np.empty((len(self.row), 3))
+        for i in np.unique(self.image):
+            rows = np.flatnonzero(self.image == i)
+            points[rows] = self.points_m(rows)
+        return points
+
+    @cached_property
+    def _along(self) -> FloatArray:
+        """(n, 3) how the points move with their depths, in the world."""
+        R, centre = (p[self.image] for p in self._poses)
+        axis = np.einsum("nij,nj->ni", R, self._forward[self.traverse.image_eye[self.image]])
+        to_a = self._world_m - centre
+        return np.asarray(to_a / np.maximum(np.einsum("ni,ni->n", to_a, axis), 1e-12)[:, None])
+
+    @cached_property
+    def _forward(self) -> FloatArray:
+        """Axes (eyes, 3) of their cameras, in their frames."""
+        return np.array([_forward(eye.camera) for eye in self.traverse.rig.eyes])
+
+    def sighting(self, rows: IntArray, image: IntArray | int, world_T_mast: gtsam.Pose3) -> Sighting:
+        """How `image`, of another stop, sees each of the rows, if its mast is at that pose.
+
+        One image for all rows, or one for each.
+        """
+        t, points, first = self.traverse, self._world_m[rows], self.image[rows]
+        image = np.broadcast_to(image, rows.shape)
+        eye = t.image_eye[image]
+        mast_R, mast_t = (x[image] for x in self._mast_T_cameras)
         R_m, t_m = world_T_mast.rotation().matrix(), world_T_mast.translation()
         in_mast = (points - t_m) @ R_m
-        uv, d_point, valid = camera.project_with_jacobian((in_mast - mast_t) @ mast_R)
-        d_mast = d_point @ mast_R.T
+        in_camera = np.einsum("nji,nj->ni", mast_R, in_mast - mast_t)
+        uv, d_point = np.empty((len(rows), 2)), np.empty((len(rows), 2, 3))
+        valid = np.empty(len(rows), dtype=bool)
+        for e in np.unique(eye).tolist():
+            k = np.flatnonzero(eye == e)
+            uv[k], d_point[k], valid[k] = t.rig.eyes[e].camera.project_with_jacobian(in_camera[k])
+        d_mast = d_point @ np.swapaxes(mast_R, 1, 2)
         # A turn of the mast by w takes what it sees by -w x p, a shift by -v.
         d_pose = np.concatenate([np.cross(d_mast, in_mast[:, None]), -d_mast], axis=2)
-        to_a = points - centre_a
-        range_a = np.linalg.norm(to_a, axis=1)
-        along = to_a / np.maximum((to_a @ R_a) @ _forward(self.camera(first)), 1e-12)[:, None]
         inverse = np.maximum(self.inverse_depth[rows], _NEAREST_INVERSE_M)
-        d_world = d_mast @ R_m.T
-        d_inverse = np.einsum("nij,nj->ni", d_world, -along / inverse[:, None] ** 2)
-        to_b = points - (R_m @ mast_t + t_m)
+        d_inverse = np.einsum("nij,nj->ni", d_mast @ R_m.T, -self._along[rows] / inverse[:, None] ** 2)
+        to_a = points - self._poses[1][first]
+        to_b = (in_mast - mast_t) @ R_m.T
+        range_a = np.linalg.norm(to_a, axis=1)
         range_b = np.maximum(np.linalg.norm(to_b, axis=1), 1e-9)
-        focal = [float(c.pinhole.calibration_matrix[0, 0]) for c in (self.camera(first), camera)]
         return Sighting(
             uv_px=uv,
             d_pose=d_pose,
             d_inverse_depth=d_inverse,
             cosine=np.einsum("ni,ni->n", to_a, to_b) / np.maximum(range_a * range_b, 1e-12),
-            zoom=focal[1] / focal[0] * range_a / range_b,
+            zoom=self._focal_px[eye] / self._focal_px[t.image_eye[first]] * range_a / range_b,
             valid=valid,
         )
 
     def affine(self, rows: IntArray, image: int, world_T_mast: gtsam.Pose3) -> FloatArray:
         """Derivative (n, 2, 2) of the pixel in `image` by the pixel of one other image, on the surface."""
         camera = self.camera(image)
-        mast_R, mast_t = self._mast_T_camera(image)
+        mast_R, mast_t = (x[image] for x in self._mast_T_cameras)
         R_m, t_m = world_T_mast.rotation().matrix(), world_T_mast.translation()
         pixels = []
         for shift in ((-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0)):
@@ -152,23 +179,22 @@ class Terrain:
             pixels.append(camera.project((in_mast - mast_t) @ mast_R)[0])
         return np.stack([pixels[1] - pixels[0], pixels[3] - pixels[2]], -1) / 2
 
-    def _mast_T_camera(self, image: int) -> tuple[FloatArray, FloatArray]:
+    @cached_property
+    def _mast_T_cameras(self) -> tuple[FloatArray, FloatArray]:
         t = self.traverse
-        R, centre = t.rig.mast_T_camera(t.pan_tilt_rad[t.image_frame[[image]]], t.image_eye[[image]])
-        return R[0], centre[0]
+        return t.rig.mast_T_camera(t.pan_tilt_rad[t.image_frame], t.image_eye)
+
+    @cached_property
+    def _focal_px(self) -> FloatArray:
+        """Focal lengths (eyes,)."""
+        return np.array([e.camera.pinhole.calibration_matrix[0, 0] for e in self.traverse.rig.eyes])
 
 
-def terrain_of(solution: Solution) -> Terrain:
-    """The points that a solution of single stops places, each with its surface."""
+def terrain_arrays(solution: Solution) -> dict[str, FloatArray | IntArray]:
+    """What `terrain_from` needs to build the terrain of a solution of single stops."""
     t, final = solution.traverse, solution.final
     obs = t.observations
     assert obs is not None
-    frames = tuple(
-        replace(f, pan_rad=float(pan), tilt_rad=float(tilt))
-        for f, (pan, tilt) in zip(t.frames, final.pan_tilt_rad, strict=True)
-    )
-    stops = tuple(replace(s, world_T_mast=pose) for s, pose in zip(t.stops, final.world_T_mast, strict=True))
-    refined = replace(t, frames=frames, stops=stops)
     # Observations are sorted by track, then image.
     tracks, first = np.unique(obs.track, return_index=True)
     landmark = np.searchsorted(solution.landmark_track, tracks).clip(max=len(solution.landmark_track) - 1)
@@ -181,21 +207,47 @@ def terrain_of(solution: Solution) -> Terrain:
     ahead = np.array([_forward(e.camera) for e in t.rig.eyes])[t.image_eye[image]]
     axis = np.einsum("nij,nj->ni", final.world_R_camera[image], ahead)
     depth = np.einsum("ni,ni->n", axis, to_point)
-    inverse = 1 / np.maximum(depth, 1e-3)
     sigma = _sigma_inverse_m(solution, tracks, to_point, image)
     good = (depth > 1e-3) & np.isfinite(sigma)
+    world_R_mast, world_t_mast = pose_arrays(final.world_T_mast)
+    return {
+        "pan_tilt_rad": final.pan_tilt_rad,
+        "world_R_mast": world_R_mast,
+        "world_t_mast": world_t_mast,
+        "track": tracks[good],
+        "row": first[good],
+        "inverse_depth": 1 / depth[good],
+        "sigma_inverse_m": sigma[good],
+    }
+
+
+def terrain_from(
+    traverse: Traverse,
+    *,
+    pan_tilt_rad: FloatArray,
+    world_R_mast: FloatArray,
+    world_t_mast: FloatArray,
+    **columns: Any,
+) -> Terrain:
+    """The points that a solution of the traverse places, each with its surface; see `terrain_arrays`."""
+    frames = tuple(
+        replace(f, pan_rad=float(pan), tilt_rad=float(tilt))
+        for f, (pan, tilt) in zip(traverse.frames, pan_tilt_rad, strict=True)
+    )
+    stops = tuple(
+        replace(s, world_T_mast=gtsam.Pose3(gtsam.Rot3(R), t))
+        for s, R, t in zip(traverse.stops, world_R_mast, world_t_mast, strict=True)
+    )
     terrain = Terrain(
-        traverse=refined,
-        track=tracks[good],
-        row=first[good],
-        inverse_depth=inverse[good],
-        sigma_inverse_m=sigma[good],
-        slope=np.zeros((int(good.sum()), 2)),
+        traverse=replace(traverse, frames=frames, stops=stops),
+        **columns,
+        slope=np.zeros((len(columns["track"]), 2)),
     )
     slope = terrain.slope.copy()
+    world_R_camera, _ = terrain.traverse.camera_poses()
     for i in np.unique(terrain.image):
         rows = np.flatnonzero(terrain.image == i)
-        slope[rows] = _slopes(terrain, rows, final.world_R_camera[i])
+        slope[rows] = _slopes(terrain, rows, world_R_camera[i])
     return replace(terrain, slope=slope)
 
 

@@ -9,6 +9,7 @@ from pancam_graph.report._figures import make_corrections, make_histogram
 from pancam_graph.report._images import image_residuals, vector_panels
 from pancam_graph.report._look import AFTER, BEFORE, REJECTED, Figure, axis, layout
 from pancam_graph.report._map import make_map
+from pancam_graph.report._matching import matching_section
 from pancam_graph.report._mosaics import mosaic_section
 from pancam_graph.report._numbers import Json, fixed, short
 from pancam_graph.report._packed import packed, packed_plotly
@@ -67,6 +68,7 @@ def make_page(solution: Solution, mosaics: WrittenMosaics | None = None) -> str:
         corrections=_section("Corrections of pan and tilt", corrections),
         cross_validation=cross_validation_section(solution.cross_validation, solution.traverse),
         observations=observation_table(solution),
+        matching=matching_section(solution.traverse),
         images=image_table(solution, table),
         stops=stop_table(solution),
         rig=RIG.format(table=rig_table(solution)) if solution.refined else "",

@@ -83,6 +83,7 @@ def observation_table(solution: Solution) -> str:
         ("single", "of points that no other image sees"),
         ("behind", "of points that came to lie behind the camera"),
         ("outside", "beyond what the camera's model describes"),
+        ("came back", "of those used: set aside in between, and let in again when they fitted"),
     )
     traverse, observations = solution.traverse, solution.traverse.observations
     if observations is None or not len(observations):
@@ -93,6 +94,7 @@ def observation_table(solution: Solution) -> str:
     np.minimum.at(lowest, track, stop)
     np.maximum.at(highest, track, stop)
     several, reason = lowest != highest, np.array(solution.reason)
+    came_back = np.zeros(len(observations), dtype=bool) if solution.came_back is None else solution.came_back
     rows = []
     for name, which in (
         ("one stop", ~several),
@@ -103,6 +105,7 @@ def observation_table(solution: Solution) -> str:
         used, found = int(np.sum(solution.used & own)), int(own.sum())
         counts = [int(np.sum(own & (reason == why))) for why in ("outlier", "single", "behind", "outside")]
         share = fixed(100 * used / found, 1) if found else ""
+        counts.append(int(np.sum(came_back & own)))
         numbers = [str(int(which.sum())), str(found), str(used), share, *(str(c) for c in counts)]
         rows.append((name, *numbers))
     return table("Observations", columns, rows, texts=1)

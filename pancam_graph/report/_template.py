@@ -44,8 +44,9 @@ PAGE = (
 <h2>Observations</h2>
 {observations}
 <p class="caption">What was left out, and why; each observation's reason is in <code>residuals.csv</code>.
-Whatever contradicted the geometry of its pair of images was never an observation.</p>
+Those that came back were set aside while the geometry was still rough.</p>
 </section>
+{matching}
 <section>
 <h2>Images</h2>
 {images}
