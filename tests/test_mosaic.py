@@ -93,6 +93,25 @@ def test_the_surface_is_the_plane_and_fades_to_a_far_sky(truth: Solution) -> Non
     assert surface.inverse_range(np.array([[0.0, 0.6, 0.8]])) == pytest.approx(1e-5, abs=1e-4)
 
 
+def test_hills_beyond_the_horizon_do_not_pull_the_ground_down(truth: Solution) -> None:
+    """Hundreds of landmarks of a far ridge above the horizon leave the plane where near ones have it."""
+    landmarks = truth.final.landmarks_m.copy()
+    away_m = np.linalg.norm(landmarks[:, :2] - PLACE_M[:2], axis=1)
+    seen = np.unique(truth.landmark_row[truth.used])
+    ridge = seen[away_m[seen] > np.quantile(away_m[seen], 0.3)]
+    out = (landmarks[ridge] - PLACE_M)[:, :2] / away_m[ridge, None]
+    landmarks[ridge] = PLACE_M + np.column_stack([out, np.full(len(ridge), 0.03)]) * 800.0
+    hilly = replace(
+        truth,
+        initial=replace(truth.initial, landmarks_m=landmarks),
+        final=replace(truth.final, landmarks_m=landmarks),
+    )
+    ground = stop_ground(hilly, 0)
+    plane = ground.surfaces["refined"].plane
+    assert 1 / np.linalg.norm(plane) == pytest.approx(ground.origin_m[2], rel=0.02)
+    assert len(ridge) > 2 * (len(seen) - len(ridge))
+
+
 def test_without_landmarks_the_ground_is_the_rigs(truth: Solution) -> None:
     bare = replace(truth, used=np.zeros_like(truth.used))
     point = stop_ground(bare, 0).surfaces["refined"].ground_m(np.array([[3.0, 0.0]]))

@@ -184,7 +184,8 @@ def _fit_plane(ray: FloatArray, inverse: FloatArray, weight: FloatArray, height_
     """The plane (3,) that most landmarks are near.
 
     A share of the range counts, not pixels of parallax, in which the nearest landmarks would be all; those
-    without parallax count little.
+    without parallax count little. Nothing above the plane's horizon counts: the plane is not seen there, and
+    hills would pull it down to where they are.
     """
     nominal = np.array([0.0, 0.0, -1 / height_m])
     information = np.eye(3) * (height_m / _PLANE_SIGMA) ** 2
@@ -192,7 +193,7 @@ def _fit_plane(ray: FloatArray, inverse: FloatArray, weight: FloatArray, height_
     trusted = 1 / (0.1**2 * share**2 + 1 / np.maximum(weight, 1e-12))
     plane, robust = nominal, np.ones(len(ray))
     for _ in range(4 * _ROUNDS):
-        w = trusted * robust
+        w = np.where(ray @ plane > 0, trusted * robust, 0.0)
         normal = information + ray.T @ (w[:, None] * ray)
         plane = np.linalg.solve(normal, information @ nominal + ray.T @ (w * inverse))
         miss = inverse - _plane_inverse_range(plane, ray)
