@@ -1,6 +1,7 @@
 """Mosaics: right place, right brightness, and a seam error that is the pointing error."""
 
 import json
+import re
 import runpy
 from dataclasses import replace
 from pathlib import Path
@@ -323,6 +324,10 @@ def test_each_eye_has_its_mosaic_and_the_report_shows_them(tmp_path: Path) -> No
     assert page.count('<figure class="blink"') == 2 * 3
     assert page.count("seam error") >= 2
     assert 'id="mosaic-blink"' in page
+    assert re.findall(r'<optgroup label="([^"]+)">', page) == [
+        f"stop A/1, camera {c}" for c in ("left", "right")
+    ]
+    assert 'data-before="stop A/1, camera right: telemetry&#x27;s pointing"' in page
 
 
 def test_the_program_writes_mosaics_when_asked(

@@ -41,6 +41,8 @@ Progress = Callable[[str, int, int], None]
 class Blink:
     """Two pictures of the same, one with each pointing, that the report shows in turn."""
 
+    group: str
+    """Stop and camera."""
     title: str
     captions: dict[Pointing, str]
     """What is said under each."""
@@ -187,29 +189,30 @@ def _encoded(picture: NDArray[np.uint8], suffix: str, quality: int) -> bytes:
     return data.tobytes()
 
 
-def _blinks(made: StopMosaics, title: str) -> list[Blink]:
+def _blinks(made: StopMosaics, group: str) -> list[Blink]:
     """The panorama, pieces of its overlaps, and the view from above."""
-    found = [_blink_of(made.cylinder, f"{title}: panorama", _BLINK_WIDTH_PX)]
+    found = [_blink_of(made.cylinder, group, "panorama", _BLINK_WIDTH_PX)]
     for k, pieces in close_ups(made, _CLOSE_UPS):
         overlap = made.seams.overlaps[k]
         captions: dict[Pointing, str] = {
             "telemetry": f"telemetry: displaced by {overlap.median_px('telemetry'):.2f} px (median)",
             "refined": f"refined: displaced by {overlap.median_px('refined'):.2f} px (median)",
         }
-        found.append(
-            _blink(f"{title}: overlap of {overlap.images[0]} and {overlap.images[1]}", captions, pieces)
-        )
+        title = f"overlap of {overlap.images[0]} and {overlap.images[1]}"
+        found.append(_blink(group, title, captions, pieces))
     if made.ground is not None:
-        found.append(_blink_of(made.ground, f"{title}: from above", _BLINK_GROUND_PX))
+        found.append(_blink_of(made.ground, group, "from above", _BLINK_GROUND_PX))
     return found
 
 
-def _blink_of(mosaic: Mosaic, title: str, width_px: int) -> Blink:
+def _blink_of(mosaic: Mosaic, group: str, title: str, width_px: int) -> Blink:
     captions = {p: f"{_POINTING[p]} pointing" for p in POINTINGS}
-    return _blink(title, captions, {p: with_axes(mosaic, p, "", width_px) for p in POINTINGS})
+    return _blink(group, title, captions, {p: with_axes(mosaic, p, "", width_px) for p in POINTINGS})
 
 
-def _blink(title: str, captions: dict[Pointing, str], pictures: dict[Pointing, NDArray[np.uint8]]) -> Blink:
+def _blink(
+    group: str, title: str, captions: dict[Pointing, str], pictures: dict[Pointing, NDArray[np.uint8]]
+) -> Blink:
     height, width = pictures["refined"].shape[:2]
     jpeg = {p: _encoded(pictures[p], ".jpg", _BLINK_QUALITY) for p in POINTINGS}
-    return Blink(title=title, captions=captions, jpeg=jpeg, width_px=width, height_px=height)
+    return Blink(group=group, title=title, captions=captions, jpeg=jpeg, width_px=width, height_px=height)
