@@ -135,12 +135,18 @@ def _write(made: StopMosaics, folder: Path, name: str, title: str) -> list[Json]
             _save(folder / plain, mosaic.pictures[pointing])
             _save(folder / drawn, with_axes(mosaic, pointing, f"{title}: {_POINTING[pointing]} pointing"))
             files |= {pointing: plain, f"{pointing}_axes": drawn}
+            if mosaic.samples is not None:
+                deep = f"{name}_{kind}_{pointing}_16bit.png"
+                _save(folder / deep, mosaic.samples[pointing])
+                files[f"{pointing}_16bit"] = deep
         if kind == "cylinder":
             files["comparison"] = f"{name}_comparison.jpg"
             _save(folder / f"{name}_comparison.jpg", comparison(made, title))
         entry: Json = {"stop": made.stop, "camera": made.camera, "kind": kind, "images": list(made.images)}
         entry |= {"files": files} | _place(mosaic)
+        entry |= {"dark": mosaic.dark, "bright": mosaic.bright}
         if kind == "cylinder":
+            entry["brightness"] = _brightness(made)
             entry["seam_error"] = _seam_error(made)
         entries.append(entry)
     return entries
@@ -166,6 +172,12 @@ def _place(mosaic: Mosaic) -> Json:
     }
 
 
+def _brightness(made: StopMosaics) -> Json:
+    evening = made.evening
+    gains = {name: evening.gain.get(n) for n, name in enumerate(made.images)}
+    return {"gain": gains, "vignetting": evening.vignetting.tolist(), "vignetting_sigma": evening.sigma}
+
+
 def _seam_error(made: StopMosaics) -> Json:
     def medians(median_px: Callable[[Case], float]) -> Json:
         found = {case: median_px(case) for case in CASES}
@@ -178,11 +190,11 @@ def _seam_error(made: StopMosaics) -> Json:
     return {"used": made.seams.used, **medians(made.seams.median_px), "overlaps": overlaps}
 
 
-def _save(path: Path, picture: NDArray[np.uint8]) -> None:
+def _save(path: Path, picture: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
     path.write_bytes(_encoded(picture, path.suffix, _QUALITY))
 
 
-def _encoded(picture: NDArray[np.uint8], suffix: str, quality: int) -> bytes:
+def _encoded(picture: NDArray[np.uint8] | NDArray[np.uint16], suffix: str, quality: int) -> bytes:
     setting = [cv2.IMWRITE_JPEG_QUALITY, quality] if suffix == ".jpg" else []
     done, data = cv2.imencode(suffix, picture, setting)
     assert done

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pancam_graph.errors import InputError
 from pancam_graph.geometry import BoolArray, FloatArray
 from pancam_graph.images.mosaic._blend import blend, choose_look
+from pancam_graph.images.mosaic._evening import Evening
 from pancam_graph.images.mosaic._options import MosaicOptions
 from pancam_graph.images.mosaic._placed import (
     POINTINGS,
@@ -37,7 +38,13 @@ class Mosaic:
     projection: Projection
     """Where its pixels are in the world."""
     pictures: dict[Pointing, NDArray[np.uint8]]
-    """(rows, columns) grey; 0 where there is no image."""
+    """(rows, columns) grey, stretched for the eye; 0 where there is no image."""
+    samples: dict[Pointing, NDArray[np.uint16]] | None
+    """(rows, columns) samples of images of more than 8 bits, evened out, not stretched; 0 where there is no
+    image, 1 at the least elsewhere. None for images of 8 bits."""
+    dark: float
+    bright: float
+    """Samples that are 1 and 255 in `pictures`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -53,6 +60,8 @@ class StopMosaics:
     ground: Mosaic | None
     """From above; None where no image shows ground near enough."""
     seams: SeamError
+    evening: Evening
+    """Gains, by the images' places in `images`, and the vignetting that was taken out."""
     warnings: tuple[str, ...]
     """Images that are left out, and why."""
 
@@ -111,11 +120,11 @@ def make_mosaics(
     surface = shared.surfaces["refined"]
     native = native_px_per_degree(images)
     around = _cylinder(images, surface, options, native)
-    panorama, overview = _mosaic(images, surface, around)
-    square = Ground.around(shared.origin_m, options.ground_radius_m, options.ground_m_per_px)
-    above, _ = _mosaic(images, surface, square)
-    if panorama is None:
+    panorama, overview, evening = _mosaic(images, surface, around)
+    if panorama is None or evening is None:
         raise InputError(f"mosaic: stop {stop}, camera {camera}: expected images with data, found none")
+    square = Ground.around(shared.origin_m, options.ground_radius_m, options.ground_m_per_px)
+    above, _, _ = _mosaic(images, surface, square, evening)
     return StopMosaics(
         stop=stop,
         camera=camera,
@@ -123,23 +132,45 @@ def make_mosaics(
         cylinder=panorama,
         ground=above,
         seams=seam_error(images, shared.surfaces, overview, native),
+        evening=evening,
         warnings=tuple(warnings),
     )
 
 
 def _mosaic(
-    images: Sequence[PlacedImage], surface: Surface, projection: Projection
-) -> tuple[Mosaic | None, Lattice]:
-    """A mosaic, None where no image shows anything of it, and its lattice."""
+    images: Sequence[PlacedImage],
+    surface: Surface,
+    projection: Projection,
+    evening: Evening | None = None,
+) -> tuple[Mosaic | None, Lattice, Evening | None]:
+    """A mosaic, None where no image shows anything of it, its lattice, and what makes images equally bright.
+
+    That is estimated, unless it is given.
+    """
     lattice = Lattice.over(projection, surface)
     layers = _layers(images, "refined", lattice)
     if not layers:
-        return None, lattice
-    look = choose_look(layers, projection.height_px, projection.width_px)
-    pictures = {"refined": blend(layers, look)}
+        return None, lattice, evening
+    look = choose_look(layers, projection.height_px, projection.width_px, evening)
+    blended = {"refined": blend(layers, look)}
     del layers
-    pictures["telemetry"] = blend(_layers(images, "telemetry", lattice), look)
-    return Mosaic(projection=projection, pictures={p: pictures[p] for p in POINTINGS}), lattice
+    blended["telemetry"] = blend(_layers(images, "telemetry", lattice), look)
+    samples = None
+    if any(image.grey.dtype != np.uint8 for image in images):
+        samples = {p: _to_16_bits(blended[p]) for p in POINTINGS}
+    mosaic = Mosaic(
+        projection=projection,
+        pictures={p: look.to_8_bits(blended[p]) for p in POINTINGS},
+        samples=samples,
+        dark=look.dark,
+        bright=look.bright,
+    )
+    return mosaic, lattice, look.evening
+
+
+def _to_16_bits(blended: NDArray[np.float32]) -> NDArray[np.uint16]:
+    there = ~np.isnan(blended)
+    return np.where(there, np.clip(np.rint(np.nan_to_num(blended)), 1, 65535), 0).astype(np.uint16)
 
 
 def _layers(images: Sequence[PlacedImage], pointing: Pointing, lattice: Lattice) -> list[tuple[int, Layer]]:

@@ -11,6 +11,7 @@ from pancam_graph.errors import ImageError
 from pancam_graph.geometry import BoolArray, FloatArray
 from pancam_graph.images._normalise import usable_mask
 from pancam_graph.io.image_files import GreyImage, read_eye_image
+from pancam_graph.io.mask_files import mask_file, read_mask
 from pancam_graph.solution import Solution
 
 __all__ = ["POINTINGS", "PlacedImage", "Pointing", "Station", "View", "placed_images", "view_from_stop"]
@@ -42,6 +43,8 @@ class PlacedImage:
     grey: GreyImage
     usable: BoolArray
     """Where the image has data, of the image's shape."""
+    wanted: BoolArray
+    """Where the user's mask is white, of the same shape; everywhere without one."""
     at: dict[Pointing, Station]
 
 
@@ -101,6 +104,10 @@ def placed_images(
             continue
         try:
             grey = read_eye_image(folder / entry.file, traverse.rig, eye)
+            mask = mask_file(traverse, row)
+            wanted = np.ones(grey.shape, dtype=bool)
+            if mask is not None:
+                wanted = read_mask(mask, grey.shape[1], grey.shape[0], entry.file)
         except ImageError as error:
             warnings.append(f"mosaic: image {entry.id} is left out: {error}")
             continue
@@ -113,5 +120,7 @@ def placed_images(
             stations[pointing] = Station(
                 camera=own, world_R_camera=view.world_R_camera[row], centre_m=view.world_t_camera[row]
             )
-        images.append(PlacedImage(id=entry.id, grey=grey, usable=usable_mask(grey), at=stations))
+        images.append(
+            PlacedImage(id=entry.id, grey=grey, usable=usable_mask(grey), wanted=wanted, at=stations)
+        )
     return images, warnings

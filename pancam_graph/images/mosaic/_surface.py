@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import sparse
+from scipy import ndimage, sparse
 from scipy.sparse.linalg import LinearOperator, cg, splu
 
 from pancam_graph.geometry import FloatArray, IntArray
@@ -30,6 +30,8 @@ _FADE_CELLS = 10.0
 """Distance from the last landmark over which the surface returns to the plane."""
 _PLANE_SIGMA = 0.05
 """Of the plane's slopes about the horizontal, and of its distance as a share."""
+_SPIKE = 2.0
+"""How many times nearer or farther a cell may be than the median of its surroundings."""
 _ROUNDS = 5
 _MOST_GRADIENTS = 50
 _FARTHEST_GROUND_M = 300.0
@@ -125,7 +127,24 @@ def surface_of_stop(solution: Solution, stop: int, origin_m: FloatArray, view: V
             solver = LinearOperator(system.shape, matvec=first.solve, dtype=np.float64)
             relief, _ = cg(system, right, x0=relief, rtol=1e-6, maxiter=_MOST_GRADIENTS, M=solver)
         robust = _robust(weight, inverse - base - at @ relief)
-    return Surface(origin_m=origin_m, plane=plane, relief=relief.reshape(_ROWS, _COLUMNS))
+    return Surface(
+        origin_m=origin_m, plane=plane, relief=_without_spikes(plane, relief.reshape(_ROWS, _COLUMNS))
+    )
+
+
+def _without_spikes(plane: FloatArray, relief: FloatArray) -> FloatArray:
+    """Relief without single cells that are far nearer or farther than all around: wrong matches, most often.
+
+    One that is too far would hide all the ground before it from the mosaic from above.
+    """
+    elevation, azimuth = np.deg2rad(np.arange(_ROWS) - 90.0), np.deg2rad(np.arange(_COLUMNS))
+    ray = directions(azimuth[None, :], elevation[:, None])
+    base = _plane_inverse_range(plane, ray.reshape(-1, 3)).reshape(relief.shape)
+    inverse = np.maximum(base + relief, _LEAST_INVERSE_RANGE)
+    padded = np.pad(np.pad(inverse, ((0, 0), (1, 1)), "wrap"), ((1, 1), (0, 0)), "edge")
+    around = ndimage.median_filter(padded, size=3)[1:-1, 1:-1]
+    spike = (inverse > _SPIKE * around) | (inverse * _SPIKE < around)
+    return np.asarray(np.where(spike, around - base, relief))
 
 
 def _nominal_height_m(solution: Solution, stop: int, origin_m: FloatArray) -> float:
