@@ -15,7 +15,7 @@ from pancam_graph.errors import InputError
 from pancam_graph.images.mosaic._draw import close_ups, comparison, with_axes
 from pancam_graph.images.mosaic._make import Mosaic, StopGround, StopMosaics, make_mosaics, stop_ground
 from pancam_graph.images.mosaic._options import MosaicOptions
-from pancam_graph.images.mosaic._placed import POINTINGS, Pointing
+from pancam_graph.images.mosaic._placed import POINTINGS, Pointing, copies
 from pancam_graph.images.mosaic._projections import Cylinder
 from pancam_graph.images.mosaic._seam_error import CASES, Case
 from pancam_graph.io._schema import MOSAIC_FORMAT, VERSION
@@ -79,12 +79,13 @@ def write_mosaics(
     blinks: list[Blink] = []
     lines, warnings = [], []
     ground: tuple[int, StopGround] | None = None
+    twice = copies(traverse)
     spent = 0
     for n, (stop, eye) in enumerate(pairs):
         stop_id, camera = traverse.stops[stop].id, traverse.rig.eyes[eye].name
         try:
             if ground is None or ground[0] != stop:
-                ground = stop, stop_ground(solution, stop)
+                ground = stop, stop_ground(solution, stop, twice)
             made = make_mosaics(solution, stop_id, camera, options, ground=ground[1])
         except InputError as error:
             warnings.append(str(error))

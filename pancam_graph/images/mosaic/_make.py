@@ -1,6 +1,6 @@
 """The mosaics of one eye at one stop."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,7 @@ from pancam_graph.images.mosaic._placed import (
     PlacedImage,
     Pointing,
     View,
+    copies,
     placed_images,
     view_from_stop,
 )
@@ -75,10 +76,15 @@ class StopGround:
     views: dict[Pointing, View]
     surfaces: dict[Pointing, Surface]
     """What the landmarks of each pointing span."""
+    twice: Mapping[int, int]
+    """Rows of images that are copies of others, and of which."""
 
 
-def stop_ground(solution: Solution, stop: int) -> StopGround:
-    """Origin, views and surfaces of a stop, by row. Raises InputError where no camera has a pose."""
+def stop_ground(solution: Solution, stop: int, twice: Mapping[int, int] | None = None) -> StopGround:
+    """Origin, views and surfaces of a stop, by row; `twice` is what `copies` gives, where it is at hand.
+
+    Raises InputError where no camera has a pose.
+    """
     views = {p: view_from_stop(solution, stop, p) for p in POINTINGS}
     centres = views["refined"].world_t_camera[solution.traverse.image_stop == stop]
     centres = centres[np.isfinite(centres).all(axis=1)]
@@ -87,7 +93,8 @@ def stop_ground(solution: Solution, stop: int) -> StopGround:
         raise InputError(f"mosaic: stop {name}: expected a camera with a pose, found none")
     origin_m = centres.mean(axis=0)
     surfaces = {p: surface_of_stop(solution, stop, origin_m, v) for p, v in views.items()}
-    return StopGround(origin_m=origin_m, views=views, surfaces=surfaces)
+    twice = copies(solution.traverse) if twice is None else twice
+    return StopGround(origin_m=origin_m, views=views, surfaces=surfaces, twice=twice)
 
 
 def make_mosaics(
@@ -111,7 +118,8 @@ def make_mosaics(
     if stop not in stops:
         raise InputError(f"mosaic: stop: expected the id of a stop, found {stop!r}")
     shared = ground or stop_ground(solution, stops[stop])
-    images, warnings = placed_images(solution, stops[stop], traverse.rig.eye_index(camera), shared.views)
+    eye = traverse.rig.eye_index(camera)
+    images, warnings = placed_images(solution, stops[stop], eye, shared.views, shared.twice)
     if not images:
         why = f" ({warnings[0]})" if len(warnings) == 1 else ""
         raise InputError(

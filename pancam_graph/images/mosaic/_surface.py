@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import LinearOperator, cg, splu
+from scipy.spatial import cKDTree
 
-from pancam_graph.geometry import FloatArray, IntArray
+from pancam_graph.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.images.mosaic._placed import View
 from pancam_graph.solution import Solution
 
@@ -30,6 +31,9 @@ _FADE_CELLS = 10.0
 """Distance from the last landmark over which the surface returns to the plane."""
 _PLANE_SIGMA = 0.05
 """Of the plane's slopes about the horizontal, and of its distance as a share."""
+_NEIGHBOURS = 8
+_ALIKE = 0.15
+"""By what share ranges of neighbours may differ, two of which must be alike."""
 _SPIKE = 2.0
 """How many times nearer or farther a cell may be than the median of its surroundings."""
 _ROUNDS = 5
@@ -108,6 +112,8 @@ def surface_of_stop(solution: Solution, stop: int, origin_m: FloatArray, view: V
     to_point = view.landmarks_m[rows] - origin_m
     inverse = 1 / np.linalg.norm(to_point, axis=1)
     ray = to_point * inverse[:, None]
+    sound = _supported(ray, inverse, weight)
+    inverse, ray, weight, rows = inverse[sound], ray[sound], weight[sound], rows[sound]
     plane = _fit_plane(ray, inverse, weight, _nominal_height_m(solution, stop, origin_m))
     base = _plane_inverse_range(plane, ray)
     at = _interpolation(ray)
@@ -130,6 +136,21 @@ def surface_of_stop(solution: Solution, stop: int, origin_m: FloatArray, view: V
     return Surface(
         origin_m=origin_m, plane=plane, relief=_without_spikes(plane, relief.reshape(_ROWS, _COLUMNS))
     )
+
+
+def _supported(ray: FloatArray, inverse: FloatArray, weight: FloatArray) -> BoolArray:
+    """Which landmarks (n,) have two neighbours of about their range, as far as parallax tells it.
+
+    One without is a wrong match most often: patterns of the rover's deck repeat.
+    """
+    if len(ray) <= _NEIGHBOURS:
+        return np.ones(len(ray), dtype=bool)
+    near = cKDTree(ray).query(ray, k=_NEIGHBOURS + 1)[1][:, 1:]
+    apart = np.abs(inverse[near] - inverse[:, None])
+    noise = np.sqrt(1 / np.maximum(weight, 1e-12))
+    noise = np.hypot(noise[:, None], noise[near])
+    alike = (apart < _ALIKE * inverse[:, None]) | (apart < 3 * noise)
+    return np.asarray(np.count_nonzero(alike, axis=1) >= 2)
 
 
 def _without_spikes(plane: FloatArray, relief: FloatArray) -> FloatArray:
