@@ -1,7 +1,7 @@
 """The image files of a traverse with the user's masks, and what is odd about them."""
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,8 +26,8 @@ class Pictures:
     """True where white; None: there is none."""
     warnings: tuple[str, ...]
     """Of files that cannot be used, of colour, and of pictures that are there twice."""
-    unusable: frozenset[int]
-    """Rows of images whose file cannot be used."""
+    unusable: Mapping[int, ImageError]
+    """Why the file of an image cannot be used, by row."""
 
 
 def read_pictures(traverse: Traverse, progress: Callable[[int, int], None] | None = None) -> Pictures:
@@ -84,7 +84,7 @@ def read_pictures(traverse: Traverse, progress: Callable[[int, int], None] | Non
         images=tuple(images),
         user_masks=tuple(masks),
         warnings=tuple(warnings),
-        unusable=frozenset(unusable),
+        unusable=unusable,
     )
 
 

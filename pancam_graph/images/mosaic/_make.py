@@ -121,7 +121,8 @@ def make_mosaics(
     eye = traverse.rig.eye_index(camera)
     images, warnings = placed_images(solution, stops[stop], eye, shared.views, shared.twice)
     if not images:
-        why = f" ({warnings[0]})" if len(warnings) == 1 else ""
+        more = f"; {len(warnings) - 1} more" if len(warnings) > 1 else ""
+        why = f" ({warnings[0]}{more})" if warnings else ""
         raise InputError(
             f"mosaic: stop {stop}, camera {camera}: expected image files, found none that serve{why}"
         )

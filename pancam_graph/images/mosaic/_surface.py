@@ -145,7 +145,7 @@ def _supported(ray: FloatArray, inverse: FloatArray, weight: FloatArray) -> Bool
     """
     if len(ray) <= _NEIGHBOURS:
         return np.ones(len(ray), dtype=bool)
-    near = cKDTree(ray).query(ray, k=_NEIGHBOURS + 1)[1][:, 1:]
+    near = np.asarray(cKDTree(ray).query(ray, k=_NEIGHBOURS + 1)[1])[:, 1:]
     apart = np.abs(inverse[near] - inverse[:, None])
     noise = np.sqrt(1 / np.maximum(weight, 1e-12))
     noise = np.hypot(noise[:, None], noise[near])
