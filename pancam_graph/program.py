@@ -129,8 +129,14 @@ class Progress:
 
 
 def print_summary(solution: Solution, where: str) -> None:
-    """What a solve did: a table on a terminal, one line where standard output is piped."""
+    """What a solve did: a table on a terminal, one line where standard output is piped.
+
+    Warnings then go to standard error, a line each.
+    """
     used, total = int(solution.used.sum()), len(solution.used)
+    warnings = solution.warnings
+    if solution.cross_validation is not None:
+        warnings = (*warnings, *solution.cross_validation.warnings)
     console = Console()
     if not console.is_terminal:
         sys.stdout.write(
@@ -141,6 +147,7 @@ def print_summary(solution: Solution, where: str) -> None:
             sys.stdout.write(f"{line}\n")
         if solution.cross_validation is not None:
             sys.stdout.write(f"{_of_cross_validation(solution.cross_validation)}\n")
+        sys.stderr.writelines(f"warning: {warning}\n" for warning in warnings)
         return
     table = Table(title=solution.traverse.name or None, title_justify="left")
     for column in ("", "before", "after"):
@@ -155,10 +162,8 @@ def print_summary(solution: Solution, where: str) -> None:
     console.print(f"{state}: {solution.stop_reason}; {solution.seconds.solve:.1f} s")
     for line in _of_images(solution):
         console.print(line, highlight=False)
-    warnings = solution.warnings
     if solution.cross_validation is not None:
         console.print(_of_cross_validation(solution.cross_validation), highlight=False)
-        warnings = (*warnings, *solution.cross_validation.warnings)
     for warning in warnings:
         console.print(f"[yellow]warning[/] {warning}", highlight=False)
     console.print(f"results in [bold]{where}[/]", highlight=False)

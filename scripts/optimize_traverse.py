@@ -33,7 +33,8 @@ def main() -> int:
     show_log(verbose=arguments.verbose)
     choices = {name: getattr(arguments, name) for name in ("model", "landmarks", "method", "loss")}
     sharing = parse_sharing(arguments.sharing)
-    options = SolveOptions(**choices, sharing=sharing, **criteria(arguments.stop))
+    # Covariances of terrain points take at most a twentieth of the solve: points.ply always has them.
+    options = SolveOptions(**choices, sharing=sharing, landmark_covariances=True, **criteria(arguments.stop))
     progress = Progress()
 
     begin = time.perf_counter()

@@ -33,6 +33,9 @@ class Scene:
     """Pan and tilt of telemetry minus truth, by frame; the rest has none."""
     exposure: tuple[float, ...] = ()
     """By frame; the rest has 1."""
+    vignetting: float = 0.0
+    """Share of the light that is lost in the corners, with the square of the distance from the middle."""
+    bits: int = 16
     cameras: tuple[str, ...] = ("left",)
     points: int = 3000
     rig: Rig = field(
@@ -107,7 +110,11 @@ def solved(scene: Scene, folder: Path) -> Solution:
         frame = int(traverse.image_frame[row])
         gain = scene.exposure[frame] if frame < len(scene.exposure) else 1.0
         grey = gain * brightness(ground[:, :2]).reshape(camera.height_px, camera.width_px)
-        assert cv2.imwrite(str(folder / str(entry.file)), np.rint(grey).astype(np.uint16))
+        middle = np.array([camera.width_px - 1.0, camera.height_px - 1.0]) / 2
+        away = ((u - middle[0]) ** 2 + (v - middle[1]) ** 2) / (middle @ middle)
+        grey = np.rint((1 - scene.vignetting * away) * (grey if scene.bits == 16 else grey / 10))
+        samples = grey.astype(np.uint16) if scene.bits == 16 else grey.astype(np.uint8)
+        assert cv2.imwrite(str(folder / str(entry.file)), samples)
         uv, valid = camera.project((landmarks - t[row]) @ R[row])
         seen = np.flatnonzero(valid & camera.contains(uv))
         rows.append(np.column_stack([np.full(len(seen), row), seen, uv[seen]]))

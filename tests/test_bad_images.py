@@ -15,7 +15,7 @@ from pancam_graph import Traverse, read_traverse, write_traverse
 from pancam_graph.errors import ImageError, InputError
 from pancam_graph.images import find_observations
 from pancam_graph.io import read_pds
-from pancam_graph.io.image_files import read_image
+from pancam_graph.io.image_files import left_out, read_image
 
 LAST = "s0-f2-left.png"
 
@@ -85,20 +85,60 @@ def test_an_over_exposed_image_is_named_and_the_rest_found(truth: Traverse) -> N
     assert seen(white) == {0, 1}
 
 
-def test_an_image_of_the_wrong_size_and_a_truncated_one_are_refused_by_name(truth: Traverse) -> None:
+def spoil(file: Path, kind: str) -> str:
+    """Spoil an image file; what is then said of it."""
+    if kind == "missing":
+        file.unlink()
+        return "expected an image file, found none"
+    if kind == "truncated":
+        whole = file.read_bytes()
+        file.write_bytes(whole[: len(whole) // 2])
+        return rf"expected a whole PNG, found {len(whole) // 2} bytes without its end: truncated"
+    cv2.imwrite(str(file), np.zeros((SIZE_PX, 2 * SIZE_PX), np.uint8))
+    return "expected 240 x 240 pixels as of camera left of the rig small, found 480 x 240"
+
+
+@pytest.mark.parametrize("kind", ["missing", "truncated", "of another size"])
+def test_an_image_file_that_cannot_be_used_is_named_and_the_rest_found(truth: Traverse, kind: str) -> None:
     assert truth.folder is not None
     write_traverse(truth, truth.folder)
-    file = truth.folder / LAST
-    whole = file.read_bytes()
-    cv2.imwrite(str(file), np.zeros((SIZE_PX, 2 * SIZE_PX), np.uint8))
-    size = rf"{LAST}: expected 240 x 240 pixels as of camera left of the rig small, found 480 x 240"
+    rest = without_last(truth)
+    said = f"image s0-f2-left is left out: {truth.folder / LAST}: {spoil(truth.folder / LAST, kind)}"
+    for traverse in (read_traverse(truth.folder), truth):
+        found = find_observations(traverse, QUICK)
+        assert found.warnings == (said,)
+        assert as_bytes(found_in(found)) == rest
+    # With observations given, images are only for pictures.
+    given = find_observations(truth, QUICK)
+    write_traverse(replace(given, folder=None), truth.folder, overwrite=True)
+    assert read_traverse(truth.folder).warnings == (said,)
+
+
+@pytest.mark.parametrize("kind", ["missing", "truncated", "of another size"])
+def test_image_files_none_of_which_can_be_used_are_refused_by_name(truth: Traverse, kind: str) -> None:
+    assert truth.folder is not None
+    write_traverse(truth, truth.folder)
+    given = find_observations(truth, QUICK)
+    said = [spoil(truth.folder / str(image.file), kind) for image in truth.images]
+    words = rf"s0-f0-left\.png: {said[0]}"
     for call in (lambda: read_traverse(truth.folder), lambda: find_observations(truth, QUICK)):
-        with pytest.raises(ImageError, match=size):
+        with pytest.raises(ImageError, match=words):
             call()
-    file.write_bytes(whole[: len(whole) // 2])
-    for call in (lambda: read_traverse(truth.folder), lambda: find_observations(truth, QUICK)):
-        with pytest.raises(ImageError, match=rf"{LAST}: expected a whole PNG, found .*: truncated"):
-            call()
+    write_traverse(replace(given, folder=None), truth.folder, overwrite=True)
+    if kind == "missing":
+        assert len(read_traverse(truth.folder).warnings) == 3
+    else:  # of the rig, or of the observations, one can doubt as well
+        with pytest.raises(ImageError, match=words):
+            read_traverse(truth.folder)
+
+
+def test_of_many_image_files_a_few_are_named() -> None:
+    errors = {f"i{k}": ImageError(f"{k}.png: expected an image file, found none") for k in range(9)}
+    assert left_out(errors)[4:] == [
+        "image i4 is left out: 4.png: expected an image file, found none",
+        "4 more images are left out, whose files cannot be used either",
+    ]
+    assert len(left_out(dict(list(errors.items())[:5]))) == 5
 
 
 def test_colour_is_named_and_its_luma_used(truth: Traverse) -> None:

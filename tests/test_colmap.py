@@ -428,17 +428,20 @@ def test_names_are_safe_and_different(solved: Callable[..., Solution], tmp_path:
 
 
 @pytest.mark.slow
-def test_opportunity(opportunity_folder: Path, tmp_path: Path) -> None:
+def test_opportunity(opportunity_folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """COLMAP's own error of the five frames, and its own colours of the points off the images."""
     pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is an extra (bench)")
     solution = solve(find_observations(read_pds(opportunity_folder)))
+    caplog.set_level("INFO")
     write_colmap(solution, tmp_path / "colmap")
     scene = pycolmap.Reconstruction(tmp_path / "colmap" / "sparse")
     length, _ = expected_length(solution)
     t = solution.traverse
     assert t.observations is not None
     said = about(tmp_path / "colmap")
-    assert said["points_left_out"] < 30
+    assert 0 < said["points_beyond_infinity"] <= said["points_left_out"] < 30
+    (line,) = [r.getMessage() for r in caplog.records if r.getMessage().startswith("colmap: ")]
+    assert f"{said['points_beyond_infinity']} of them because they fit best beyond infinity" in line
     assert scene.num_points3D() == said["points"]
     scene.update_point_3d_errors()
     landmark = solution.landmark_row

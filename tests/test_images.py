@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from pancam_graph import Frame, Image, Observations, Stop, Traverse
 from pancam_graph.cameras import Pinhole
-from pancam_graph.errors import ImageError, InputError
+from pancam_graph.errors import InputError
 from pancam_graph.geometry import HEAD_R_FORWARD_CAMERA, FloatArray, rz
 from pancam_graph.images import FrontEndOptions, find_observations
 from pancam_graph.images._features import find_features
@@ -386,7 +386,8 @@ def test_images_without_content_or_file_are_warned_of(tmp_path: Path) -> None:
     )
     assert found.warnings == (
         "images s0-f1-left and s0-f2-left: no matches, although they overlap by pointing",
-        "image s0-f2-left (s0-f2-left.png): no observations were found in it",
+        "image s0-f2-left (s0-f2-left.png): no observations were found in it "
+        "(none of its 0 features was found in another image)",
         "image s0-f3-left: it has no file",
     )
     assert set(seen) == {"images", "overlaps", "masks", "features", "matches", "refinement"}
@@ -394,19 +395,14 @@ def test_images_without_content_or_file_are_warned_of(tmp_path: Path) -> None:
         assert counts == [(k + 1, len(counts)) for k in range(len(counts))]
 
 
-def test_image_of_another_size_is_refused(tmp_path: Path) -> None:
+def test_what_leaves_one_image_alone_is_named(tmp_path: Path) -> None:
     truth, _ = make_traverse(tmp_path, eyes=("left",))
     cv2.imwrite(str(tmp_path / "s0-f1-left.png"), np.zeros((200, 240), np.uint8))
-    with pytest.raises(
-        ImageError, match=r"s0-f1-left\.png: expected 240 x 240 .* camera left of .*, found 240 x 200"
-    ):
+    size = r"s0-f1-left\.png: expected 240 x 240 .* camera left of .*, found 240 x 200"
+    with pytest.raises(InputError, match=rf"features that several images share, found none .*{size}"):
         find_observations(truth, QUICK)
-
-
-def test_missing_file_is_refused(tmp_path: Path) -> None:
-    truth, _ = make_traverse(tmp_path, eyes=("left",))
-    (tmp_path / "s0-f0-left.png").unlink()
-    with pytest.raises(ImageError, match=r"s0-f0-left\.png"):
+    (tmp_path / "s0-f1-left.png").unlink()
+    with pytest.raises(InputError, match=r"found none .*s0-f1-left\.png: expected an image file, found none"):
         find_observations(truth, QUICK)
 
 

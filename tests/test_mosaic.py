@@ -1,6 +1,7 @@
 """Mosaics: right place, right brightness, and a seam error that is the pointing error."""
 
 import json
+import re
 import runpy
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from mosaic_scenes import MARK_M, PLACE_M, PX_PER_RAD, Scene, solved, without_file
+from mosaic_scenes import MARK_M, PLACE_M, PX_PER_RAD, Scene, brightness, solved, without_file
 from numpy.typing import NDArray
 
 from pancam_graph import Solution, find_observations, read_pds, solve, write_report, write_traverse
@@ -91,6 +92,25 @@ def test_the_surface_is_the_plane_and_fades_to_a_far_sky(truth: Solution) -> Non
     assert points[:, :2] == pytest.approx(places + ground.origin_m[:2])
     assert np.abs(points[:, 2]).max() < 0.05
     assert surface.inverse_range(np.array([[0.0, 0.6, 0.8]])) == pytest.approx(1e-5, abs=1e-4)
+
+
+def test_hills_beyond_the_horizon_do_not_pull_the_ground_down(truth: Solution) -> None:
+    """Hundreds of landmarks of a far ridge above the horizon leave the plane where near ones have it."""
+    landmarks = truth.final.landmarks_m.copy()
+    away_m = np.linalg.norm(landmarks[:, :2] - PLACE_M[:2], axis=1)
+    seen = np.unique(truth.landmark_row[truth.used])
+    ridge = seen[away_m[seen] > np.quantile(away_m[seen], 0.3)]
+    out = (landmarks[ridge] - PLACE_M)[:, :2] / away_m[ridge, None]
+    landmarks[ridge] = PLACE_M + np.column_stack([out, np.full(len(ridge), 0.03)]) * 800.0
+    hilly = replace(
+        truth,
+        initial=replace(truth.initial, landmarks_m=landmarks),
+        final=replace(truth.final, landmarks_m=landmarks),
+    )
+    ground = stop_ground(hilly, 0)
+    plane = ground.surfaces["refined"].plane
+    assert 1 / np.linalg.norm(plane) == pytest.approx(ground.origin_m[2], rel=0.02)
+    assert len(ridge) > 2 * (len(seen) - len(ridge))
 
 
 def test_without_landmarks_the_ground_is_the_rigs(truth: Solution) -> None:
@@ -197,6 +217,107 @@ def test_exposures_are_evened_out(truth_made: StopMosaics, tmp_path: Path) -> No
     assert np.ptp(gap) < 8  # of 255; unevened it would be a hundred
 
 
+FIVE = tuple(np.deg2rad([40.0, 20.0, 0.0, -20.0, -40.0]))
+RADII = np.linspace(0, 1, 11)
+
+
+def left_over(mosaics: StopMosaics) -> FloatArray:
+    """Share of the light that is left at some radii, as the mosaic takes it."""
+    return np.asarray(np.exp(np.power(RADII[:, None] ** 2, [1, 2, 3]) @ mosaics.evening.vignetting))
+
+
+@pytest.mark.parametrize("lost", [0.1, 0.35])
+def test_vignetting_is_found_and_taken_out(tmp_path: Path, lost: float) -> None:
+    exposure = (1.0, 1.3, 0.8, 1.1, 0.9)
+    mosaics = made(Scene(pans_rad=FIVE, vignetting=lost, exposure=exposure), tmp_path)
+    assert left_over(mosaics) == pytest.approx(1 - lost * RADII**2, rel=0.01)
+    gain = np.array([mosaics.evening.gain[k] for k in range(5)]) * exposure
+    assert gain / gain.mean() == pytest.approx(np.ones(5), rel=0.005)
+    assert mosaics.evening.sigma is not None
+    assert mosaics.evening.sigma < 0.005
+
+
+def test_no_vignetting_is_made_up(tmp_path: Path) -> None:
+    mosaics = made(Scene(pans_rad=FIVE, exposure=(1.0, 1.3, 0.8)), tmp_path)
+    assert not mosaics.evening.vignetting.any()
+    assert mosaics.evening.sigma is not None
+    assert mosaics.evening.sigma < 0.01
+
+
+def test_vignetting_that_overlaps_do_not_tell_is_left_alone(tmp_path: Path) -> None:
+    mosaics = made(Scene(vignetting=0.35), tmp_path)
+    assert not mosaics.evening.vignetting.any()
+    assert mosaics.evening.sigma is None
+
+
+def test_samples_of_16_bits_are_those_of_the_scene(tmp_path: Path) -> None:
+    solution = solved(Scene(pans_rad=FIVE, vignetting=0.2), tmp_path)
+    mosaics = make_mosaics(solution, "A/1", "left", NEAR)
+    assert mosaics.ground is not None
+    assert mosaics.ground.samples is not None
+    v, u = np.mgrid[0:400:8, 0:400:8]
+    points = mosaics.ground.projection.pixels(np.zeros((1, 3)))  # where the world's origin would be
+    xy = np.column_stack([u.ravel() - points[0, 0], points[0, 1] - v.ravel()]) * NEAR.ground_m_per_px
+    away_m = np.hypot(*(xy - PLACE_M[:2]).T)
+    near = (away_m > 1.2) & (away_m < 3.5)
+    found = mosaics.ground.samples["refined"][v.ravel(), u.ravel()][near].astype(float)
+    true = brightness(np.resize(xy, (2560, 2)))[: len(xy)][near]
+    shown = found > 0
+    assert np.count_nonzero(shown) > 200
+    ratio = found[shown] / true[shown]
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.02)  # gains are about 1 all together
+    assert np.median(np.abs(ratio / np.median(ratio) - 1)) < 0.02
+    write_mosaics(solution, tmp_path, NEAR)
+    for entry in json.loads((tmp_path / "mosaics.json").read_text())["mosaics"]:
+        deep = cv2.imread(str(tmp_path / entry["files"]["refined_16bit"]), cv2.IMREAD_UNCHANGED)
+        plain = cv2.imread(str(tmp_path / entry["files"]["refined"]), cv2.IMREAD_UNCHANGED)
+        assert deep.dtype == np.uint16
+        assert np.array_equal(deep == 0, plain == 0)
+        between = (plain > 1) & (plain < 255)
+        level = 1 + 254 * (deep[between] - entry["dark"]) / (entry["bright"] - entry["dark"])
+        assert np.abs(level - plain[between]).max() < 1.0
+
+
+def test_images_of_8_bits_have_mosaics_of_8_bits(tmp_path: Path) -> None:
+    solution = solved(Scene(bits=8), tmp_path)
+    assert make_mosaics(solution, "A/1", "left", NEAR).cylinder.samples is None
+    write_mosaics(solution, tmp_path, NEAR)
+    for entry in json.loads((tmp_path / "mosaics.json").read_text())["mosaics"]:
+        assert not any("16bit" in kind for kind in entry["files"])
+
+
+def test_what_a_mask_covers_is_no_ground_and_shown_last(truth_made: StopMosaics, tmp_path: Path) -> None:
+    """The lower two thirds of each image are black in the mask."""
+    solution = solved(Scene(), tmp_path)
+    mask = np.full((224, 224), 255, np.uint8)
+    mask[80:] = 0
+    (tmp_path / "masks").mkdir()
+    cv2.imwrite(str(tmp_path / "masks" / "left.png"), mask)
+    masked = make_mosaics(solution, "A/1", "left", NEAR)
+    around, before = (m.cylinder.pictures["refined"] > 0 for m in (masked, truth_made))
+    assert np.array_equal(around, before)
+    assert masked.ground is not None
+    assert truth_made.ground is not None
+    shown, all_shown = (np.count_nonzero(g.pictures["refined"]) for g in (masked.ground, truth_made.ground))
+    assert 0 < shown < 0.75 * all_shown
+    cv2.imwrite(str(tmp_path / "masks" / "left.png"), mask[:100])
+    with pytest.raises(
+        InputError, match=r"left\.png: expected a mask of 224 x 224 pixels .* found 224 x 100"
+    ):
+        make_mosaics(solution, "A/1", "left", NEAR)
+
+
+def test_wrong_landmarks_do_not_hide_the_ground(truth: Solution) -> None:
+    landmarks = truth.final.landmarks_m.copy()
+    wrong = np.random.default_rng(2).choice(len(landmarks), 60, replace=False)
+    landmarks[wrong] = PLACE_M + (landmarks[wrong] - PLACE_M) * 40.0
+    bad = replace(truth, final=replace(truth.final, landmarks_m=landmarks))
+    places = np.random.default_rng(3).uniform(-4, 4, (500, 2))
+    points = stop_ground(bad, 0).surfaces["refined"].ground_m(places)
+    assert np.isfinite(points).all()
+    assert np.abs(points[:, 2]).max() < 0.1
+
+
 def test_both_pointings_share_seams_and_exposure(tmp_path: Path) -> None:
     pictures = made(Scene(error_rad=((2e-3, -2e-3),)), tmp_path).cylinder.pictures
     assert pictures["telemetry"].shape == pictures["refined"].shape
@@ -272,6 +393,17 @@ def test_images_that_cannot_be_had_are_warned_of(tmp_path: Path) -> None:
     assert json.loads((out / "solution.json").read_text())["warnings"] == list(saved.warnings)
 
 
+def test_a_picture_that_is_there_twice_is_shown_once(tmp_path: Path) -> None:
+    solution = solved(Scene(), tmp_path)
+    (tmp_path / "f2-left.png").write_bytes((tmp_path / "f0-left.png").read_bytes())
+    mosaics = make_mosaics(solution, "A/1", "left", NEAR)
+    assert mosaics.images == ("f0-left", "f1-left")
+    (warning,) = mosaics.warnings
+    assert warning == (
+        "mosaic: image f2-left (f2-left.png) is left out: the same picture as image f0-left (f0-left.png)"
+    )
+
+
 def test_no_image_at_all_is_a_warning(tmp_path: Path) -> None:
     solution = solved(Scene(pans_rad=(0.0,)), tmp_path)
     (tmp_path / "f0-left.png").unlink()
@@ -304,6 +436,10 @@ def test_each_eye_has_its_mosaic_and_the_report_shows_them(tmp_path: Path) -> No
     assert page.count('<figure class="blink"') == 2 * 3
     assert page.count("seam error") >= 2
     assert 'id="mosaic-blink"' in page
+    assert re.findall(r'<optgroup label="([^"]+)">', page) == [
+        f"stop A/1, camera {c}" for c in ("left", "right")
+    ]
+    assert 'data-before="stop A/1, camera right: telemetry&#x27;s pointing"' in page
 
 
 def test_the_program_writes_mosaics_when_asked(

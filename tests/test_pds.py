@@ -667,8 +667,14 @@ def test_two_rovers_and_two_sites_are_refused(tmp_path: Path) -> None:
 def test_truncated_opportunity_image_is_named(opportunity_folder: Path, tmp_path: Path) -> None:
     name = "1N491020376ILFCNY9P0706L0M1.IMG"
     (tmp_path / name).write_bytes((opportunity_folder / name).read_bytes()[:-1])
-    with pytest.raises(ImageError, match=f"{name}: .IMAGE: expected 2140160 bytes or more .* found 2140159"):
+    said = rf"{name}: \^IMAGE: expected 2140160 bytes or more .* found 2140159"
+    with pytest.raises(ImageError, match=said):
         read_pds(tmp_path)
+    for other in sorted(opportunity_folder.glob("*.IMG"))[1:3]:
+        (tmp_path / other.name).write_bytes(other.read_bytes())
+    rest = read_pds(tmp_path)
+    assert len(rest.images) == 2
+    assert re.fullmatch(rf"image {Path(name).stem} is left out: .*{said}.*", rest.warnings[0])
 
 
 def test_opportunity_label_without_camera_model_is_named(opportunity_folder: Path, tmp_path: Path) -> None:

@@ -88,6 +88,7 @@ def test_solves_and_writes_the_contract(run_apart: Run, traverse_folder: Path, t
     assert len(raw["images"]) == n
     assert np.array(raw["stops"][1]["covariance"]).shape == (6, 6)
     assert raw["observations"]["used"] + raw["observations"]["rejected"] > 100
+    assert b"property float sigma_m" in (out / "points.ply").read_bytes().split(b"end_header")[0]
 
 
 @pytest.mark.parametrize("model", ["circle", "free", "projective"])

@@ -49,11 +49,12 @@ def find_observations(
     taken from there, and the result is the same to the last bit.
 
     Returns the traverse with observations of origin "images", in place of any that it had, and with
-    warnings for images without observations or over-exposed or there twice, and for pairs of images that
+    warnings for images without observations, or whose file cannot be used (missing, truncated, of another
+    size than its camera), over-exposed or there twice, and for pairs of images that
     overlap, and of stops that are near, but give no matches.
 
-    Raises InputError if no image has a file or nothing is found, ImageError naming the file for
-    one that cannot be read or has another size than its camera, and for such a mask.
+    Raises InputError if no image has a file or nothing is found, ImageError naming the file if none can be
+    used, and for a mask that cannot.
     """
     work = Steps(traverse, options, progress, Cache(cache))
     warnings = [*work.pictures.warnings, *work.over_exposed()]
@@ -80,6 +81,7 @@ def find_observations(
         if traverse.images[i].file is not None
         else f"image {traverse.images[i].id}: it has no file"
         for i in unseen
+        if i not in work.pictures.unusable
     ]
     uv_px, size_px = np.empty((len(image), 2)), np.empty(len(image))
     for i in np.unique(image):

@@ -1,13 +1,13 @@
 """The image files of a traverse with the user's masks, and what is odd about them."""
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pancam_graph.errors import InputError
+from pancam_graph.errors import ImageError, InputError
 from pancam_graph.geometry import BoolArray
-from pancam_graph.io.image_files import GreyImage, read_eye_content
+from pancam_graph.io.image_files import GreyImage, left_out, read_eye_content
 from pancam_graph.io.mask_files import mask_file, read_mask
 from pancam_graph.traverse import Traverse
 
@@ -21,18 +21,21 @@ class Pictures:
     """Images as arrays, and the user's masks; by rows of the traverse."""
 
     images: tuple[GreyImage | None, ...]
-    """None without a file, or where a file before it is the same picture."""
+    """None without a file that can be used, or where a file before it is the same picture."""
     user_masks: tuple[BoolArray | None, ...]
     """True where white; None: there is none."""
     warnings: tuple[str, ...]
-    """Of colour, and of pictures that are there twice."""
+    """Of files that cannot be used, of colour, and of pictures that are there twice."""
+    unusable: Mapping[int, ImageError]
+    """Why the file of an image cannot be used, by row."""
 
 
 def read_pictures(traverse: Traverse, progress: Callable[[int, int], None] | None = None) -> Pictures:
     """Read all image files of a traverse and the masks that belong to them.
 
-    Raises InputError if no image has a file, ImageError naming the file for one that cannot be read or has
-    another size than its camera, and for such a mask.
+    A file that is missing, cannot be read or has another size than its camera is warned of. Raises InputError
+    if no image has a file, ImageError naming the file if none can be used, and for a mask that cannot: what
+    it covers must not be used.
     """
     if all(image.file is None for image in traverse.images):
         raise InputError(f"traverse {traverse.name}: expected observations or image files, found neither")
@@ -41,12 +44,16 @@ def read_pictures(traverse: Traverse, progress: Callable[[int, int], None] | Non
     masks: list[BoolArray | None] = []
     coloured: list[str] = []
     warnings: list[str] = []
+    unusable: dict[int, ImageError] = {}
     first_of: dict[bytes, int] = {}
     mask_of: dict[tuple[Path, tuple[int, ...]], BoolArray] = {}
     for row, (entry, eye) in enumerate(zip(traverse.images, traverse.image_eye, strict=True)):
         image, mask = None, None
-        if entry.file is not None:
-            content = read_eye_content(folder / entry.file, traverse.rig, int(eye))
+        try:
+            content = entry.file and read_eye_content(folder / entry.file, traverse.rig, int(eye))
+        except ImageError as error:
+            content, unusable[row] = None, error
+        if entry.file and content:
             image = content.samples
             if content.colour:
                 coloured.append(entry.file)
@@ -68,9 +75,17 @@ def read_pictures(traverse: Traverse, progress: Callable[[int, int], None] | Non
         masks.append(mask)
         if progress is not None:
             progress(row + 1, len(traverse.images))
+    if unusable and len(unusable) == sum(entry.file is not None for entry in traverse.images):
+        raise next(iter(unusable.values()))
+    warnings[:0] = left_out({traverse.images[row].id: error for row, error in unusable.items()})
     if coloured:
         warnings.insert(0, f"images in colour, of which the luma is used: {listed(coloured)}")
-    return Pictures(images=tuple(images), user_masks=tuple(masks), warnings=tuple(warnings))
+    return Pictures(
+        images=tuple(images),
+        user_masks=tuple(masks),
+        warnings=tuple(warnings),
+        unusable=unusable,
+    )
 
 
 def image_name(traverse: Traverse, row: int) -> str:

@@ -326,6 +326,8 @@ class Steps:
 
     def why_nothing(self, row: int) -> str:
         """Why an image may have no observations, as the end of a sentence; empty where nothing is known."""
+        if row in self.pictures.unusable:
+            return f" ({self.pictures.unusable[row]})"
         mask = self.masks[row]
         if mask is None:
             return ""
@@ -335,7 +337,8 @@ class Steps:
                 return f" ({share:.0%} of it {text})"
         if not any(row in {pair.a, pair.b} for pair in self.pairs):
             return " (it overlaps no other image by pointing)"
-        return ""
+        found = len(self.features[row].uv_px)
+        return f" (none of its {found} features was found in another image)"
 
 
 def _as_arrays(matcher: StopMatcher, stops: tuple[int, int]) -> Arrays:

@@ -66,6 +66,8 @@ class Placed:
     """(m, 2, 2) takes small residuals of the image as taken to residuals of the straightened one."""
     shift_px: FloatArray
     """(m,) how far the range at which images are resampled moves the pixel; 0 but for a moving pupil."""
+    beyond: int
+    """How many landmarks were left out because they fit best beyond infinity."""
 
 
 def finite_images(solution: Solution) -> BoolArray:
@@ -147,7 +149,8 @@ def place_observations(solution: Solution, straight: list[Straight | None]) -> P
     found = np.einsum("nij,nj->ni", enlargement, solution.residual_final_px[row])
     bound = _DIFFERENCE_PX + _DIFFERENCE_SHARE * np.linalg.norm(found, axis=1)
     other = valid & (np.linalg.norm(residual - found, axis=1) > bound)
-    valid &= ~np.isin(landmark, landmark[other])
+    beyond = np.unique(landmark[other])
+    valid &= ~np.isin(landmark, beyond)
     views = np.bincount(landmark[valid], minlength=len(solution.landmark_track))
     keep = valid & (views[landmark] > 1)
     return Placed(
@@ -158,6 +161,7 @@ def place_observations(solution: Solution, straight: list[Straight | None]) -> P
         residual_px=residual[keep],
         enlargement=enlargement[keep],
         shift_px=shift[keep],
+        beyond=len(beyond),
     )
 
 

@@ -4,6 +4,7 @@ The text format is that of COLMAP's documentation, "Output Format". COLMAP has t
 at (0.5, 0.5), and poses that take points of the world to the camera.
 """
 
+import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +30,7 @@ from pancam_graph.solution import Solution, rms_px
 
 __all__ = ["fill_colmap", "write_colmap"]
 
+_LOG = logging.getLogger(__name__)
 _FIRST_PIXEL = 0.5
 _SOURCE_IMAGES = 20
 """How many other images COLMAP's stereo chooses for each; its own default."""
@@ -84,7 +86,17 @@ def fill_colmap(solution: Solution, folder: Path, brightness: Brightness) -> Non
         (sparse / f"{name}.txt").write_text(text, encoding="utf-8", newline="\n")
     written = _write_images(solution, folder / "images", straight, numbers, brightness)
     _write_stereo(folder / "stereo", [numbers.name[i] for i in written])
-    write_export_json(folder, "colmap", _about(solution, straight, placed, numbers, written, brightness))
+    about = _about(solution, straight, placed, numbers, written, brightness)
+    _LOG.info(
+        "colmap: %d images, %d of them with pictures, %d points; %d points left out, %d of them because they "
+        "fit best beyond infinity",
+        len(numbers.of_image),
+        len(written),
+        about["points"],
+        about["points_left_out"],
+        about["points_beyond_infinity"],
+    )
+    write_export_json(folder, "colmap", about)
 
 
 def _numbers(
@@ -287,6 +299,7 @@ def _about(
         "observations": len(placed.row),
         "points": len(of_point),
         "points_left_out": int(np.isfinite(solution.final.landmarks_m).all(axis=1).sum()) - len(of_point),
+        "points_beyond_infinity": placed.beyond,
         "mean_reprojection_error_px": float(np.mean(of_point)) if len(of_point) else None,
         "rms_px": rms_px(placed.residual_px),
         "rms_raw_px": rms_px(solution.residual_final_px[placed.row]),

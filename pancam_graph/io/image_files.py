@@ -1,5 +1,6 @@
 """Image files as 2-D grey arrays: PDS .IMG through its label, anything else through OpenCV."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,18 @@ from pancam_graph.errors import ImageError, InputError
 from pancam_graph.io.pds_label import ImageLayout, PdsLabel, read_label
 from pancam_graph.rigs import Rig
 
-__all__ = ["GreyImage", "ImageContent", "read_eye_content", "read_eye_image", "read_image"]
+__all__ = [
+    "GreyImage",
+    "ImageContent",
+    "left_out",
+    "read_eye_content",
+    "read_eye_image",
+    "read_image",
+]
 
 GreyImage = NDArray[np.uint8] | NDArray[np.uint16]
 
+_NAMED = 5
 _GREY_WEIGHTS = np.array([0.299, 0.587, 0.114])
 """Red, green, blue to luma, ITU-R BT.601; what OpenCV uses for its own formats."""
 
@@ -30,6 +39,15 @@ class ImageContent:
     """Whether there were bands that differ; their luma is what `samples` has."""
     host: str | None
     """The spacecraft that a PDS label names."""
+
+
+def left_out(errors: Mapping[str, ImageError]) -> list[str]:
+    """Warnings of images, by id, whose files cannot be used: one of each, and how many more there are."""
+    said = [f"image {name} is left out: {error}" for name, error in list(errors.items())[:_NAMED]]
+    more = len(errors) - _NAMED
+    return (
+        [*said, f"{more} more images are left out, whose files cannot be used either"] if more > 0 else said
+    )
 
 
 def read_image(path: Path) -> GreyImage:

@@ -25,9 +25,10 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from pancam_graph.errors import InputError
+from pancam_graph.errors import ImageError, InputError
 from pancam_graph.geometry import FloatArray, IntArray, wrap_angle
 from pancam_graph.io._pds_image import PMA_GROUPS, LabelledImage, read_labelled_image
+from pancam_graph.io.image_files import left_out
 from pancam_graph.rigs import MER_MAST, MastKinematics, ReferenceSigma, RigFit, RigFitOptions, fit_rig
 from pancam_graph.traverse import Frame, Image, Stop, Traverse
 
@@ -79,7 +80,8 @@ def read_pds(folder: Path | str) -> Traverse:
 
     Raises InputError naming file and entry for a folder without .IMG files, a label that is missing, no
     label, or lacks an entry (camera model, rover pose, mast angles), a camera that is not on the mast,
-    images of two rovers or two site frames, and (as ImageError) a file shorter than its label says.
+    images of two rovers or two site frames, and ImageError if all files are shorter than their labels say; if
+    only some are, they are warned of and left out.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -87,9 +89,13 @@ def read_pds(folder: Path | str) -> Traverse:
     files = sorted(f for f in folder.iterdir() if f.suffix.lower() == ".img" and f.is_file())
     if not files:
         raise InputError(f"{folder}: expected images with PDS labels (*.IMG), found none")
-    images = [read_labelled_image(file) for file in files]
+    images, unusable = list[LabelledImage](), dict[str, ImageError]()
+    for file in files:
+        _add_image(file, images, unusable)
+    if not images:
+        raise next(iter(unusable.values()))
     kinematics = _common_mast(images)
-    warnings: list[str] = []
+    warnings = left_out(unusable)
     eye_of, eye_names = _sort_eyes(images)
     stop_ids, stops = _sort_stops(images, kinematics, warnings)
     frame_of, frames_first = _sort_frames(images, eye_of)
@@ -136,6 +142,13 @@ def read_pds(folder: Path | str) -> Traverse:
         folder=folder,
         warnings=tuple(warnings),
     )
+
+
+def _add_image(file: Path, images: list[LabelledImage], unusable: dict[str, ImageError]) -> None:
+    try:
+        images.append(read_labelled_image(file))
+    except ImageError as error:
+        unusable[file.stem] = error
 
 
 def _kind(path: Path) -> str:

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import numpy as np
@@ -20,7 +21,7 @@ from pancam_graph.io._schema import (
     TraverseFile,
     rig_entry,
 )
-from pancam_graph.io.image_files import read_eye_content
+from pancam_graph.io.image_files import left_out, read_eye_content
 from pancam_graph.io.mask_files import mask_file, read_mask
 from pancam_graph.io.observations import observations_npz, read_observations
 from pancam_graph.traverse import Frame, Image, Stop, Traverse
@@ -35,11 +36,13 @@ def read_traverse(folder: Path | str) -> Traverse:
     """Read a traverse folder: `traverse.json`, the observations and image files that it names.
 
     Every image file and mask is decoded once, to know that it is there, whole, of its camera's size and,
-    where labels tell, of the same rover; nothing is kept of it. `observations` is None where the file says
-    null: they are then to be found in the images.
+    where labels tell, of the same rover; nothing is kept of it. Image files that are not are warned of, and
+    what reads them later does without. `observations` is None where the file says null: they are then to be
+    found in the images.
 
-    Raises InputError (ImageError for an image) with one sentence naming file, entry, what was expected and
-    what was found.
+    Raises InputError with one sentence naming file, entry, what was expected and what was found; ImageError
+    for a mask that cannot be used, and if no image file can be: unless observations are given and all image
+    files are missing.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -70,8 +73,11 @@ def read_traverse(folder: Path | str) -> Traverse:
             traverse = traverse.with_observations(observations)
         except InputError as error:
             raise InputError(f"{source}: {str(error).removeprefix('observations: ')}") from error
-    _require_images(files, traverse)
-    return traverse
+    unusable = _unusable_images(files, traverse)
+    # Where observations are to be found in images, that warns of them.
+    return (
+        traverse if source is None else replace(traverse, warnings=(*traverse.warnings, *left_out(unusable)))
+    )
 
 
 def write_traverse(traverse: Traverse, folder: Path | str, *, overwrite: bool = False) -> None:
@@ -184,10 +190,15 @@ def _inside(folder: Path, name: str, entry: str) -> Path:
     return folder / name
 
 
-def _require_images(files: list[Path | None], traverse: Traverse) -> None:
-    """Raise ImageError for an image or a mask that cannot be used, InputError for images of two rovers."""
+def _unusable_images(files: list[Path | None], traverse: Traverse) -> dict[str, ImageError]:
+    """The image files that cannot be used, by id.
+
+    Raises ImageError for a mask that cannot be used and if no image file can, InputError for images of two
+    rovers.
+    """
     hosts: dict[str, Path] = {}
     masks: set[tuple[Path, int, int]] = set()
+    unusable: dict[int, ImageError] = {}
     for row, file in enumerate(files):
         if file is None:
             continue
@@ -195,14 +206,17 @@ def _require_images(files: list[Path | None], traverse: Traverse) -> None:
         camera = traverse.rig.eyes[eye].camera
         mask = mask_file(traverse, row)
         try:
-            content = read_eye_content(file, traverse.rig, eye)
             # One mask most often serves many images.
             if mask is not None and (mask, camera.width_px, camera.height_px) not in masks:
                 read_mask(mask, camera.width_px, camera.height_px, file.name)
                 masks.add((mask, camera.width_px, camera.height_px))
         except ImageError as error:
-            entry = f"images[{row}] ({traverse.images[row].id})"
-            raise ImageError(f"{traverse.folder}/{_TRAVERSE_JSON}: {entry}: {error}") from error
+            raise _at(traverse, row, error) from error
+        try:
+            content = read_eye_content(file, traverse.rig, eye)
+        except ImageError as error:
+            unusable[row] = error
+            continue
         if content.host is not None:
             hosts.setdefault(content.host, file)
             first = next(iter(hosts))
@@ -211,6 +225,19 @@ def _require_images(files: list[Path | None], traverse: Traverse) -> None:
                     f"{file}: INSTRUMENT_HOST_ID: expected {first} as in {hosts[first].name}, "
                     f"found {content.host}: images of two rovers"
                 )
+    named = [file for file in files if file is not None]
+    lost = traverse.observations is not None and not any(file.exists() for file in named)
+    if len(unusable) == len(named) > 0 and not lost:
+        row, first_error = next(iter(unusable.items()))
+        raise _at(traverse, row, first_error) from first_error
+    return {traverse.images[row].id: error for row, error in unusable.items()}
+
+
+def _at(traverse: Traverse, row: int, error: ImageError) -> ImageError:
+    """An error that says which entry of the traverse it is about."""
+    return ImageError(
+        f"{traverse.folder}/{_TRAVERSE_JSON}: images[{row}] ({traverse.images[row].id}): {error}"
+    )
 
 
 def _copies(traverse: Traverse, folder: Path) -> list[tuple[Path, Path]]:

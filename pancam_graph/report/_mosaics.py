@@ -2,6 +2,7 @@
 
 import base64
 from html import escape
+from itertools import groupby
 
 from pancam_graph.images.mosaic import Blink, WrittenMosaics
 
@@ -13,6 +14,7 @@ _STYLE = """
 .blink img { display: block; max-width: 100%; height: auto; border: 1px solid var(--line); }
 .blink img.after { position: absolute; inset: 0; }
 .controls button { font: inherit; padding: 3px 14px; min-width: 6em; cursor: pointer; }
+.controls button[aria-pressed=true] { background: var(--after); color: #ffffff; border-style: inset; }
 .controls input[type=range] { width: 220px; vertical-align: middle; }
 .blink figcaption { margin-top: 6px; font-weight: 600; min-height: 1.5em; overflow-wrap: anywhere; }
 .seams li { overflow-wrap: anywhere; max-width: 130ch; }
@@ -24,38 +26,53 @@ _SCRIPT = r"""
   const select = document.getElementById("mosaic-view");
   const slider = document.getElementById("mosaic-fade");
   const button = document.getElementById("mosaic-blink");
+  const still = matchMedia("(prefers-reduced-motion: reduce)");
   let timer = null;
   const show = () => blinks.forEach((blink, row) => {
     blink.hidden = row !== Number(select.value);
     const share = Number(slider.value) / 100;
-    blink.querySelector("img.after").style.opacity = share;
-    blink.querySelector("figcaption").textContent = share === 0 ? blink.dataset.before
+    const words = share === 0 ? blink.dataset.before
       : share === 1 ? blink.dataset.after
         : `${Math.round(100 * share)} % refined over telemetry`;
+    const [before, after] = blink.querySelectorAll("img");
+    after.style.opacity = share;
+    before.ariaHidden = String(share > 0.5);
+    after.ariaHidden = String(share <= 0.5);
+    blink.querySelector("figcaption").textContent = words;
+    if (!blink.hidden) slider.setAttribute("aria-valuetext", words);
   });
+  const swap = () => { slider.value = Number(slider.value) < 50 ? 100 : 0; show(); };
   const stop = () => {
     clearInterval(timer);
     timer = null;
-    button.textContent = "Blink";
-    button.setAttribute("aria-pressed", "false");
+    if (!still.matches) button.setAttribute("aria-pressed", "false");
+  };
+  const name = () => {
+    stop();
+    button.textContent = still.matches ? "Swap" : "Blink";
+    if (still.matches) button.removeAttribute("aria-pressed");
   };
   button.addEventListener("click", () => {
     if (timer !== null) { stop(); return; }
-    timer = setInterval(() => { slider.value = Number(slider.value) < 50 ? 100 : 0; show(); }, 700);
-    button.textContent = "Hold";
+    swap();
+    if (still.matches) return;
+    timer = setInterval(swap, 700);
     button.setAttribute("aria-pressed", "true");
   });
   slider.addEventListener("input", () => { stop(); show(); });
   select.addEventListener("change", show);
+  still.addEventListener("change", name);
+  name();
   show();
 })();
 """
 _CAPTION = (
-    "Both pointings on the surface that the adjusted landmarks span, with the same exposures, seams and "
-    "contrast: only the pointing differs. Overlaps are four times enlarged, the first image in red and the "
-    "second in green and blue: grey where they agree. The seam error is the median displacement of windows "
-    "of 64 pixels, by phase correlation, in pixels of the images at their centre. Pictures in full, and "
-    "where their pixels are in the world: folder mosaics beside this page."
+    "Blink shows both pointings in turn; where the system asks for less motion, each press swaps them. The "
+    "slider fades. Both are on the surface that the adjusted landmarks span, with the same exposures, seams "
+    "and contrast: only the pointing differs. Overlaps are four times enlarged, the first image in red and "
+    "the second in green and blue: grey where they agree. The seam error is the median displacement of "
+    "windows of 64 pixels, by phase correlation, in pixels of the images at their centre. Pictures in full, "
+    "and where their pixels are in the world: folder mosaics beside this page."
 )
 
 
@@ -63,7 +80,13 @@ def mosaic_section(written: WrittenMosaics | None) -> str:
     """The section of the mosaics; nothing where none were made."""
     if written is None or not written.blinks:
         return ""
-    options = "".join(f'<option value="{n}">{escape(b.title)}</option>' for n, b in enumerate(written.blinks))
+    groups = groupby(enumerate(written.blinks), key=lambda numbered: numbered[1].group)
+    options = "".join(
+        f'<optgroup label="{escape(name)}">'
+        + "".join(f'<option value="{n}">{escape(b.title)}</option>' for n, b in members)
+        + "</optgroup>"
+        for name, members in groups
+    )
     lines = "".join(f"<li>{escape(line)}</li>" for line in written.lines)
     figures = "\n".join(_figure(blink, hidden=n > 0) for n, blink in enumerate(written.blinks))
     return (
@@ -78,7 +101,7 @@ def mosaic_section(written: WrittenMosaics | None) -> str:
 
 
 def _figure(blink: Blink, *, hidden: bool) -> str:
-    before, after = escape(blink.captions["telemetry"]), escape(blink.captions["refined"])
+    before, after = (escape(f"{blink.group}: {blink.captions[p]}") for p in ("telemetry", "refined"))
     size = f'width="{blink.width_px}" height="{blink.height_px}"'
     images = "".join(
         f'<img class="{kind}" {size} alt="{escape(blink.title)}, {words}" src="{_uri(jpeg)}">'

@@ -99,7 +99,12 @@ class _Axis:
 def _framed(picture: Picture, across: _Axis, down: _Axis, names: tuple[str, str], title: str) -> Picture:
     """The picture with ticks and words around it."""
     height, width = picture.shape[:2]
-    left, top, right, bottom = 108, 46, 34, 78
+    left, top, bottom = 108, 46, 78
+    # Words may be wider than a small picture.
+    name_px = _width_px(names[0], 0.6)
+    right = max(
+        34, _width_px(title, 0.7) - width + 10, (name_px - width) // 2 + 10, name_px + 20 - left - width
+    )
     page = np.full((height + top + bottom, width + left + right, 3), 255, dtype=np.uint8)
     page[top : top + height, left : left + width] = picture
     cv2.rectangle(page, (left - 1, top - 1), (left + width, top + height), INK, 1)
@@ -114,7 +119,8 @@ def _framed(picture: Picture, across: _Axis, down: _Axis, names: tuple[str, str]
             cv2.line(page, (left - 8, y), (left - 1, y), INK, 1)
             size = cv2.getTextSize(text, _FONT, 0.6, 1)[0]
             _write(page, text, (left - 14 - size[0], y + size[1] // 2))
-    _write(page, names[0], (left + width // 2, top + height + 60), centred=True)
+    middle = max(left + width // 2, name_px // 2 + 10)
+    _write(page, names[0], (middle, top + height + 60), centred=True)
     turned = np.ascontiguousarray(np.rot90(page, -1))
     _write(turned, names[1], (turned.shape[1] - top - height // 2, 24), centred=True)
     page = np.ascontiguousarray(np.rot90(turned))
@@ -151,14 +157,20 @@ def _draw_circles(picture: Picture, projection: Ground, scale: float) -> None:
         _write_over(picture, f"{azimuth}", np.array(centre) + d * (outer * per_m - 24))
 
 
+def _plain(text: str) -> str:
+    """OpenCV's own letters are ASCII."""
+    return text.encode("ascii", "replace").decode("ascii")
+
+
+def _width_px(text: str, size: float) -> int:
+    return int(cv2.getTextSize(_plain(text), _FONT, size, 1)[0][0])
+
+
 def _write(
     page: Picture, text: str, at: tuple[int, int], *, size: float = 0.6, centred: bool = False
 ) -> None:
-    # OpenCV's own letters are ASCII.
-    plain = text.encode("ascii", "replace").decode("ascii")
-    width = cv2.getTextSize(plain, _FONT, size, 1)[0][0]
-    place = (at[0] - width // 2, at[1]) if centred else at
-    cv2.putText(page, plain, place, _FONT, size, INK, 1, cv2.LINE_AA)
+    place = (at[0] - _width_px(text, size) // 2, at[1]) if centred else at
+    cv2.putText(page, _plain(text), place, _FONT, size, INK, 1, cv2.LINE_AA)
 
 
 def _write_over(picture: Picture, text: str, at: NDArray[np.float64]) -> None:

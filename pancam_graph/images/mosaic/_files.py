@@ -15,7 +15,7 @@ from pancam_graph.errors import InputError
 from pancam_graph.images.mosaic._draw import close_ups, comparison, with_axes
 from pancam_graph.images.mosaic._make import Mosaic, StopGround, StopMosaics, make_mosaics, stop_ground
 from pancam_graph.images.mosaic._options import MosaicOptions
-from pancam_graph.images.mosaic._placed import POINTINGS, Pointing
+from pancam_graph.images.mosaic._placed import POINTINGS, Pointing, copies
 from pancam_graph.images.mosaic._projections import Cylinder
 from pancam_graph.images.mosaic._seam_error import CASES, Case
 from pancam_graph.io._schema import MOSAIC_FORMAT, VERSION
@@ -41,6 +41,8 @@ Progress = Callable[[str, int, int], None]
 class Blink:
     """Two pictures of the same, one with each pointing, that the report shows in turn."""
 
+    group: str
+    """Stop and camera."""
     title: str
     captions: dict[Pointing, str]
     """What is said under each."""
@@ -77,12 +79,13 @@ def write_mosaics(
     blinks: list[Blink] = []
     lines, warnings = [], []
     ground: tuple[int, StopGround] | None = None
+    twice = copies(traverse)
     spent = 0
     for n, (stop, eye) in enumerate(pairs):
         stop_id, camera = traverse.stops[stop].id, traverse.rig.eyes[eye].name
         try:
             if ground is None or ground[0] != stop:
-                ground = stop, stop_ground(solution, stop)
+                ground = stop, stop_ground(solution, stop, twice)
             made = make_mosaics(solution, stop_id, camera, options, ground=ground[1])
         except InputError as error:
             warnings.append(str(error))
@@ -133,12 +136,18 @@ def _write(made: StopMosaics, folder: Path, name: str, title: str) -> list[Json]
             _save(folder / plain, mosaic.pictures[pointing])
             _save(folder / drawn, with_axes(mosaic, pointing, f"{title}: {_POINTING[pointing]} pointing"))
             files |= {pointing: plain, f"{pointing}_axes": drawn}
+            if mosaic.samples is not None:
+                deep = f"{name}_{kind}_{pointing}_16bit.png"
+                _save(folder / deep, mosaic.samples[pointing])
+                files[f"{pointing}_16bit"] = deep
         if kind == "cylinder":
             files["comparison"] = f"{name}_comparison.jpg"
             _save(folder / f"{name}_comparison.jpg", comparison(made, title))
         entry: Json = {"stop": made.stop, "camera": made.camera, "kind": kind, "images": list(made.images)}
         entry |= {"files": files} | _place(mosaic)
+        entry |= {"dark": mosaic.dark, "bright": mosaic.bright}
         if kind == "cylinder":
+            entry["brightness"] = _brightness(made)
             entry["seam_error"] = _seam_error(made)
         entries.append(entry)
     return entries
@@ -164,6 +173,12 @@ def _place(mosaic: Mosaic) -> Json:
     }
 
 
+def _brightness(made: StopMosaics) -> Json:
+    evening = made.evening
+    gains = {name: evening.gain.get(n) for n, name in enumerate(made.images)}
+    return {"gain": gains, "vignetting": evening.vignetting.tolist(), "vignetting_sigma": evening.sigma}
+
+
 def _seam_error(made: StopMosaics) -> Json:
     def medians(median_px: Callable[[Case], float]) -> Json:
         found = {case: median_px(case) for case in CASES}
@@ -176,40 +191,41 @@ def _seam_error(made: StopMosaics) -> Json:
     return {"used": made.seams.used, **medians(made.seams.median_px), "overlaps": overlaps}
 
 
-def _save(path: Path, picture: NDArray[np.uint8]) -> None:
+def _save(path: Path, picture: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
     path.write_bytes(_encoded(picture, path.suffix, _QUALITY))
 
 
-def _encoded(picture: NDArray[np.uint8], suffix: str, quality: int) -> bytes:
+def _encoded(picture: NDArray[np.uint8] | NDArray[np.uint16], suffix: str, quality: int) -> bytes:
     setting = [cv2.IMWRITE_JPEG_QUALITY, quality] if suffix == ".jpg" else []
     done, data = cv2.imencode(suffix, picture, setting)
     assert done
     return data.tobytes()
 
 
-def _blinks(made: StopMosaics, title: str) -> list[Blink]:
+def _blinks(made: StopMosaics, group: str) -> list[Blink]:
     """The panorama, pieces of its overlaps, and the view from above."""
-    found = [_blink_of(made.cylinder, f"{title}: panorama", _BLINK_WIDTH_PX)]
+    found = [_blink_of(made.cylinder, group, "panorama", _BLINK_WIDTH_PX)]
     for k, pieces in close_ups(made, _CLOSE_UPS):
         overlap = made.seams.overlaps[k]
         captions: dict[Pointing, str] = {
             "telemetry": f"telemetry: displaced by {overlap.median_px('telemetry'):.2f} px (median)",
             "refined": f"refined: displaced by {overlap.median_px('refined'):.2f} px (median)",
         }
-        found.append(
-            _blink(f"{title}: overlap of {overlap.images[0]} and {overlap.images[1]}", captions, pieces)
-        )
+        title = f"overlap of {overlap.images[0]} and {overlap.images[1]}"
+        found.append(_blink(group, title, captions, pieces))
     if made.ground is not None:
-        found.append(_blink_of(made.ground, f"{title}: from above", _BLINK_GROUND_PX))
+        found.append(_blink_of(made.ground, group, "from above", _BLINK_GROUND_PX))
     return found
 
 
-def _blink_of(mosaic: Mosaic, title: str, width_px: int) -> Blink:
+def _blink_of(mosaic: Mosaic, group: str, title: str, width_px: int) -> Blink:
     captions = {p: f"{_POINTING[p]} pointing" for p in POINTINGS}
-    return _blink(title, captions, {p: with_axes(mosaic, p, "", width_px) for p in POINTINGS})
+    return _blink(group, title, captions, {p: with_axes(mosaic, p, "", width_px) for p in POINTINGS})
 
 
-def _blink(title: str, captions: dict[Pointing, str], pictures: dict[Pointing, NDArray[np.uint8]]) -> Blink:
+def _blink(
+    group: str, title: str, captions: dict[Pointing, str], pictures: dict[Pointing, NDArray[np.uint8]]
+) -> Blink:
     height, width = pictures["refined"].shape[:2]
     jpeg = {p: _encoded(pictures[p], ".jpg", _BLINK_QUALITY) for p in POINTINGS}
-    return Blink(title=title, captions=captions, jpeg=jpeg, width_px=width, height_px=height)
+    return Blink(group=group, title=title, captions=captions, jpeg=jpeg, width_px=width, height_px=height)

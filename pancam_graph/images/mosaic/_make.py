@@ -1,6 +1,6 @@
 """The mosaics of one eye at one stop."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,12 +9,14 @@ from numpy.typing import NDArray
 from pancam_graph.errors import InputError
 from pancam_graph.geometry import BoolArray, FloatArray
 from pancam_graph.images.mosaic._blend import blend, choose_look
+from pancam_graph.images.mosaic._evening import Evening
 from pancam_graph.images.mosaic._options import MosaicOptions
 from pancam_graph.images.mosaic._placed import (
     POINTINGS,
     PlacedImage,
     Pointing,
     View,
+    copies,
     placed_images,
     view_from_stop,
 )
@@ -37,7 +39,13 @@ class Mosaic:
     projection: Projection
     """Where its pixels are in the world."""
     pictures: dict[Pointing, NDArray[np.uint8]]
-    """(rows, columns) grey; 0 where there is no image."""
+    """(rows, columns) grey, stretched for the eye; 0 where there is no image."""
+    samples: dict[Pointing, NDArray[np.uint16]] | None
+    """(rows, columns) samples of images of more than 8 bits, evened out, not stretched; 0 where there is no
+    image, 1 at the least elsewhere. None for images of 8 bits."""
+    dark: float
+    bright: float
+    """Samples that are 1 and 255 in `pictures`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -53,6 +61,8 @@ class StopMosaics:
     ground: Mosaic | None
     """From above; None where no image shows ground near enough."""
     seams: SeamError
+    evening: Evening
+    """Gains, by the images' places in `images`, and the vignetting that was taken out."""
     warnings: tuple[str, ...]
     """Images that are left out, and why."""
 
@@ -66,10 +76,15 @@ class StopGround:
     views: dict[Pointing, View]
     surfaces: dict[Pointing, Surface]
     """What the landmarks of each pointing span."""
+    twice: Mapping[int, int]
+    """Rows of images that are copies of others, and of which."""
 
 
-def stop_ground(solution: Solution, stop: int) -> StopGround:
-    """Origin, views and surfaces of a stop, by row. Raises InputError where no camera has a pose."""
+def stop_ground(solution: Solution, stop: int, twice: Mapping[int, int] | None = None) -> StopGround:
+    """Origin, views and surfaces of a stop, by row; `twice` is what `copies` gives, where it is at hand.
+
+    Raises InputError where no camera has a pose.
+    """
     views = {p: view_from_stop(solution, stop, p) for p in POINTINGS}
     centres = views["refined"].world_t_camera[solution.traverse.image_stop == stop]
     centres = centres[np.isfinite(centres).all(axis=1)]
@@ -78,7 +93,8 @@ def stop_ground(solution: Solution, stop: int) -> StopGround:
         raise InputError(f"mosaic: stop {name}: expected a camera with a pose, found none")
     origin_m = centres.mean(axis=0)
     surfaces = {p: surface_of_stop(solution, stop, origin_m, v) for p, v in views.items()}
-    return StopGround(origin_m=origin_m, views=views, surfaces=surfaces)
+    twice = copies(solution.traverse) if twice is None else twice
+    return StopGround(origin_m=origin_m, views=views, surfaces=surfaces, twice=twice)
 
 
 def make_mosaics(
@@ -102,20 +118,22 @@ def make_mosaics(
     if stop not in stops:
         raise InputError(f"mosaic: stop: expected the id of a stop, found {stop!r}")
     shared = ground or stop_ground(solution, stops[stop])
-    images, warnings = placed_images(solution, stops[stop], traverse.rig.eye_index(camera), shared.views)
+    eye = traverse.rig.eye_index(camera)
+    images, warnings = placed_images(solution, stops[stop], eye, shared.views, shared.twice)
     if not images:
-        why = f" ({warnings[0]})" if len(warnings) == 1 else ""
+        more = f"; {len(warnings) - 1} more" if len(warnings) > 1 else ""
+        why = f" ({warnings[0]}{more})" if warnings else ""
         raise InputError(
             f"mosaic: stop {stop}, camera {camera}: expected image files, found none that serve{why}"
         )
     surface = shared.surfaces["refined"]
     native = native_px_per_degree(images)
     around = _cylinder(images, surface, options, native)
-    panorama, overview = _mosaic(images, surface, around)
-    square = Ground.around(shared.origin_m, options.ground_radius_m, options.ground_m_per_px)
-    above, _ = _mosaic(images, surface, square)
-    if panorama is None:
+    panorama, overview, evening = _mosaic(images, surface, around)
+    if panorama is None or evening is None:
         raise InputError(f"mosaic: stop {stop}, camera {camera}: expected images with data, found none")
+    square = Ground.around(shared.origin_m, options.ground_radius_m, options.ground_m_per_px)
+    above, _, _ = _mosaic(images, surface, square, evening)
     return StopMosaics(
         stop=stop,
         camera=camera,
@@ -123,23 +141,45 @@ def make_mosaics(
         cylinder=panorama,
         ground=above,
         seams=seam_error(images, shared.surfaces, overview, native),
+        evening=evening,
         warnings=tuple(warnings),
     )
 
 
 def _mosaic(
-    images: Sequence[PlacedImage], surface: Surface, projection: Projection
-) -> tuple[Mosaic | None, Lattice]:
-    """A mosaic, None where no image shows anything of it, and its lattice."""
+    images: Sequence[PlacedImage],
+    surface: Surface,
+    projection: Projection,
+    evening: Evening | None = None,
+) -> tuple[Mosaic | None, Lattice, Evening | None]:
+    """A mosaic, None where no image shows anything of it, its lattice, and what makes images equally bright.
+
+    That is estimated, unless it is given.
+    """
     lattice = Lattice.over(projection, surface)
     layers = _layers(images, "refined", lattice)
     if not layers:
-        return None, lattice
-    look = choose_look(layers, projection.height_px, projection.width_px)
-    pictures = {"refined": blend(layers, look)}
+        return None, lattice, evening
+    look = choose_look(layers, projection.height_px, projection.width_px, evening)
+    blended = {"refined": blend(layers, look)}
     del layers
-    pictures["telemetry"] = blend(_layers(images, "telemetry", lattice), look)
-    return Mosaic(projection=projection, pictures={p: pictures[p] for p in POINTINGS}), lattice
+    blended["telemetry"] = blend(_layers(images, "telemetry", lattice), look)
+    samples = None
+    if any(image.grey.dtype != np.uint8 for image in images):
+        samples = {p: _to_16_bits(blended[p]) for p in POINTINGS}
+    mosaic = Mosaic(
+        projection=projection,
+        pictures={p: look.to_8_bits(blended[p]) for p in POINTINGS},
+        samples=samples,
+        dark=look.dark,
+        bright=look.bright,
+    )
+    return mosaic, lattice, look.evening
+
+
+def _to_16_bits(blended: NDArray[np.float32]) -> NDArray[np.uint16]:
+    there = ~np.isnan(blended)
+    return np.where(there, np.clip(np.rint(np.nan_to_num(blended)), 1, 65535), 0).astype(np.uint16)
 
 
 def _layers(images: Sequence[PlacedImage], pointing: Pointing, lattice: Lattice) -> list[tuple[int, Layer]]:

@@ -1,5 +1,7 @@
 """The images of one eye at one stop, where telemetry and where the adjustment puts them."""
 
+import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -11,9 +13,20 @@ from pancam_graph.errors import ImageError
 from pancam_graph.geometry import BoolArray, FloatArray
 from pancam_graph.images._normalise import usable_mask
 from pancam_graph.io.image_files import GreyImage, read_eye_image
+from pancam_graph.io.mask_files import mask_file, read_mask
 from pancam_graph.solution import Solution
+from pancam_graph.traverse import Traverse
 
-__all__ = ["POINTINGS", "PlacedImage", "Pointing", "Station", "View", "placed_images", "view_from_stop"]
+__all__ = [
+    "POINTINGS",
+    "PlacedImage",
+    "Pointing",
+    "Station",
+    "View",
+    "copies",
+    "placed_images",
+    "view_from_stop",
+]
 
 Pointing = Literal["telemetry", "refined"]
 POINTINGS: tuple[Pointing, ...] = ("telemetry", "refined")
@@ -42,6 +55,8 @@ class PlacedImage:
     grey: GreyImage
     usable: BoolArray
     """Where the image has data, of the image's shape."""
+    wanted: BoolArray
+    """Where the user's mask is white, of the same shape; everywhere without one."""
     at: dict[Pointing, Station]
 
 
@@ -80,11 +95,32 @@ def view_from_stop(solution: Solution, stop: int, pointing: Pointing) -> View:
     )
 
 
+def copies(traverse: Traverse) -> dict[int, int]:
+    """Rows of images whose file is the same, to the byte, as that of an image before, and that image's row.
+
+    The front end leaves out the same ones.
+    """
+    sizes: dict[int, list[tuple[int, Path]]] = {}
+    for row, image in enumerate(traverse.images):
+        path = (traverse.folder or Path()) / (image.file or "")
+        if image.file is not None and path.is_file():
+            sizes.setdefault(path.stat().st_size, []).append((row, path))
+    found: dict[int, int] = {}
+    for alike in sizes.values():
+        first: dict[bytes, int] = {}
+        for row, path in alike if len(alike) > 1 else ():
+            before = first.setdefault(hashlib.sha256(path.read_bytes()).digest(), row)
+            if before != row:
+                found[row] = before
+    return found
+
+
 def placed_images(
-    solution: Solution, stop: int, eye: int, views: dict[Pointing, View]
+    solution: Solution, stop: int, eye: int, views: dict[Pointing, View], twice: Mapping[int, int]
 ) -> tuple[list[PlacedImage], list[str]]:
     """The images that an eye took at a stop, and a warning for each that cannot be had.
 
+    `twice` is what `copies` gives: one picture cannot be of two places.
     Where the rig was adjusted, its calibration belongs to the refined pointing only.
     """
     traverse = solution.traverse
@@ -95,12 +131,23 @@ def placed_images(
         if entry.file is None:
             warnings.append(f"mosaic: image {entry.id} is left out: it has no file")
             continue
+        if row in twice:
+            first = traverse.images[twice[row]]
+            warnings.append(
+                f"mosaic: image {entry.id} ({entry.file}) is left out: the same picture as image {first.id} "
+                f"({first.file})"
+            )
+            continue
         poses = [(v.world_R_camera[row], v.world_t_camera[row]) for v in views.values()]
         if not all(np.isfinite(a).all() for pose in poses for a in pose):
             warnings.append(f"mosaic: image {entry.id} is left out: its camera has no pose")
             continue
         try:
             grey = read_eye_image(folder / entry.file, traverse.rig, eye)
+            mask = mask_file(traverse, row)
+            wanted = np.ones(grey.shape, dtype=bool)
+            if mask is not None:
+                wanted = read_mask(mask, grey.shape[1], grey.shape[0], entry.file)
         except ImageError as error:
             warnings.append(f"mosaic: image {entry.id} is left out: {error}")
             continue
@@ -113,5 +160,7 @@ def placed_images(
             stations[pointing] = Station(
                 camera=own, world_R_camera=view.world_R_camera[row], centre_m=view.world_t_camera[row]
             )
-        images.append(PlacedImage(id=entry.id, grey=grey, usable=usable_mask(grey), at=stations))
+        images.append(
+            PlacedImage(id=entry.id, grey=grey, usable=usable_mask(grey), wanted=wanted, at=stations)
+        )
     return images, warnings

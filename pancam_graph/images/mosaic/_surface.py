@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import sparse
+from scipy import ndimage, sparse
 from scipy.sparse.linalg import LinearOperator, cg, splu
+from scipy.spatial import cKDTree
 
-from pancam_graph.geometry import FloatArray, IntArray
+from pancam_graph.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.images.mosaic._placed import View
 from pancam_graph.solution import Solution
 
@@ -30,6 +31,11 @@ _FADE_CELLS = 10.0
 """Distance from the last landmark over which the surface returns to the plane."""
 _PLANE_SIGMA = 0.05
 """Of the plane's slopes about the horizontal, and of its distance as a share."""
+_NEIGHBOURS = 8
+_ALIKE = 0.15
+"""By what share ranges of neighbours may differ, two of which must be alike."""
+_SPIKE = 2.0
+"""How many times nearer or farther a cell may be than the median of its surroundings."""
 _ROUNDS = 5
 _MOST_GRADIENTS = 50
 _FARTHEST_GROUND_M = 300.0
@@ -106,6 +112,8 @@ def surface_of_stop(solution: Solution, stop: int, origin_m: FloatArray, view: V
     to_point = view.landmarks_m[rows] - origin_m
     inverse = 1 / np.linalg.norm(to_point, axis=1)
     ray = to_point * inverse[:, None]
+    sound = _supported(ray, inverse, weight)
+    inverse, ray, weight, rows = inverse[sound], ray[sound], weight[sound], rows[sound]
     plane = _fit_plane(ray, inverse, weight, _nominal_height_m(solution, stop, origin_m))
     base = _plane_inverse_range(plane, ray)
     at = _interpolation(ray)
@@ -125,7 +133,39 @@ def surface_of_stop(solution: Solution, stop: int, origin_m: FloatArray, view: V
             solver = LinearOperator(system.shape, matvec=first.solve, dtype=np.float64)
             relief, _ = cg(system, right, x0=relief, rtol=1e-6, maxiter=_MOST_GRADIENTS, M=solver)
         robust = _robust(weight, inverse - base - at @ relief)
-    return Surface(origin_m=origin_m, plane=plane, relief=relief.reshape(_ROWS, _COLUMNS))
+    return Surface(
+        origin_m=origin_m, plane=plane, relief=_without_spikes(plane, relief.reshape(_ROWS, _COLUMNS))
+    )
+
+
+def _supported(ray: FloatArray, inverse: FloatArray, weight: FloatArray) -> BoolArray:
+    """Which landmarks (n,) have two neighbours of about their range, as far as parallax tells it.
+
+    One without is a wrong match most often: patterns of the rover's deck repeat.
+    """
+    if len(ray) <= _NEIGHBOURS:
+        return np.ones(len(ray), dtype=bool)
+    near = np.asarray(cKDTree(ray).query(ray, k=_NEIGHBOURS + 1)[1])[:, 1:]
+    apart = np.abs(inverse[near] - inverse[:, None])
+    noise = np.sqrt(1 / np.maximum(weight, 1e-12))
+    noise = np.hypot(noise[:, None], noise[near])
+    alike = (apart < _ALIKE * inverse[:, None]) | (apart < 3 * noise)
+    return np.asarray(np.count_nonzero(alike, axis=1) >= 2)
+
+
+def _without_spikes(plane: FloatArray, relief: FloatArray) -> FloatArray:
+    """Relief without single cells that are far nearer or farther than all around: wrong matches, most often.
+
+    One that is too far would hide all the ground before it from the mosaic from above.
+    """
+    elevation, azimuth = np.deg2rad(np.arange(_ROWS) - 90.0), np.deg2rad(np.arange(_COLUMNS))
+    ray = directions(azimuth[None, :], elevation[:, None])
+    base = _plane_inverse_range(plane, ray.reshape(-1, 3)).reshape(relief.shape)
+    inverse = np.maximum(base + relief, _LEAST_INVERSE_RANGE)
+    padded = np.pad(np.pad(inverse, ((0, 0), (1, 1)), "wrap"), ((1, 1), (0, 0)), "edge")
+    around = ndimage.median_filter(padded, size=3)[1:-1, 1:-1]
+    spike = (inverse > _SPIKE * around) | (inverse * _SPIKE < around)
+    return np.asarray(np.where(spike, around - base, relief))
 
 
 def _nominal_height_m(solution: Solution, stop: int, origin_m: FloatArray) -> float:
@@ -184,7 +224,8 @@ def _fit_plane(ray: FloatArray, inverse: FloatArray, weight: FloatArray, height_
     """The plane (3,) that most landmarks are near.
 
     A share of the range counts, not pixels of parallax, in which the nearest landmarks would be all; those
-    without parallax count little.
+    without parallax count little. Nothing above the plane's horizon counts: the plane is not seen there, and
+    hills would pull it down to where they are.
     """
     nominal = np.array([0.0, 0.0, -1 / height_m])
     information = np.eye(3) * (height_m / _PLANE_SIGMA) ** 2
@@ -192,7 +233,7 @@ def _fit_plane(ray: FloatArray, inverse: FloatArray, weight: FloatArray, height_
     trusted = 1 / (0.1**2 * share**2 + 1 / np.maximum(weight, 1e-12))
     plane, robust = nominal, np.ones(len(ray))
     for _ in range(4 * _ROUNDS):
-        w = trusted * robust
+        w = np.where(ray @ plane > 0, trusted * robust, 0.0)
         normal = information + ray.T @ (w[:, None] * ray)
         plane = np.linalg.solve(normal, information @ nominal + ray.T @ (w * inverse))
         miss = inverse - _plane_inverse_range(plane, ray)

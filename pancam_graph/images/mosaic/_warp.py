@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pancam_graph.geometry import BoolArray, FloatArray
 from pancam_graph.images.mosaic._placed import PlacedImage, Pointing, Station
-from pancam_graph.images.mosaic._projections import Projection
+from pancam_graph.images.mosaic._projections import Ground, Projection
 from pancam_graph.images.mosaic._surface import Surface
 
 __all__ = ["STEP_PX", "Lattice", "Layer", "largest_gap", "warp"]
@@ -32,6 +32,10 @@ class Layer:
     grey: NDArray[np.float32]
     valid: BoolArray
     """Where the image has data."""
+    chosen: BoolArray
+    """Where it has data that the user's mask does not cover."""
+    radius_squared: NDArray[np.float16]
+    """Squared distance from the middle of the image, in half diagonals: 1 in its corners."""
 
     @property
     def box(self) -> tuple[slice, slice]:
@@ -99,7 +103,10 @@ def largest_gap(covered: BoolArray) -> tuple[int, int]:
 
 
 def warp(image: PlacedImage, pointing: Pointing, lattice: Lattice) -> list[Layer]:
-    """An image in a mosaic: one layer, two where it lies across the ends of a closed one, or none."""
+    """An image in a mosaic: one layer, two where it lies across the ends of a closed one, or none.
+
+    On the ground, what the user's mask covers is left out: it is no ground.
+    """
     projection = lattice.projection
     pixels, cells = lattice.seen_by(image.at[pointing])
     rows = np.flatnonzero(cells.any(axis=1))
@@ -125,9 +132,11 @@ def warp(image: PlacedImage, pointing: Pointing, lattice: Lattice) -> list[Layer
         uv = cv2.remap(
             np.ascontiguousarray(part), at_u, at_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
-        grey, valid = _sample(image, np.asarray(uv, dtype=np.float32))
-        if valid.any():
-            layers.append(_trimmed(Layer(left_px=left, top_px=top, grey=grey, valid=valid)))
+        layer = _sample(image, np.asarray(uv, dtype=np.float32), left, top)
+        if isinstance(projection, Ground):
+            layer = replace(layer, valid=layer.chosen)
+        if layer.valid.any():
+            layers.append(_trimmed(layer))
     return layers
 
 
@@ -139,23 +148,25 @@ def _trimmed(layer: Layer) -> Layer:
         first = int(filled[0]) // STEP_PX * STEP_PX
         kept.append(slice(first, int(filled[-1]) + 1))
     rows, columns = kept
-    return replace(
-        layer,
+    return Layer(
         left_px=layer.left_px + columns.start,
         top_px=layer.top_px + rows.start,
         grey=np.ascontiguousarray(layer.grey[rows, columns]),
         valid=np.ascontiguousarray(layer.valid[rows, columns]),
+        chosen=np.ascontiguousarray(layer.chosen[rows, columns]),
+        radius_squared=np.ascontiguousarray(layer.radius_squared[rows, columns]),
     )
 
 
-def _sample(image: PlacedImage, uv: NDArray[np.float32]) -> tuple[NDArray[np.float32], BoolArray]:
-    """Brightness of an image at pixels (rows, columns, 2), and where it has any."""
+def _sample(image: PlacedImage, uv: NDArray[np.float32], left_px: int, top_px: int) -> Layer:
+    """The layer of an image at pixels (rows, columns, 2)."""
     height, width = image.grey.shape
     u, v = np.ascontiguousarray(uv[..., 0]), np.ascontiguousarray(uv[..., 1])
     inside = (u >= _EDGE_PX) & (u <= width - 1 - _EDGE_PX) & (v >= _EDGE_PX) & (v <= height - 1 - _EDGE_PX)
     u, v = np.where(inside, u, -1.0).astype(np.float32), np.where(inside, v, -1.0).astype(np.float32)
-    usable = cv2.remap(image.usable.astype(np.uint8), u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
-    valid = inside & (usable > 0)
+    flags = image.usable.astype(np.uint8) * (1 + image.wanted.astype(np.uint8))
+    flag = cv2.remap(flags, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
+    valid, chosen = inside & (flag > 0), inside & (flag > 1)
     level = _levels(uv)
     grey = np.zeros(u.shape, dtype=np.float32)
     source: NDArray[Any] = image.grey.astype(np.float32)
@@ -175,7 +186,16 @@ def _sample(image: PlacedImage, uv: NDArray[np.float32]) -> tuple[NDArray[np.flo
         source = cv2.resize(
             padded, (padded.shape[1] // 2, padded.shape[0] // 2), interpolation=cv2.INTER_AREA
         )
-    return grey, valid
+    middle = np.array([(width - 1) / 2, (height - 1) / 2])
+    squared = ((u - middle[0]) ** 2 + (v - middle[1]) ** 2) / float(middle @ middle)
+    return Layer(
+        left_px=left_px,
+        top_px=top_px,
+        grey=grey,
+        valid=valid,
+        chosen=chosen,
+        radius_squared=squared.astype(np.float16),
+    )
 
 
 def _levels(uv: NDArray[np.float32]) -> NDArray[np.int8]:
