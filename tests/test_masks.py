@@ -1,5 +1,6 @@
 """Masks: the user's files, missing and saturated pixels, sky, and the rover that drives along."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -309,3 +310,28 @@ def test_rendered_deck_is_masked(tmp_path: Path) -> None:
 def test_options_of_masks_are_checked() -> None:
     with pytest.raises(InputError, match="masks: expected automatic or user, found 'none'"):
         FrontEndOptions(masks="none")  # type: ignore[arg-type]  # that is what is tested
+
+
+def test_the_example_of_a_mask_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The example of docs/files.md masks that camera and pointing, and no other."""
+    page = Path(__file__).resolve().parents[1] / "docs" / "files.md"
+    if not page.exists():
+        pytest.skip("no docs: they are part of the repository, not of the installed package")
+    (code,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    folder = tmp_path / "TRAVERSE"
+    folder.mkdir()
+    truth, _ = make_traverse(folder, pans_deg=(-10.0, 10.0))
+    write_traverse(truth, folder, overwrite=True)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "files.md", "exec"), {})
+    traverse = read_traverse(folder)
+    found = [mask_file(traverse, row) for row in range(len(traverse.images))]
+    expected = [
+        (i.frame, i.camera) == (traverse.images[0].frame, traverse.images[0].camera) for i in traverse.images
+    ]
+    assert [mask is not None for mask in found] == expected
+    masks = find_masks(traverse, FrontEndOptions(masks="user"))
+    assert masks[0] is not None
+    reasons = masks[0].reasons & np.uint8(Reason.USER)
+    assert reasons[160:].all()
+    assert not reasons[:160].any()
