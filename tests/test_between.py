@@ -10,6 +10,7 @@ import pytest
 from scipy import ndimage
 
 from pancam_graph import (
+    Observations,
     Rendering,
     RenderOptions,
     SimulationOptions,
@@ -31,6 +32,7 @@ from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._patches import align_patches
 from pancam_graph.images._splines import Splines
 from pancam_graph.images._terrain import Terrain, terrain_arrays, terrain_from
+from pancam_graph.matching import StopMatching
 from pancam_graph.rigs import Eye, Rig, rig_template
 from pancam_graph.threads import n_workers
 
@@ -182,10 +184,17 @@ Fitted = list[tuple[PairGeometry, FloatArray, FloatArray, FloatArray]]
 
 
 @pytest.fixture(scope="module")
-def small_run(small: tuple[Rendering, Traverse]) -> tuple[Traverse, Fitted]:
-    """What is found, and what the least-squares matching within stops made of what."""
+def small_run(small: tuple[Rendering, Traverse]) -> tuple[Traverse, Fitted, int]:
+    """What is found, what the least-squares matching within stops made of what, and how much was untied."""
     fitted: Fitted = []
-    original = _refine._refine_pair
+    untied: list[int] = []
+    original, tied = _refine._refine_pair, _steps.Steps.tied
+
+    def counted(
+        steps: _steps.Steps, observations: Observations, feature: np.ndarray
+    ) -> tuple[Observations, list[StopMatching]]:
+        untied.append(len(observations))
+        return tied(steps, observations, feature)
 
     def recorded(
         pair: PairGeometry, spline: Splines, uv_a: FloatArray, uv_b: FloatArray, options: FrontEndOptions
@@ -196,11 +205,12 @@ def small_run(small: tuple[Rendering, Traverse]) -> tuple[Traverse, Fitted]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_refine, "_refine_pair", recorded)
-        return find_observations(small[1], QUICK), fitted
+        patch.setattr(_steps.Steps, "tied", counted)
+        return find_observations(small[1], QUICK), fitted, untied[0]
 
 
 @pytest.fixture(scope="module")
-def small_found(small_run: tuple[Traverse, Fitted]) -> Traverse:
+def small_found(small_run: tuple[Traverse, Fitted, int]) -> Traverse:
     return small_run[0]
 
 
@@ -242,7 +252,7 @@ def test_ties_between_stops_lie_on_the_terrain(
 
 
 def test_least_squares_matching_beats_the_features_own_places(
-    small: tuple[Rendering, Traverse], small_run: tuple[Traverse, Fitted]
+    small: tuple[Rendering, Traverse], small_run: tuple[Traverse, Fitted, int]
 ) -> None:
     rendering, traverse = small
     R, centre = traverse.camera_poses(rendering.truth.world_T_mast, rendering.truth.pan_tilt_rad)
@@ -310,7 +320,9 @@ def test_ties_that_were_found_before_an_interrupt_are_kept(
         )
 
 
-def test_all_that_was_looked_at_is_accounted_for(small_found: Traverse) -> None:
+def test_all_that_was_looked_at_is_accounted_for(
+    small_found: Traverse, small_run: tuple[Traverse, Fitted, int]
+) -> None:
     found = small_found.matching
     assert found is not None
     assert {(s.a, s.b) for s in found.stops} == {(0, 1), (1, 0)}
@@ -325,8 +337,7 @@ def test_all_that_was_looked_at_is_accounted_for(small_found: Traverse) -> None:
     assert sum(p.off_line for p in found.pairs) > 0
     observations = small_found.observations
     assert observations is not None
-    tied = linking(small_found, np.searchsorted(observations.track, observations.track))
-    assert int(tied.sum()) == sum(s.kept for s in found.stops)
+    assert len(observations) - small_run[2] == sum(s.kept for s in found.stops)
 
 
 def test_small_panoramas_place_the_second_stop(
