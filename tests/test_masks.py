@@ -295,16 +295,18 @@ def test_rendered_deck_is_masked(tmp_path: Path) -> None:
         apart = rendering.points(row, uv)[0] - bare.points(row, uv)[0]
         truths.append((np.linalg.norm(apart, axis=1) > 0.05).reshape(size, size))
     masks = find_masks(replace(rendering.traverse, folder=tmp_path))
-    decked = 0
+    found = []
     for deck, mask in zip(truths, masks, strict=True):
         assert isinstance(mask, ImageMask)
         rover = mask.reasons & Reason.ROVER > 0
         if deck.mean() > 0.05:
-            decked += 1
-            assert np.mean(rover[ndimage.binary_erosion(deck, iterations=5)]) > 0.95
+            found.append(np.mean(rover[ndimage.binary_erosion(deck, iterations=5)]))
         # Its shadow's edge may count as well, and is near it.
         assert np.mean(rover[~ndimage.binary_dilation(deck, iterations=30)]) < 0.01
-    assert decked >= 6
+    assert len(found) >= 6
+    assert np.median(found) > 0.98
+    # Straight ahead, ground moves so little in the image that nothing is said of the deck before it.
+    assert min(found) > 0.9
 
 
 def test_options_of_masks_are_checked() -> None:
