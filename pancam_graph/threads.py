@@ -18,6 +18,7 @@ __all__ = ["blas_on_one_thread", "each", "in_order", "in_parallel", "n_workers"]
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 _AHEAD = 2
+"""Items for each worker that `in_order` hands over before their turn."""
 _VARIABLE = "PANCAM_GRAPH_THREADS"
 
 
@@ -62,12 +63,14 @@ def in_parallel(function: Callable[[int, int], None], n: int, *, grain: int) -> 
 
     def drain() -> None:
         was_busy, _THREAD.is_busy = _THREAD.is_busy, workers > 1 or _THREAD.is_busy
-        for i, (begin, end) in waiting:  # drawn under the interpreter's lock: each range once
-            try:
-                function(begin, end)
-            except Exception as error:  # noqa: PERF203  a range is worth far more than a try
-                failed[i] = error  # raised below, in the caller's thread
-        _THREAD.is_busy = was_busy
+        try:
+            for i, (begin, end) in waiting:  # drawn under the interpreter's lock: each range once
+                try:
+                    function(begin, end)
+                except Exception as error:  # noqa: PERF203  a range is worth far more than a try
+                    failed[i] = error  # raised below, in the caller's thread
+        finally:  # an interrupt passes through
+            _THREAD.is_busy = was_busy
 
     # The caller works too: to wake one thread less is a good part of a small range's time.
     others = [_pool(workers).submit(drain) for _ in range(min(workers, len(ranges)) - 1)]

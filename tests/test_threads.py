@@ -134,3 +134,19 @@ def test_two_tasks_run_at_once(monkeypatch) -> None:
     monkeypatch.setenv("PANCAM_GRAPH_THREADS", "2")
     both = threading.Barrier(2, timeout=10)
     assert in_order(lambda _: both.wait() >= 0, range(2)) == [True, True]
+
+
+def test_after_an_interrupt_ranges_are_for_all_threads_again(monkeypatch) -> None:
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", "2")
+    caller, began = threading.current_thread(), threading.Event()
+
+    def interrupted(begin: int, end: int) -> None:
+        if threading.current_thread() is caller:
+            began.set()
+            raise KeyboardInterrupt
+        began.wait(10)
+
+    with pytest.raises(KeyboardInterrupt):
+        in_parallel(interrupted, 1000, grain=1)
+    both = threading.Barrier(2, timeout=10)
+    in_parallel(lambda begin, end: both.wait() and None, 2, grain=1)

@@ -7,7 +7,7 @@ import numpy as np
 
 from pancam_graph.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.images._features import Features
-from pancam_graph.images._match import match_in_windows
+from pancam_graph.images._match import beyond_chance, match_in_windows
 from pancam_graph.images._options import FrontEndOptions
 from pancam_graph.images._pairs import Segments
 from pancam_graph.images._terrain import Sighting, Terrain
@@ -21,7 +21,6 @@ _LEAST_SEEN = 20
 _STEPS_PER_OCTAVE = 2
 _FINAL_STEPS = 6
 _AGREE_SIGMAS = 3.0
-_CHANCE_SIGMAS = 4.0
 _ROUNDS = 2
 
 
@@ -115,9 +114,7 @@ def align_stops(
         distance = whitened_distance(terrain, ties, found.world_T_mast)
         # Wrong matches lie anywhere in their windows: so many would agree by chance.
         chance = np.minimum(1.0, (_AGREE_SIGMAS / half_width) ** 2)
-        expected, spread = float(chance.sum()), float(np.sqrt(np.sum(chance * (1 - chance))))
-        agreeing = np.count_nonzero(distance < _AGREE_SIGMAS)
-        if agreeing < max(options.min_pair_matches, expected + _CHANCE_SIGMAS * spread):
+        if not beyond_chance(distance < _AGREE_SIGMAS, chance, options):
             return Refusal.CHANCE
     return found
 
@@ -136,7 +133,7 @@ def _matched(
     parts, widths = [], []
     for i in ours:
         rows = rows_of[i]
-        own = _chosen(features[i], feature_of[terrain.row[rows]])
+        own = features[i].select(feature_of[terrain.row[rows]])
         for j in theirs:
             seen = terrain.sighting(rows, j, at.world_T_mast)
             radius = _radius_px(terrain, rows, seen, at, options)
@@ -151,7 +148,7 @@ def _matched(
                 magnification=seen.zoom,
                 valid=usable,
             )
-            other = _chosen(features[j], feature_of[terrain.row[rows_of[j]]])
+            other = features[j].select(feature_of[terrain.row[rows_of[j]]])
             matches = match_in_windows(own, other, segments, options)
             parts.append(
                 Ties(
@@ -163,12 +160,6 @@ def _matched(
             )
             widths.append(radius[matches.a])
     return Ties.concatenate(parts), np.concatenate([np.empty(0), *widths])
-
-
-def _chosen(features: Features, rows: IntArray) -> Features:
-    return Features(
-        uv_px=features.uv_px[rows], size_px=features.size_px[rows], descriptor=features.descriptor[rows]
-    )
 
 
 def _radius_px(

@@ -13,7 +13,7 @@ from pancam_graph.images._options import FrontEndOptions
 from pancam_graph.images._pairs import Segments
 from pancam_graph.kernel import compiled
 
-__all__ = ["Matches", "match_in_windows"]
+__all__ = ["Matches", "beyond_chance", "match_in_windows"]
 
 Descriptors: TypeAlias = NDArray[np.uint8]
 
@@ -21,6 +21,7 @@ _CELL_PX = 16.0
 _SAME_PLACE_PX = 3.0
 _SIZE_RATIO = 2.5
 _NONE = np.int64(np.iinfo(np.int64).max)
+_CHANCE_SIGMAS = 4.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,6 +86,13 @@ def match_in_windows(
     found = np.flatnonzero(best >= 0)
     mutual = found[for_b[best[found]] == found]
     return Matches(a=mutual, b=best[mutual], distance=np.sqrt(best_d2[mutual]) / DESCRIPTOR_NORM)
+
+
+def beyond_chance(agrees: BoolArray, chance: FloatArray, options: FrontEndOptions) -> bool:
+    """Whether more matches (n,) agree than would if all were wrong: each then does so by its chance (n,)."""
+    expected, spread = float(chance.sum()), float(np.sqrt(np.sum(chance * (1 - chance))))
+    least = max(options.min_pair_matches, expected + _CHANCE_SIGMAS * spread)
+    return bool(np.count_nonzero(agrees) >= least)
 
 
 def _gridded(uv_px: FloatArray) -> tuple[FloatArray, IntArray, IntArray, IntArray]:

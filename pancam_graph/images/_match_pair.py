@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pancam_graph.geometry import BoolArray, FloatArray
 from pancam_graph.images._features import Features
-from pancam_graph.images._match import Matches, match_in_windows
+from pancam_graph.images._match import Matches, beyond_chance, match_in_windows
 from pancam_graph.images._options import FrontEndOptions
 from pancam_graph.images._pairs import PairGeometry, Segments
 from pancam_graph.images._verify import PairFit, epipolar_px, fit_pair
@@ -18,7 +18,6 @@ from pancam_graph.matching import Refusal
 __all__ = ["PairMatches", "match_pair"]
 
 _TRUE_PX = 1.0
-_CHANCE_SIGMAS = 4.0
 _HORIZON_RAD = np.deg2rad(3.0)
 _DECK_PX = 3.0
 
@@ -72,9 +71,7 @@ def match_pair(
     distance, _ = epipolar_px(pair, fit.p, uv_a, uv_b, options)
     # Wrong matches lie anywhere in their windows: so many would agree by chance.
     chance = np.minimum(1.0, _TRUE_PX * np.hypot(1.0, segments.magnification[matches.a]) / half_width)
-    expected, spread = float(chance.sum()), float(np.sqrt(np.sum(chance * (1 - chance))))
-    agreeing = np.count_nonzero(distance < _TRUE_PX)
-    if agreeing < max(options.min_pair_matches, expected + _CHANCE_SIGMAS * spread):
+    if not beyond_chance(distance < _TRUE_PX, chance, options):
         return _refused(found, Refusal.CHANCE)
 
     segments = pair.segments(features_a.uv_px, fit.p, fit.root, options.guided_slack_px, options)
