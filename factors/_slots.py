@@ -11,7 +11,7 @@ from typing import Any, Literal
 import gtsam
 import numpy as np
 
-from pancam_graph.geometry import FloatArray, IntArray, corrected_poses, correction_twists, pose_arrays
+from pancam_graph.base.geometry import FloatArray, IntArray, corrected_poses, correction_twists, pose_arrays
 
 __all__ = ["Corrected", "Fixed", "Key", "PoseSlot", "Slot", "custom_factor"]
 

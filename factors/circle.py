@@ -14,8 +14,8 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pancam_graph.base.geometry import FloatArray, skew
 from pancam_graph.factors._slots import Slot, custom_factor
-from pancam_graph.geometry import FloatArray, skew
 
 __all__ = ["CircleOffset", "circle_factor", "circle_residual"]
 

@@ -17,8 +17,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from pancam_graph.base.geometry import FloatArray
 from pancam_graph.elimination import LandmarkSystem, Panels, Posture, Root
-from pancam_graph.geometry import FloatArray
 
 __all__ = ["LandmarkBlocks"]
 

@@ -11,8 +11,7 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 
-from pancam_graph.factors._slots import PoseSlot, Slot, custom_factor
-from pancam_graph.geometry import (
+from pancam_graph.base.geometry import (
     FloatArray,
     compose,
     pan_tilt_rotation,
@@ -20,6 +19,7 @@ from pancam_graph.geometry import (
     so3_log,
     so3_right_jacobian_inverse,
 )
+from pancam_graph.factors._slots import PoseSlot, Slot, custom_factor
 
 __all__ = ["mast_factor", "mast_residual"]
 

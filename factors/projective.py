@@ -10,10 +10,10 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 
+from pancam_graph.base.geometry import FloatArray
 from pancam_graph.cameras import CALIBRATION_ENTRIES, Conditioning, projection_tangents, split_projections
 from pancam_graph.factors._slots import PoseSlot, Slot, custom_factor
 from pancam_graph.factors.mast import Pose, mast_residual
-from pancam_graph.geometry import FloatArray
 
 __all__ = ["projective_factor", "projective_residual"]
 

@@ -17,8 +17,8 @@ from benchmarks.cases import CASES, DEFAULT_CASES, chosen_cases
 from benchmarks.engines import ENGINES
 from benchmarks.report import against_baseline, read_baseline, write_baseline
 from benchmarks.running import prepare, run_cases
-from pancam_graph.errors import InputError
-from pancam_graph.program import Parser, run, show_log
+from pancam_graph.base.errors import InputError
+from pancam_graph.cli._program import Parser, run, show_log
 
 BASELINE = Path(__file__).with_name("benchmark_baseline.json")
 

@@ -16,9 +16,10 @@ from pathlib import Path
 from benchmarks.memory import peak_memory_mb
 from benchmarks.steps import Steps
 from pancam_graph import find_observations, read_input, solve
-from pancam_graph.errors import InputError
-from pancam_graph.program import Parser, Progress, run, show_log
-from pancam_graph.threads import n_workers
+from pancam_graph.base.errors import InputError
+from pancam_graph.base.threads import n_workers
+from pancam_graph.cli._program import Parser, Progress, run, show_log
+from pancam_graph.results import write_results
 
 RENDER = Path(__file__).with_name("render_traverse.py")
 
@@ -50,7 +51,7 @@ def main() -> int:
         steps.done("tracks")
         solution = solve(found, on_iteration=progress.iteration)
         steps.done("solve")
-        solution.save(Path(out) / "out")
+        write_results(solution, Path(out) / "out")
         steps.done("results and report")
     print(steps.table())
     wall_s, n = sum(wall for wall, _ in steps.seconds.values()), len(traverse.images)

@@ -16,8 +16,8 @@ from pathlib import Path
 from benchmarks.cases import CASES, chosen_cases, make
 from benchmarks.engines import ENGINES, NotRun, measure, run_module
 from benchmarks.running import prepare
-from pancam_graph.errors import InputError
-from pancam_graph.program import Parser, run, show_log
+from pancam_graph.base.errors import InputError
+from pancam_graph.cli._program import Parser, run, show_log
 
 _ENGINE = "eliminated"
 """Whose compiled code the smoother uses."""

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from pancam_graph import SimulationOptions, SmootherOptions, TraverseSmoother, simulate
-from pancam_graph.incremental import stops_of
-from pancam_graph.program import Parser, Progress, run, show_log
+from pancam_graph.cli._program import Parser, Progress, run, show_log
 from pancam_graph.report import DriveStep, write_drive
 from pancam_graph.rigs import TEMPLATES, rig_template
+from pancam_graph.smoother._incremental import stops_of
 
 
 def main() -> int:

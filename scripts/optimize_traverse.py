@@ -14,15 +14,16 @@ import time
 from dataclasses import replace
 
 from pancam_graph import SolveOptions, cross_validate, find_observations, read_input, solve
-from pancam_graph.images.mosaic import MosaicOptions
-from pancam_graph.incremental import solve_incrementally
-from pancam_graph.io import cache_folder, check_exports, check_out
-from pancam_graph.kernel import must_compile
-from pancam_graph.main_options import add_main_options
-from pancam_graph.program import Parser, Progress, print_summary, resumable, run, show_log
-from pancam_graph.sharing import parse_sharing
-from pancam_graph.solve import COMPILING
-from pancam_graph.stopping import criteria
+from pancam_graph.cli._program import Parser, Progress, print_summary, resumable, run, show_log
+from pancam_graph.cli._refine_options import add_main_options
+from pancam_graph.data._sharing import parse_sharing
+from pancam_graph.images import cache_folder
+from pancam_graph.landmarks.kernel import must_compile
+from pancam_graph.mosaic import MosaicOptions
+from pancam_graph.results import check_exports, check_out, write_results
+from pancam_graph.smoother._incremental import solve_incrementally
+from pancam_graph.solve._solve import COMPILING
+from pancam_graph.solve._stopping import criteria
 
 
 def main() -> int:
@@ -61,7 +62,7 @@ def main() -> int:
         progress.say("writing the results")
         mosaics = MosaicOptions() if arguments.mosaic else None
         results = {"report": not arguments.no_report, "exports": arguments.export, "mosaics": mosaics}
-        solution = solution.save(arguments.out, **results, progress=progress.counted)
+        solution = write_results(solution, arguments.out, **results, progress=progress.counted)
     print_summary(solution, str(arguments.out))
     return 0 if solution.converged else 1
 

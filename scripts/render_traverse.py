@@ -9,10 +9,9 @@ Exit status: 0 written, 2 bad input (nothing is written).
 
 from pathlib import Path
 
-from pancam_graph.drive_program import DriveParser
-from pancam_graph.io import write_rendering
-from pancam_graph.program import Progress, degrees, run
-from pancam_graph.simulate import RenderOptions, render
+from pancam_graph.cli._drive_options import DriveParser
+from pancam_graph.cli._program import Progress, degrees, run
+from pancam_graph.simulate import RenderOptions, render, write_rendering
 
 
 def main() -> int:

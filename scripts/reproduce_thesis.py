@@ -12,8 +12,8 @@ from experiments.figures import require_matplotlib
 from experiments.output import require_new, write_results
 from experiments.registry import FAMILIES, plan
 from experiments.running import run_tasks
-from pancam_graph.errors import InputError
-from pancam_graph.program import Parser, Progress, run, show_log
+from pancam_graph.base.errors import InputError
+from pancam_graph.cli._program import Parser, Progress, run, show_log
 
 
 def main() -> int:

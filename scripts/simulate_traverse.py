@@ -9,10 +9,10 @@ Exit status: 0 written, 2 bad input (nothing is written).
 
 from pathlib import Path
 
-from pancam_graph.drive_program import DriveParser
-from pancam_graph.io import check_new, write_traverse, write_truth
-from pancam_graph.program import run
-from pancam_graph.simulate import SimulationOptions, simulate
+from pancam_graph.cli._drive_options import DriveParser
+from pancam_graph.cli._program import run
+from pancam_graph.io import write_traverse
+from pancam_graph.simulate import SimulationOptions, check_new, simulate, write_truth
 
 
 def main() -> int:

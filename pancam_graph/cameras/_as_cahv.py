@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from pancam_graph.cameras._base import Camera
+from pancam_graph.base.errors import CameraError
+from pancam_graph.cameras._brown import Brown
 from pancam_graph.cameras._cahv import CAHV, CAHVOR
-from pancam_graph.cameras._pinhole import Brown
-from pancam_graph.errors import CameraError
+from pancam_graph.cameras._camera import Camera
 
 __all__ = ["as_cahv"]
 

@@ -11,10 +11,9 @@ import gtsam
 import numpy as np
 from scipy.linalg import rq
 
-from pancam_graph.cameras._base import Camera, Rays, require_finite
-from pancam_graph.cameras._pinhole import Pinhole
-from pancam_graph.errors import CameraError
-from pancam_graph.geometry import BoolArray, FloatArray
+from pancam_graph.base.errors import CameraError
+from pancam_graph.base.geometry import BoolArray, FloatArray
+from pancam_graph.cameras._camera import Camera, Pinhole, Rays, require_finite
 
 __all__ = ["CAHV", "CAHVOR", "CAHVORE", "cahv_of_vectors"]
 

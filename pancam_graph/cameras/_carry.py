@@ -6,8 +6,8 @@ on the same line of sight, and the whitening turns residuals back to pixels of t
 
 import numpy as np
 
-from pancam_graph.cameras._base import Camera
-from pancam_graph.geometry import BoolArray, FloatArray
+from pancam_graph.base.geometry import BoolArray, FloatArray
+from pancam_graph.cameras._camera import Camera
 
 __all__ = ["carry_to_pinhole"]
 

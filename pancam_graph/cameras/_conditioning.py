@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pancam_graph.geometry import FloatArray, IntArray
+from pancam_graph.base.geometry import FloatArray, IntArray
 
 __all__ = ["Conditioning"]
 

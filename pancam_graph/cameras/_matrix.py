@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pancam_graph.errors import CameraError
-from pancam_graph.geometry import FloatArray
+from pancam_graph.base.errors import CameraError
+from pancam_graph.base.geometry import FloatArray
 
 __all__ = [
     "CALIBRATION_ENTRIES",

@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
-from pancam_graph.cameras._base import Camera
+from pancam_graph.base.errors import CameraError
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.cameras._camera import Camera, Pinhole
 from pancam_graph.cameras._carry import carry_to_pinhole
-from pancam_graph.cameras._pinhole import Pinhole
-from pancam_graph.errors import CameraError
-from pancam_graph.geometry import BoolArray, FloatArray, IntArray
 
 __all__ = ["straight_pixels", "straightened", "straightening_map"]
 

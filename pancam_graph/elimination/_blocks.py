@@ -5,9 +5,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from pancam_graph.base.geometry import IntArray
 from pancam_graph.elimination._linkage import Linkage
 from pancam_graph.elimination._panels import Panels
-from pancam_graph.geometry import IntArray
 from pancam_graph.landmarks import Measurements
 
 __all__ = ["Block", "Layout", "blocks_of"]

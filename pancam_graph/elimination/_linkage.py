@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pancam_graph.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.landmarks import CameraViews
 
 __all__ = ["Linkage", "Posture"]

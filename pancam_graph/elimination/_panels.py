@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import blas, lapack
 
-from pancam_graph.errors import SolveError
-from pancam_graph.geometry import FloatArray, IntArray
+from pancam_graph.base.errors import SolveError
+from pancam_graph.base.geometry import FloatArray, IntArray
 
 __all__ = ["Covariance", "FreeDirectionError", "Panels", "Pattern", "Root", "pattern"]
 

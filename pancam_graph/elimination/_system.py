@@ -10,22 +10,23 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pancam_graph import kernel
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.base.threads import in_parallel
 from pancam_graph.elimination._blocks import Block, Layout, blocks_of
 from pancam_graph.elimination._linkage import Linkage, Posture
 from pancam_graph.elimination._panels import Covariance, Panels, pattern
-from pancam_graph.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.landmarks import (
+    SQUARED,
     CameraViews,
     Landmarks,
+    Loss,
     Measurements,
+    kernel,
     over_landmarks,
     rays_of,
     refine,
     triangulate,
 )
-from pancam_graph.losses import SQUARED, Loss
-from pancam_graph.threads import in_parallel
 
 __all__ = ["LandmarkSystem", "Room"]
 

@@ -10,9 +10,7 @@ from functools import cached_property
 import gtsam
 import numpy as np
 
-from pancam_graph.elimination import Covariance, Linkage, Posture
-from pancam_graph.factors import Key
-from pancam_graph.geometry import (
+from pancam_graph.base.geometry import (
     BoolArray,
     FloatArray,
     IntArray,
@@ -21,11 +19,11 @@ from pancam_graph.geometry import (
     pose_arrays,
     twists_in_parent,
 )
+from pancam_graph.data import FIXED, Quantity, Sharing, State, Traverse
+from pancam_graph.elimination import Covariance, Linkage, Posture
+from pancam_graph.factors import Key
 from pancam_graph.graph._template import Factors, FactorTemplate, diagonal_noise
 from pancam_graph.landmarks import CameraViews
-from pancam_graph.sharing import FIXED, Quantity, Sharing
-from pancam_graph.solution import State
-from pancam_graph.traverse import Traverse
 
 __all__ = ["HardTemplate"]
 

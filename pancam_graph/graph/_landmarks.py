@@ -7,12 +7,11 @@ landmarks back from the values that the optimiser found.
 import gtsam
 import numpy as np
 
-from pancam_graph.geometry import BoolArray, FloatArray
+from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.graph._native_calibrations import NativeCalibrations
 from pancam_graph.graph._soft import SoftTemplate
 from pancam_graph.graph._template import read_variable
-from pancam_graph.landmarks import Measurements
-from pancam_graph.losses import SQUARED, Loss
+from pancam_graph.landmarks import SQUARED, Loss, Measurements
 
 __all__ = ["ExplicitLandmarks"]
 

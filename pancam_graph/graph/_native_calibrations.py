@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 from scipy.linalg import null_space
 
-from pancam_graph.geometry import FloatArray, IntArray
+from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.graph._rig_variables import RigVariable, RigVariables
 
 __all__ = ["NativeCalibrations"]

@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from pancam_graph.errors import InputError
+from pancam_graph.base.errors import InputError
 
 __all__ = ["DEFAULT_FLEX", "RIGID", "Flex", "Model", "Tie"]
 

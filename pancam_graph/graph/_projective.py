@@ -8,6 +8,7 @@ how they move with the entries are in closed form, and the factor of P that they
 import gtsam
 import numpy as np
 
+from pancam_graph.base.geometry import FloatArray, IntArray, pose_arrays
 from pancam_graph.cameras import (
     CALIBRATION_ENTRIES,
     Conditioning,
@@ -15,16 +16,13 @@ from pancam_graph.cameras import (
     projection_tangents,
     split_projections,
 )
+from pancam_graph.data import ENTRIES, Refined, RigCorrection, State, Traverse
 from pancam_graph.elimination import Covariance, Posture
 from pancam_graph.factors import Fixed, Key, projective_factor
-from pancam_graph.geometry import FloatArray, IntArray, pose_arrays
 from pancam_graph.graph._options import Flex
 from pancam_graph.graph._soft import SoftTemplate
 from pancam_graph.graph._template import Factors, diagonal_noise
 from pancam_graph.landmarks import CameraViews
-from pancam_graph.sharing import ENTRIES
-from pancam_graph.solution import Refined, RigCorrection, State
-from pancam_graph.traverse import Traverse
 
 __all__ = ["ProjectiveTemplate"]
 

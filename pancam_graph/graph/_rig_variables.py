@@ -12,10 +12,7 @@ from functools import cached_property
 import gtsam
 import numpy as np
 
-from pancam_graph.cameras import CALIBRATION_ENTRIES, Camera
-from pancam_graph.elimination import Covariance, Linkage
-from pancam_graph.factors import Corrected, Fixed, Key, PoseSlot, Slot
-from pancam_graph.geometry import (
+from pancam_graph.base.geometry import (
     BoolArray,
     FloatArray,
     IntArray,
@@ -23,9 +20,20 @@ from pancam_graph.geometry import (
     correction_twists,
     pose_arrays,
 )
-from pancam_graph.sharing import ENTRIES, FOCAL, Freedom, Quantity, Sharing, default_sigma
-from pancam_graph.solution import Refined, RigCorrection
-from pancam_graph.traverse import Traverse
+from pancam_graph.cameras import CALIBRATION_ENTRIES, Camera
+from pancam_graph.data import (
+    ENTRIES,
+    FOCAL,
+    Freedom,
+    Quantity,
+    Refined,
+    RigCorrection,
+    Sharing,
+    Traverse,
+    default_sigma,
+)
+from pancam_graph.elimination import Covariance, Linkage
+from pancam_graph.factors import Corrected, Fixed, Key, PoseSlot, Slot
 
 __all__ = ["RigVariable", "RigVariables"]
 

@@ -10,15 +10,20 @@ from functools import cached_property
 import gtsam
 import numpy as np
 
+from pancam_graph.base.geometry import (
+    FloatArray,
+    IntArray,
+    pan_tilt_from_rotation,
+    pose_arrays,
+    rz,
+    wrap_angle,
+)
+from pancam_graph.data import Sharing, State, Traverse
 from pancam_graph.elimination import Linkage, Posture
 from pancam_graph.factors import CircleOffset, Fixed, Key, Slot, circle_factor, mast_factor
-from pancam_graph.geometry import FloatArray, IntArray, pan_tilt_from_rotation, pose_arrays, rz, wrap_angle
 from pancam_graph.graph._options import Flex, Model
 from pancam_graph.graph._template import Factors, FactorTemplate, diagonal_noise
 from pancam_graph.landmarks import CameraViews
-from pancam_graph.sharing import Sharing
-from pancam_graph.solution import State
-from pancam_graph.traverse import Traverse
 
 __all__ = ["SoftTemplate"]
 

@@ -7,15 +7,13 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from pancam_graph.base.geometry import FloatArray, IntArray
+from pancam_graph.data import Refined, RigCorrection, Sharing, State, Traverse
 from pancam_graph.elimination import Covariance, Linkage, Posture
 from pancam_graph.factors import Fixed, Key, Slot
-from pancam_graph.geometry import FloatArray, IntArray
 from pancam_graph.graph._options import Model
 from pancam_graph.graph._rig_variables import RigVariables
 from pancam_graph.landmarks import CameraViews
-from pancam_graph.sharing import Sharing
-from pancam_graph.solution import Refined, RigCorrection, State
-from pancam_graph.traverse import Traverse
 
 __all__ = ["FactorTemplate", "Factors", "diagonal_noise", "read_variable"]
 

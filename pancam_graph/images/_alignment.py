@@ -5,13 +5,13 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from pancam_graph.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.data import Refusal
 from pancam_graph.images._features import Features
 from pancam_graph.images._match import beyond_chance, match_in_windows
 from pancam_graph.images._options import FrontEndOptions
 from pancam_graph.images._pairs import Segments
 from pancam_graph.images._terrain import Sighting, Terrain
-from pancam_graph.matching import Refusal
 
 __all__ = ["Alignment", "Ties", "align_stops", "fit_pose", "telemetry_alignment", "whitened_distance"]
 

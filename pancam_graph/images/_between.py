@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pancam_graph.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.base.threads import in_parallel
+from pancam_graph.data import Observations, Refusal, StopMatching, Traverse
 from pancam_graph.images._alignment import (
     Alignment,
     Ties,
@@ -23,9 +25,6 @@ from pancam_graph.images._options import FrontEndOptions
 from pancam_graph.images._patches import HALF_WIDTH_PX, MAX_REACH_PX, Coefficients, align_patches
 from pancam_graph.images._splines import Splines
 from pancam_graph.images._terrain import Sighting, Terrain
-from pancam_graph.matching import Refusal, StopMatching
-from pancam_graph.threads import in_parallel
-from pancam_graph.traverse import Observations, Traverse
 
 __all__ = ["StopMatcher", "StopTies", "joined", "near_stops", "on_terrain", "stereo_stops"]
 

@@ -18,8 +18,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from pancam_graph.io._atomic import whole_file
-from pancam_graph.io.cache_folder import begin_cache
+from pancam_graph.base.whole_files import whole_file
+from pancam_graph.images._cache_folder import begin_cache
 
 __all__ = ["Cache", "digest"]
 

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.cameras import Camera
-from pancam_graph.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.images._normalise import normalise, usable_mask
 from pancam_graph.images._options import FrontEndOptions
 

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pancam_graph.errors import InputError
+from pancam_graph.base.errors import InputError
+from pancam_graph.data import Matching, Observations, PairMatching, StopMatching, Traverse
 from pancam_graph.images._cache import Cache
 from pancam_graph.images._masks import ImageMask
 from pancam_graph.images._match import Matches
@@ -15,8 +16,6 @@ from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._read import image_name, listed
 from pancam_graph.images._steps import Progress, Steps
 from pancam_graph.images._tracks import Links, join_tracks, spread_tracks
-from pancam_graph.matching import Matching, PairMatching, StopMatching
-from pancam_graph.traverse import Observations, Traverse
 
 __all__ = ["find_masks", "find_observations"]
 

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pancam_graph.geometry import BoolArray, FloatArray
+from pancam_graph.base.geometry import BoolArray, FloatArray
+from pancam_graph.data import Traverse
 from pancam_graph.images._normalise import usable_mask
 from pancam_graph.images._sky import find_sky
-from pancam_graph.traverse import Traverse
 
 __all__ = ["ImageMask", "Reason", "elevation_rad", "mask_image", "saturated"]
 

@@ -7,11 +7,11 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from pancam_graph.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.images._features import DESCRIPTOR_NORM, Features
 from pancam_graph.images._options import FrontEndOptions
 from pancam_graph.images._pairs import Segments
-from pancam_graph.kernel import compiled
+from pancam_graph.landmarks import compiled
 
 __all__ = ["Matches", "beyond_chance", "match_in_windows"]
 

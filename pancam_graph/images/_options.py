@@ -3,7 +3,7 @@
 from dataclasses import dataclass, fields
 from typing import Literal
 
-from pancam_graph.errors import InputError
+from pancam_graph.base.errors import InputError
 
 __all__ = ["FrontEndOptions"]
 

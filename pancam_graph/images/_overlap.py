@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.cameras import Camera
-from pancam_graph.geometry import BoolArray, FloatArray
+from pancam_graph.data import Traverse
 from pancam_graph.images._options import FrontEndOptions
 from pancam_graph.images._pairs import MAX_TURN_RAD, MAX_ZOOM, PairGeometry, inspected_depths_m
-from pancam_graph.traverse import Traverse
 
 __all__ = ["overlap_cells", "overlapping_pairs"]
 

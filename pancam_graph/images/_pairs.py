@@ -7,10 +7,10 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, compose, pose_arrays
 from pancam_graph.cameras import Camera
-from pancam_graph.geometry import BoolArray, FloatArray, IntArray, compose, pose_arrays
+from pancam_graph.data import Traverse
 from pancam_graph.images._options import FrontEndOptions
-from pancam_graph.traverse import Traverse
 
 __all__ = [
     "FAR_M",

@@ -10,8 +10,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from pancam_graph.geometry import FloatArray, IntArray
-from pancam_graph.kernel import compiled
+from pancam_graph.base.geometry import FloatArray, IntArray
+from pancam_graph.landmarks import compiled
 
 __all__ = ["HALF_WIDTH_PX", "MAX_REACH_PX", "Coefficients", "align_patches"]
 

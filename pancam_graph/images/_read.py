@@ -5,11 +5,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pancam_graph.errors import ImageError, InputError
-from pancam_graph.geometry import BoolArray
-from pancam_graph.io.image_files import GreyImage, left_out, read_eye_content
-from pancam_graph.io.mask_files import mask_file, read_mask
-from pancam_graph.traverse import Traverse
+from pancam_graph.base.errors import ImageError, InputError
+from pancam_graph.base.geometry import BoolArray
+from pancam_graph.data import Traverse
+from pancam_graph.io import GreyImage, left_out, mask_file, read_eye_content, read_mask
 
 __all__ = ["Pictures", "image_name", "listed", "read_pictures"]
 

@@ -2,15 +2,15 @@
 
 import numpy as np
 
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.base.threads import in_parallel
 from pancam_graph.cameras import Camera
-from pancam_graph.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.data import Traverse
 from pancam_graph.images._options import FrontEndOptions
 from pancam_graph.images._pairs import FAR_M, PairGeometry
 from pancam_graph.images._patches import HALF_WIDTH_PX, align_patches
 from pancam_graph.images._splines import Splines
 from pancam_graph.images._verify import epipolar_px
-from pancam_graph.threads import in_parallel
-from pancam_graph.traverse import Traverse
 
 __all__ = ["refine_tracks"]
 

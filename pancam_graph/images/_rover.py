@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pancam_graph.geometry import BoolArray, FloatArray, wrap_angle
+from pancam_graph.base.geometry import BoolArray, FloatArray, wrap_angle
+from pancam_graph.data import Traverse
 from pancam_graph.images._options import FrontEndOptions
 from pancam_graph.images._pairs import MAX_ZOOM, PairGeometry, Relative, move_pixels
-from pancam_graph.traverse import Traverse
 
 __all__ = ["find_rover", "rover_partners"]
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pancam_graph.geometry import BoolArray, FloatArray
+from pancam_graph.base.geometry import BoolArray, FloatArray
 
 __all__ = ["find_sky"]
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from pancam_graph.io.image_files import GreyImage
+from pancam_graph.io import GreyImage
 
 __all__ = ["Splines"]
 

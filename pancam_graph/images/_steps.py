@@ -8,7 +8,9 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from pancam_graph.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.base.threads import in_order
+from pancam_graph.data import Observations, StopMatching, Traverse
 from pancam_graph.images._alignment import Ties
 from pancam_graph.images._between import StopMatcher, StopTies, joined, near_stops, on_terrain, stereo_stops
 from pancam_graph.images._cache import Arrays, Cache, digest
@@ -23,10 +25,7 @@ from pancam_graph.images._refine import refine_tracks
 from pancam_graph.images._rover import find_rover, rover_partners
 from pancam_graph.images._splines import Splines
 from pancam_graph.images._terrain import terrain_arrays, terrain_from
-from pancam_graph.matching import StopMatching
 from pancam_graph.solve import solve
-from pancam_graph.threads import in_order
-from pancam_graph.traverse import Observations, Traverse
 
 __all__ = ["Progress", "Steps"]
 

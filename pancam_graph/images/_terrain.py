@@ -8,10 +8,9 @@ import gtsam
 import numpy as np
 from scipy.spatial import cKDTree
 
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, pose_arrays
 from pancam_graph.cameras import Camera
-from pancam_graph.geometry import BoolArray, FloatArray, IntArray, pose_arrays
-from pancam_graph.solution import Solution
-from pancam_graph.traverse import Observations, Traverse
+from pancam_graph.data import Observations, Solution, Traverse
 
 __all__ = ["Sighting", "Terrain", "terrain_arrays", "terrain_from"]
 

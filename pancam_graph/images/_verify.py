@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pancam_graph.geometry import FloatArray
+from pancam_graph.base.geometry import FloatArray
 from pancam_graph.images._options import FrontEndOptions
 from pancam_graph.images._pairs import FAR_M, PairGeometry, Relative, move_pixels
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pancam_graph.errors import GeometryError
-from pancam_graph.geometry import FloatArray
+from pancam_graph.base.errors import GeometryError
+from pancam_graph.base.geometry import FloatArray
 
 __all__ = ["CircleFit", "fit_circle"]
 

@@ -12,9 +12,9 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pancam_graph.base.errors import CameraError, GeometryError, InputError
+from pancam_graph.base.geometry import FloatArray, IntArray, compose, pose_arrays
 from pancam_graph.cameras import decompose_projection, projection_matrix
-from pancam_graph.errors import CameraError, GeometryError, InputError
-from pancam_graph.geometry import FloatArray, IntArray, compose, pose_arrays
 from pancam_graph.initialise._circle import CircleFit, fit_circle
 from pancam_graph.rigs import Rig
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from pancam_graph.errors import GeometryError, InputError
-from pancam_graph.geometry import FloatArray, IntArray, pose_arrays, wrap_angle
+from pancam_graph.base.errors import GeometryError, InputError
+from pancam_graph.base.geometry import FloatArray, IntArray, pose_arrays, wrap_angle
+from pancam_graph.data import Traverse
 from pancam_graph.initialise._circle import fit_circle
 from pancam_graph.initialise._extract import FreeCameras, extract_free, head_tilt_rad, mast_pan_rad
-from pancam_graph.traverse import Traverse
 
 __all__ = ["Start", "start_from_cameras", "start_from_odometry", "start_from_telemetry"]
 

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import pydantic
 
-from pancam_graph.errors import InputError, PancamGraphError
+from pancam_graph.base.errors import InputError, PancamGraphError
 
 __all__ = ["entry_name", "prefixed", "read_bytes", "read_json", "refused_by_schema", "short", "validated"]
 

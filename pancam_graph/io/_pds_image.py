@@ -6,10 +6,10 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
+from pancam_graph.base.errors import CameraError, GeometryError, InputError
+from pancam_graph.base.geometry import Z_DOWN_R_Z_UP, FloatArray, pose_from_wxyz, rotation_from_wxyz
 from pancam_graph.cameras import CAHV, cahv_of_vectors
-from pancam_graph.errors import CameraError, GeometryError, InputError
-from pancam_graph.geometry import Z_DOWN_R_Z_UP, FloatArray, pose_from_wxyz, rotation_from_wxyz
-from pancam_graph.io.pds_label import LabelGroup, PdsLabel, read_label
+from pancam_graph.io._pds_label import LabelGroup, PdsLabel, read_label
 from pancam_graph.rigs import MARS2020_MAST, MER_MAST, MSL_MAST, MastKinematics
 
 __all__ = ["PMA_GROUPS", "LabelledImage", "read_labelled_image"]

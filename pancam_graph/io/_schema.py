@@ -11,12 +11,12 @@ from typing import Annotated, Any, Literal
 import gtsam
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
 
+from pancam_graph.base.errors import GeometryError, InputError
+from pancam_graph.base.geometry import pose_from_wxyz, wxyz_from_rotation
 from pancam_graph.cameras import CAHV, CAHVOR, CAHVORE, Brown, Camera, Pinhole
-from pancam_graph.errors import GeometryError, InputError
-from pancam_graph.geometry import pose_from_wxyz, wxyz_from_rotation
+from pancam_graph.data import Freedom, Sharing
 from pancam_graph.io._json import prefixed
 from pancam_graph.rigs import Eye, Rig, rig_template
-from pancam_graph.sharing import Freedom, Sharing
 
 __all__ = [
     "MOSAIC_FORMAT",

@@ -5,10 +5,9 @@ from html import escape
 
 import numpy as np
 
-from pancam_graph._honest import CrossValidation, Sigmas
+from pancam_graph.data import CrossValidation, Sigmas, Traverse
 from pancam_graph.report._numbers import fixed
 from pancam_graph.report._tables import table
-from pancam_graph.traverse import Traverse
 
 __all__ = ["cross_validation_section"]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pancam_graph.geometry import FloatArray, pose_arrays
+from pancam_graph.base.geometry import FloatArray, pose_arrays
 from pancam_graph.report._look import AFTER, BEFORE, REJECTED, axis, layout
 from pancam_graph.report._map import ellipse_outlines, translation_covariance_in_world
 from pancam_graph.report._numbers import Json, polyline, rounded

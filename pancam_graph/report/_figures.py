@@ -4,10 +4,10 @@ from html import escape
 
 import numpy as np
 
-from pancam_graph.geometry import FloatArray, wrap_angle
+from pancam_graph.base.geometry import FloatArray, wrap_angle
+from pancam_graph.data import Solution
 from pancam_graph.report._look import AFTER, BEFORE, GRID, INK, MUTED, Figure, axis, layout
 from pancam_graph.report._numbers import Json, fixed, lengths, rounded, short
-from pancam_graph.solution import Solution
 
 __all__ = ["histogram_edges", "make_corrections", "make_histogram"]
 

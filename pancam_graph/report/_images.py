@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pancam_graph.errors import PancamGraphError
-from pancam_graph.geometry import FloatArray, IntArray
+from pancam_graph.base.errors import PancamGraphError
+from pancam_graph.base.geometry import FloatArray, IntArray
+from pancam_graph.data import Solution, rms_px
 from pancam_graph.report._numbers import Json, fixed, lengths, round_factor, rounded, thinned
-from pancam_graph.solution import Solution, rms_px
 
 __all__ = ["ImageResiduals", "choose_images", "image_residuals", "magnification", "picture", "vector_panels"]
 
@@ -86,7 +86,7 @@ def magnification(residuals_px: FloatArray, width_px: int) -> float:
 def picture(path: Path) -> str | None:
     """A small contrast-stretched JPEG of an image file as a data URI; None if it cannot be read."""
     # Imported when needed: the package io saves solutions and calls the report itself.
-    from pancam_graph.io.image_files import read_image  # noqa: PLC0415
+    from pancam_graph.io import read_image  # noqa: PLC0415
 
     try:
         pixels: NDArray[Any] = read_image(path)

@@ -4,12 +4,12 @@ from html import escape
 
 import numpy as np
 
-from pancam_graph.geometry import FloatArray, pose_arrays
+from pancam_graph.base.geometry import FloatArray, pose_arrays
+from pancam_graph.data import Solution
 from pancam_graph.report._look import AFTER, BEFORE, INK, RESIDUAL_SCALE, Figure, axis, layout
 from pancam_graph.report._numbers import Json, decimals_for, polyline, round_factor, rounded, short, thinned
 from pancam_graph.report._scene import near_spacing
 from pancam_graph.report._terrain import Terrain
-from pancam_graph.solution import Solution
 
 __all__ = ["ellipse_outlines", "make_map", "place_labels", "translation_covariance_in_world"]
 

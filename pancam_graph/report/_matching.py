@@ -2,10 +2,9 @@
 
 from html import escape
 
-from pancam_graph.matching import Matching
+from pancam_graph.data import Matching, Traverse
 from pancam_graph.report._numbers import fixed
 from pancam_graph.report._tables import table
-from pancam_graph.traverse import Traverse
 
 __all__ = ["matching_section"]
 

@@ -4,7 +4,7 @@ import base64
 from html import escape
 from itertools import groupby
 
-from pancam_graph.images.mosaic import Blink, WrittenMosaics
+from pancam_graph.mosaic import Blink, WrittenMosaics
 
 __all__ = ["mosaic_section"]
 

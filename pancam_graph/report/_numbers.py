@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pancam_graph.geometry import FloatArray, IntArray
+from pancam_graph.base.geometry import FloatArray, IntArray
 
 __all__ = [
     "Json",

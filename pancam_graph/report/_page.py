@@ -3,7 +3,8 @@
 import json
 from html import escape
 
-from pancam_graph.images.mosaic import WrittenMosaics
+from pancam_graph.data import Solution
+from pancam_graph.mosaic import WrittenMosaics
 from pancam_graph.report._cross_validation import cross_validation_section
 from pancam_graph.report._figures import make_corrections, make_histogram
 from pancam_graph.report._images import image_residuals, vector_panels
@@ -19,7 +20,6 @@ from pancam_graph.report._style import STYLE
 from pancam_graph.report._tables import image_table, observation_table, rig_table, stop_table
 from pancam_graph.report._template import NO_VECTORS, PAGE, RIG, SCENE_CONTROLS, VECTOR_CONTROLS
 from pancam_graph.report._terrain import make_terrain
-from pancam_graph.solution import Solution
 
 __all__ = ["headline", "lead", "make_page"]
 

@@ -5,12 +5,12 @@ from html import escape
 
 import numpy as np
 
-from pancam_graph.geometry import FloatArray, IntArray, pose_arrays
+from pancam_graph.base.geometry import FloatArray, IntArray, pose_arrays
+from pancam_graph.data import Solution
 from pancam_graph.report._look import EYES, GRID, INK, RESIDUAL_SCALE, Figure, layout
 from pancam_graph.report._numbers import Json, decimals_for, polyline, round_factor, rounded, short, thinned
 from pancam_graph.report._terrain import Terrain
 from pancam_graph.rigs import Rig
-from pancam_graph.solution import Solution
 
 __all__ = ["Masts", "eye_circles", "frustums", "label_stops", "make_masts", "make_scene", "near_spacing"]
 

@@ -6,11 +6,11 @@ from html import escape
 import gtsam
 import numpy as np
 
-from pancam_graph.geometry import pose_arrays
+from pancam_graph.base.geometry import pose_arrays
+from pancam_graph.data import Solution
 from pancam_graph.report._images import ImageResiduals
 from pancam_graph.report._map import translation_covariance_in_world
 from pancam_graph.report._numbers import fixed
-from pancam_graph.solution import Solution
 
 __all__ = ["image_table", "observation_table", "rig_table", "stop_table", "table"]
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pancam_graph.geometry import FloatArray, IntArray, pose_arrays
-from pancam_graph.solution import Solution
+from pancam_graph.base.geometry import FloatArray, IntArray, pose_arrays
+from pancam_graph.data import Solution
 
 __all__ = ["Terrain", "landmark_residuals", "make_terrain"]
 

@@ -1,10 +1,5 @@
 """Mast rigs: the pan-tilt chain, its eyes, and the templates that ship."""
 
-from pancam_graph.rigs._fit import RigFit as RigFit
-from pancam_graph.rigs._fit import fit_rig as fit_rig
-from pancam_graph.rigs._fit_system import ReferenceSigma as ReferenceSigma
-from pancam_graph.rigs._fit_system import RigFitOptions as RigFitOptions
-from pancam_graph.rigs._free_directions import FreeDirection as FreeDirection
 from pancam_graph.rigs._mars2020 import mars2020_mastcam_z as mars2020_mastcam_z
 from pancam_graph.rigs._mars2020 import mars2020_navcam as mars2020_navcam
 from pancam_graph.rigs._masts import MARS2020_MAST as MARS2020_MAST
@@ -24,3 +19,8 @@ from pancam_graph.rigs._templates import exomars_pancam as exomars_pancam
 from pancam_graph.rigs._templates import mer_navcam as mer_navcam
 from pancam_graph.rigs._templates import mer_pancam as mer_pancam
 from pancam_graph.rigs._templates import rig_template as rig_template
+from pancam_graph.rigs.fit._fit import RigFit as RigFit
+from pancam_graph.rigs.fit._fit import fit_rig as fit_rig
+from pancam_graph.rigs.fit._free_directions import FreeDirection as FreeDirection
+from pancam_graph.rigs.fit._system import ReferenceSigma as ReferenceSigma
+from pancam_graph.rigs.fit._system import RigFitOptions as RigFitOptions

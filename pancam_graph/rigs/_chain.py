@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pancam_graph.geometry import (
+from pancam_graph.base.geometry import (
     FloatArray,
     IntArray,
     compose,

@@ -5,8 +5,8 @@ from functools import partial
 
 import numpy as np
 
+from pancam_graph.base.errors import InputError
 from pancam_graph.cameras import CAHVOR, CAHVORE
-from pancam_graph.errors import InputError
 from pancam_graph.rigs._masts import MARS2020_MAST
 from pancam_graph.rigs._rig import Rig
 from pancam_graph.rigs._rover_eyes import document_eye, mast_rig

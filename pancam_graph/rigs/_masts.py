@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from pancam_graph.geometry import Z_DOWN_R_Z_UP, FloatArray, ry, rz
+from pancam_graph.base.geometry import Z_DOWN_R_Z_UP, FloatArray, ry, rz
 from pancam_graph.rigs._rig import PointingSigma
 
 __all__ = ["MARS2020_MAST", "MER_MAST", "MSL_MAST", "MastKinematics"]

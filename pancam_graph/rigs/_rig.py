@@ -6,9 +6,9 @@ from functools import cached_property
 import gtsam
 import numpy as np
 
+from pancam_graph.base.errors import InputError
+from pancam_graph.base.geometry import FloatArray, IntArray, compose, pan_tilt_rotation, pose_arrays
 from pancam_graph.cameras import CAHV, Camera, Pinhole
-from pancam_graph.errors import InputError
-from pancam_graph.geometry import FloatArray, IntArray, compose, pan_tilt_rotation, pose_arrays
 
 __all__ = ["Eye", "PointingSigma", "Rig"]
 

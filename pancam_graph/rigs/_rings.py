@@ -3,8 +3,8 @@
 import gtsam
 import numpy as np
 
+from pancam_graph.base.geometry import HEAD_R_FORWARD_CAMERA, FloatArray, rz
 from pancam_graph.cameras import Pinhole
-from pancam_graph.geometry import HEAD_R_FORWARD_CAMERA, FloatArray, rz
 from pancam_graph.rigs._rig import Eye, PointingSigma, Rig
 
 __all__ = ["ladybug3", "ladybug5"]

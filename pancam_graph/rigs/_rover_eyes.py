@@ -3,8 +3,8 @@
 import gtsam
 import numpy as np
 
+from pancam_graph.base.geometry import Z_DOWN_R_Z_UP
 from pancam_graph.cameras import CAHV
-from pancam_graph.geometry import Z_DOWN_R_Z_UP
 from pancam_graph.rigs._masts import MastKinematics
 from pancam_graph.rigs._rig import Eye, Rig
 

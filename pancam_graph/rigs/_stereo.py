@@ -3,9 +3,9 @@
 import gtsam
 import numpy as np
 
+from pancam_graph.base.errors import InputError
+from pancam_graph.base.geometry import HEAD_R_FORWARD_CAMERA, rz
 from pancam_graph.cameras import Pinhole
-from pancam_graph.errors import InputError
-from pancam_graph.geometry import HEAD_R_FORWARD_CAMERA, rz
 from pancam_graph.rigs._rig import Eye, PointingSigma, Rig
 
 __all__ = ["stereo_pan_tilt"]

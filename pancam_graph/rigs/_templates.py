@@ -9,9 +9,9 @@ from collections.abc import Callable
 import gtsam
 import numpy as np
 
+from pancam_graph.base.errors import InputError
+from pancam_graph.base.geometry import HEAD_R_FORWARD_CAMERA, FloatArray, rz
 from pancam_graph.cameras import Pinhole
-from pancam_graph.errors import InputError
-from pancam_graph.geometry import HEAD_R_FORWARD_CAMERA, FloatArray, rz
 from pancam_graph.rigs._mars2020 import MASTCAM_Z_TEMPLATES, mars2020_navcam
 from pancam_graph.rigs._msl import msl_mastcam, msl_navcam
 from pancam_graph.rigs._rig import Eye, PointingSigma, Rig

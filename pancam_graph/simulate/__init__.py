@@ -2,6 +2,9 @@
 
 from pancam_graph.simulate._drive import TelemetryStart as TelemetryStart
 from pancam_graph.simulate._drive import Truth as Truth
+from pancam_graph.simulate._folder import check_new as check_new
+from pancam_graph.simulate._folder import write_rendering as write_rendering
+from pancam_graph.simulate._folder import write_truth as write_truth
 from pancam_graph.simulate._options import DriveOptions as DriveOptions
 from pancam_graph.simulate._options import RenderOptions as RenderOptions
 from pancam_graph.simulate._options import SimulationOptions as SimulationOptions

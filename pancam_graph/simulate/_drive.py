@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from pancam_graph.base.geometry import BoolArray, FloatArray, rz, wrap_angle
 from pancam_graph.cameras import Camera
-from pancam_graph.geometry import BoolArray, FloatArray, rz, wrap_angle
+from pancam_graph.data import Frame, Image, Observations, Stop, Traverse
 from pancam_graph.rigs import Rig
 from pancam_graph.simulate._options import DriveOptions
 from pancam_graph.simulate._wrong_rig import wrong_rig
-from pancam_graph.traverse import Frame, Image, Observations, Stop, Traverse
 
 __all__ = [
     "TelemetryStart",

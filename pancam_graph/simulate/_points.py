@@ -9,9 +9,10 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
+from pancam_graph.base.errors import InputError
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, compose, pose_arrays
 from pancam_graph.cameras import Camera
-from pancam_graph.errors import InputError
-from pancam_graph.geometry import BoolArray, FloatArray, IntArray, compose, pose_arrays
+from pancam_graph.data import Observations, Traverse
 from pancam_graph.rigs import Rig
 from pancam_graph.simulate._drive import (
     TelemetryStart,
@@ -25,7 +26,6 @@ from pancam_graph.simulate._drive import (
 )
 from pancam_graph.simulate._options import SimulationOptions
 from pancam_graph.simulate._terrain import Terrain
-from pancam_graph.traverse import Observations, Traverse
 
 __all__ = ["PointsTruth", "Simulation", "simulate"]
 

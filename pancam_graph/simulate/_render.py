@@ -5,8 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pancam_graph.errors import InputError
-from pancam_graph.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.base.errors import InputError
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.base.threads import in_parallel
+from pancam_graph.data import Traverse
 from pancam_graph.rigs import Rig
 from pancam_graph.simulate import _rays
 from pancam_graph.simulate._drive import (
@@ -23,8 +25,6 @@ from pancam_graph.simulate._options import RenderOptions
 from pancam_graph.simulate._rays import Deck, Scene
 from pancam_graph.simulate._scene import make_deck, make_scene, slopes
 from pancam_graph.simulate._sensor import HALO_PX, GreyImage, expose
-from pancam_graph.threads import in_parallel
-from pancam_graph.traverse import Traverse
 
 __all__ = ["Rendering", "render"]
 

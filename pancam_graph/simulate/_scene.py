@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import affine_transform, shift
 from scipy.spatial.transform import Rotation
 
-from pancam_graph.geometry import FloatArray, IntArray
+from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.simulate import _rays
 from pancam_graph.simulate._options import RenderOptions
 from pancam_graph.simulate._rays import Deck, Grids, Scene, heights

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pancam_graph.geometry import BoolArray, FloatArray
+from pancam_graph.base.geometry import BoolArray, FloatArray
 
 __all__ = ["Terrain"]
 

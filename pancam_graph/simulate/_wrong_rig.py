@@ -5,7 +5,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from pancam_graph.geometry import corrected_poses, rz
+from pancam_graph.base.geometry import corrected_poses, rz
 from pancam_graph.rigs import Rig
 
 __all__ = ["wrong_rig"]

@@ -1,5 +1,7 @@
 """The drive followed stop by stop: iSAM2 on masts, angles and the rig, landmarks eliminated in blocks."""
 
+from pancam_graph.smoother._file import load_smoother as load_smoother
+from pancam_graph.smoother._file import save_smoother as save_smoother
 from pancam_graph.smoother._options import Closure as Closure
 from pancam_graph.smoother._options import Estimate as Estimate
 from pancam_graph.smoother._options import SmootherOptions as SmootherOptions

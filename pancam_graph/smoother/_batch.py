@@ -5,13 +5,11 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from pancam_graph._eliminated import EliminatedSolver
-from pancam_graph._problem import Problem
+from pancam_graph.data import Traverse
 from pancam_graph.graph import HardTemplate
 from pancam_graph.landmarks import Landmarks
 from pancam_graph.smoother._map import DriveMap
-from pancam_graph.stopping import StopRule
-from pancam_graph.traverse import Traverse
+from pancam_graph.solve import EliminatedSolver, Problem, StopRule
 
 __all__ = ["solved_anew", "whole_problem", "whole_traverse"]
 

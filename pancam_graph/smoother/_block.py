@@ -10,8 +10,8 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
+from pancam_graph.base.geometry import FloatArray
 from pancam_graph.elimination import LandmarkSystem, Panels, Room
-from pancam_graph.geometry import FloatArray
 from pancam_graph.graph import read_variable
 from pancam_graph.landmarks import Landmarks
 from pancam_graph.smoother._frame import CommonMotion, carried, posture_in

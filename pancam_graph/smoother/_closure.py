@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 from scipy.special import chdtrc, chdtri, erfcinv
 
-from pancam_graph.geometry import FloatArray, IntArray
+from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.smoother._localise import localise
 from pancam_graph.smoother._map import DriveMap
 from pancam_graph.smoother._options import Closure, SmootherOptions

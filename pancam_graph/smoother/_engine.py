@@ -6,14 +6,14 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from pancam_graph.geometry import FloatArray
+from pancam_graph.base.geometry import FloatArray
+from pancam_graph.base.threads import each
 from pancam_graph.smoother._batch import solved_anew
 from pancam_graph.smoother._frame import orthonormal
 from pancam_graph.smoother._map import Change, DriveMap
 from pancam_graph.smoother._options import SmootherOptions
 from pancam_graph.smoother._station import Postures, Station
 from pancam_graph.smoother._tree import Tree
-from pancam_graph.threads import each
 
 __all__ = ["Engine", "Rounds"]
 

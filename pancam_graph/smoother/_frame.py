@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 
+from pancam_graph.base.geometry import FloatArray
 from pancam_graph.elimination import Posture
-from pancam_graph.geometry import FloatArray
 from pancam_graph.landmarks import CameraViews, Landmarks
 
 __all__ = ["CommonMotion", "carried", "orthonormal", "posture_in"]

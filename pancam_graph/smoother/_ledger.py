@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pancam_graph.geometry import BoolArray, FloatArray, IntArray
-from pancam_graph.traverse import Observations
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.data import Observations
 
 __all__ = ["Fate", "Ledger"]
 

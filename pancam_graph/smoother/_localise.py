@@ -6,16 +6,14 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from pancam_graph._optimise import InOrder, OnGraph, optimise, parameters_of
+from pancam_graph.base.geometry import FloatArray
 from pancam_graph.elimination import LandmarkSystem, Posture
 from pancam_graph.factors import LandmarkBlocks
-from pancam_graph.geometry import FloatArray
 from pancam_graph.graph import read_variable
-from pancam_graph.landmarks import residuals
-from pancam_graph.losses import loss_of
+from pancam_graph.landmarks import loss_of, residuals
 from pancam_graph.smoother._placing import Seen, placed_anew
 from pancam_graph.smoother._station import Postures, Station, copied
-from pancam_graph.stopping import StopRule
+from pancam_graph.solve import InOrder, OnGraph, StopRule, optimise, parameters_of
 
 __all__ = ["Located", "localise"]
 

@@ -6,15 +6,15 @@ from dataclasses import dataclass, field, replace
 import gtsam
 import numpy as np
 
+from pancam_graph.base.geometry import BoolArray, IntArray
+from pancam_graph.base.threads import each
 from pancam_graph.elimination import Room
-from pancam_graph.geometry import BoolArray, IntArray
 from pancam_graph.landmarks import Landmarks, residuals
 from pancam_graph.smoother._block import LandmarkBlock
 from pancam_graph.smoother._ledger import Fate, Ledger
 from pancam_graph.smoother._placing import Placed, Seen, believed, combined, gathered, placed_anew
 from pancam_graph.smoother._sets import distinct
 from pancam_graph.smoother._station import Patch, Postures, Station
-from pancam_graph.threads import each
 
 __all__ = ["Change", "DriveMap"]
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pancam_graph.geometry import IntArray
+from pancam_graph.base.geometry import IntArray
 from pancam_graph.smoother._ledger import Fate
 from pancam_graph.smoother._map import DriveMap
 from pancam_graph.smoother._placing import Seen

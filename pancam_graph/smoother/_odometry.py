@@ -2,7 +2,7 @@
 
 import gtsam
 
-from pancam_graph.errors import InputError
+from pancam_graph.base.errors import InputError
 from pancam_graph.smoother._frame import orthonormal
 from pancam_graph.smoother._station import Station, copied
 

@@ -6,9 +6,9 @@ from typing import Literal
 import gtsam
 import numpy as np
 
-from pancam_graph.errors import InputError
-from pancam_graph.geometry import FloatArray
-from pancam_graph.sharing import Sharing
+from pancam_graph.base.errors import InputError
+from pancam_graph.base.geometry import FloatArray
+from pancam_graph.data import Sharing
 
 __all__ = ["Closure", "Estimate", "SmootherOptions", "Update"]
 

@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtri, erfc
 
-from pancam_graph._rejection import screen
-from pancam_graph.geometry import BoolArray, IntArray
+from pancam_graph.base.geometry import BoolArray, IntArray
 from pancam_graph.landmarks import (
     CameraViews,
     Landmarks,
@@ -20,6 +19,7 @@ from pancam_graph.landmarks import (
 from pancam_graph.smoother._ledger import Fate, Ledger
 from pancam_graph.smoother._sets import distinct
 from pancam_graph.smoother._station import Patch
+from pancam_graph.solve import screen
 
 __all__ = ["Placed", "Seen", "believed", "combined", "gathered", "placed_anew"]
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pancam_graph.geometry import IntArray
+from pancam_graph.base.geometry import IntArray
 
 __all__ = ["distinct"]
 

@@ -7,12 +7,13 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
+from pancam_graph.base.errors import InputError
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.base.threads import blas_on_one_thread
 from pancam_graph.cameras import carry_to_pinhole
-from pancam_graph.errors import InputError
-from pancam_graph.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.data import Frame, Image, Observations, Sharing, Stop, Traverse
 from pancam_graph.landmarks import Landmarks
 from pancam_graph.rigs import Rig
-from pancam_graph.sharing import Sharing
 from pancam_graph.smoother._batch import whole_traverse
 from pancam_graph.smoother._closure import bridge, judged, loops
 from pancam_graph.smoother._engine import Engine, Rounds
@@ -25,8 +26,6 @@ from pancam_graph.smoother._options import Closure, Estimate, SmootherOptions, U
 from pancam_graph.smoother._state import SmootherState, state_of
 from pancam_graph.smoother._station import Postures, Station, copied
 from pancam_graph.smoother._warnings import warnings_of
-from pancam_graph.threads import blas_on_one_thread
-from pancam_graph.traverse import Frame, Image, Observations, Stop, Traverse
 
 __all__ = ["TraverseSmoother"]
 
@@ -407,13 +406,13 @@ class TraverseSmoother:
 
         Raises InputError where there is nothing to keep or the file cannot be written.
         """
-        from pancam_graph.io import save_smoother  # noqa: PLC0415  io imports this module
+        from pancam_graph.smoother._file import save_smoother  # noqa: PLC0415  io imports this module
 
         save_smoother(self.state(), Path(path))
 
     @staticmethod
     def load(path: Path | str) -> "TraverseSmoother":
         """A smoother as it was saved. Raises InputError for a file of another version or a damaged one."""
-        from pancam_graph.io import load_smoother  # noqa: PLC0415  io imports this module
+        from pancam_graph.smoother._file import load_smoother  # noqa: PLC0415  io imports this module
 
         return TraverseSmoother.of(load_smoother(Path(path)))

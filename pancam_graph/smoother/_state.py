@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from pancam_graph.geometry import FloatArray, IntArray
+from pancam_graph.base.geometry import FloatArray, IntArray
+from pancam_graph.data import Traverse
 from pancam_graph.graph import read_variable
 from pancam_graph.smoother._batch import whole_traverse
 from pancam_graph.smoother._map import DriveMap
 from pancam_graph.smoother._options import SmootherOptions
-from pancam_graph.traverse import Traverse
 
 __all__ = ["SmootherState", "state_of"]
 

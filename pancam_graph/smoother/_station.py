@@ -6,14 +6,12 @@ from functools import cached_property
 import gtsam
 import numpy as np
 
+from pancam_graph.base.geometry import FloatArray, IntArray
+from pancam_graph.data import Sharing, State, Traverse
 from pancam_graph.elimination import Linkage, Posture
 from pancam_graph.factors import Key
-from pancam_graph.geometry import FloatArray, IntArray
 from pancam_graph.graph import HardTemplate, diagonal_noise, read_variable
 from pancam_graph.landmarks import CameraViews
-from pancam_graph.sharing import Sharing
-from pancam_graph.solution import State
-from pancam_graph.traverse import Traverse
 
 __all__ = ["Patch", "Postures", "Station", "copied"]
 

@@ -5,8 +5,8 @@ from collections.abc import Iterable, Sequence
 import gtsam
 import numpy as np
 
-from pancam_graph.errors import SolveError
-from pancam_graph.geometry import FloatArray
+from pancam_graph.base.errors import SolveError
+from pancam_graph.base.geometry import FloatArray
 
 __all__ = ["Tree"]
 

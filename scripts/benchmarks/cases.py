@@ -7,8 +7,8 @@ import numpy as np
 
 from benchmarks.peer import write_peer
 from pancam_graph import SimulationOptions, simulate, write_traverse
-from pancam_graph.errors import InputError
-from pancam_graph.geometry import IntArray
+from pancam_graph.base.errors import InputError
+from pancam_graph.base.geometry import IntArray
 from pancam_graph.rigs import mer_navcam
 
 __all__ = ["CASES", "DEFAULT_CASES", "GROWTH", "Case", "Files", "Size", "chosen_cases", "make"]

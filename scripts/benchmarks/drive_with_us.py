@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from pancam_graph import SolveOptions, read_traverse, solve
-from pancam_graph.incremental import stops_of
-from pancam_graph.program import run
+from pancam_graph.cli._program import run
+from pancam_graph.data import Traverse
 from pancam_graph.smoother import TraverseSmoother, Update
-from pancam_graph.traverse import Traverse
+from pancam_graph.smoother._incremental import stops_of
 
 
 def main() -> int:

@@ -6,9 +6,9 @@ import gtsam
 import numpy as np
 
 from pancam_graph import Traverse
+from pancam_graph.base.errors import InputError
+from pancam_graph.base.geometry import HEAD_R_FORWARD_CAMERA, FloatArray, rz, wxyz_from_rotation
 from pancam_graph.cameras import Pinhole
-from pancam_graph.errors import InputError
-from pancam_graph.geometry import HEAD_R_FORWARD_CAMERA, FloatArray, rz, wxyz_from_rotation
 from pancam_graph.rigs import Rig
 
 __all__ = ["write_peer"]

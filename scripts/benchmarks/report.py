@@ -11,7 +11,7 @@ from pathlib import Path
 
 from benchmarks.cases import GROWTH, Size
 from benchmarks.engines import ENGINES, Measured, NotRun
-from pancam_graph.errors import InputError
+from pancam_graph.base.errors import InputError
 
 __all__ = [
     "GROWTH_LIMIT",

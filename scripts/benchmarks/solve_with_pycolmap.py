@@ -15,8 +15,8 @@ import pycolmap
 
 from benchmarks.memory import peak_memory_mb
 from pancam_graph import Traverse, read_traverse
-from pancam_graph.geometry import FloatArray
-from pancam_graph.program import run
+from pancam_graph.base.geometry import FloatArray
+from pancam_graph.cli._program import run
 
 _FUNCTION_TOLERANCE = 1e-6
 

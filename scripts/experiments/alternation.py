@@ -6,9 +6,9 @@ from experiments.models import variant
 from experiments.running import Sample
 from experiments.scenarios import Scenario
 from pancam_graph import Traverse, solve
-from pancam_graph.errors import PancamGraphError
+from pancam_graph.base.errors import PancamGraphError
 from pancam_graph.graph import Model
-from pancam_graph.options import Method
+from pancam_graph.solve._options import Method
 
 __all__ = ["NAME", "STEPS", "AlternationTask"]
 

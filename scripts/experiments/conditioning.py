@@ -9,7 +9,7 @@ from experiments.models import variant
 from experiments.running import Sample, attempt
 from experiments.scenarios import Scenario
 from pancam_graph import Traverse, solve
-from pancam_graph.errors import SolveError
+from pancam_graph.base.errors import SolveError
 
 __all__ = ["ORIGINS_M", "ConditioningTask", "name_of"]
 

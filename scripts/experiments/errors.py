@@ -12,7 +12,7 @@ from itertools import combinations
 import numpy as np
 
 from pancam_graph import Solution, Traverse
-from pancam_graph.geometry import FloatArray
+from pancam_graph.base.geometry import FloatArray
 from pancam_graph.simulate import Simulation
 
 __all__ = [

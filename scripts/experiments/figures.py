@@ -12,7 +12,7 @@ from experiments.opportunity import NAME as OPPORTUNITY
 from experiments.registry import CLUSTERS, PANORAMAS, TRAVERSES
 from experiments.running import Row
 from experiments.verdicts import Results
-from pancam_graph.errors import InputError
+from pancam_graph.base.errors import InputError
 
 __all__ = ["draw", "require_matplotlib"]
 

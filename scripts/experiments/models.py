@@ -7,12 +7,12 @@ from experiments.predicted import predicted_errors
 from experiments.running import Sample, attempt
 from experiments.scenarios import Scenario
 from pancam_graph import Solution, SolveOptions
-from pancam_graph._adjustment import Adjustment
-from pancam_graph.errors import SolveError
+from pancam_graph.base.errors import SolveError
+from pancam_graph.base.threads import blas_on_one_thread
+from pancam_graph.data import Freedom, Sharing
 from pancam_graph.graph import Flex, Model
-from pancam_graph.sharing import Freedom, Sharing
 from pancam_graph.simulate import Simulation
-from pancam_graph.threads import blas_on_one_thread
+from pancam_graph.solve import Adjustment
 
 __all__ = ["FREE_FLEX", "KNOWN_RIG", "RIG_OFF", "ClusterTask", "Variant", "variant"]
 

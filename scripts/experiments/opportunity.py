@@ -16,8 +16,8 @@ from pancam_graph import (
     read_input,
     solve,
 )
-from pancam_graph._honest import Splitting
-from pancam_graph.geometry import FloatArray, pose_arrays
+from pancam_graph.base.geometry import FloatArray, pose_arrays
+from pancam_graph.data import Splitting
 from pancam_graph.graph import Model
 
 __all__ = ["NAME", "OpportunityTask", "opportunity_folder"]

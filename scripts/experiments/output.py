@@ -9,7 +9,7 @@ from experiments.figures import draw
 from experiments.running import Sample, summarise
 from experiments.tables import results_text
 from experiments.verdicts import Results, Verdict, verdicts
-from pancam_graph.errors import InputError
+from pancam_graph.base.errors import InputError
 
 __all__ = ["require_new", "write_results"]
 

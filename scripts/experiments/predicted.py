@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from experiments.errors import aligned_centres, distances_percent
-from pancam_graph._adjustment import Adjustment
-from pancam_graph._joint import retracted
-from pancam_graph.geometry import FloatArray
+from pancam_graph.base.geometry import FloatArray
+from pancam_graph.solve import Adjustment
+from pancam_graph.solve._joint import retracted
 
 __all__ = ["DRAWS", "predicted_errors"]
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from pancam_graph.errors import PancamGraphError
+from pancam_graph.base.errors import PancamGraphError
 
 __all__ = ["Row", "Sample", "Task", "attempt", "quantile", "run_tasks", "summarise"]
 

@@ -5,8 +5,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pancam_graph.geometry import FloatArray
-from pancam_graph.kernel import compiled
+from pancam_graph.base.geometry import FloatArray
+from pancam_graph.landmarks import compiled
 from pancam_graph.simulate._rays._compiling import SOURCES, part
 from pancam_graph.simulate._rays._world import Grids
 

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 
-from pancam_graph.geometry import FloatArray, IntArray
+from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.simulate._rays._compiling import SOURCES, entry, inlined
 from pancam_graph.simulate._rays._deck import RIM_M, hit_deck, panel
 from pancam_graph.simulate._rays._ground import NEAREST_M, height_at, level_at, march, march_start, sample

@@ -2,7 +2,7 @@
 
 import math
 
-from pancam_graph.geometry import FloatArray
+from pancam_graph.base.geometry import FloatArray
 from pancam_graph.simulate._rays._compiling import inlined, part
 from pancam_graph.simulate._rays._world import Scene
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pancam_graph.geometry import FloatArray, IntArray
+from pancam_graph.base.geometry import FloatArray, IntArray
 
 __all__ = ["ALBEDO", "CHANNELS", "OUTCROP", "SHADE", "SLOPE_X", "SLOPE_Y", "Deck", "Grids", "Scene"]
 

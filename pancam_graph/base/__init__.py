@@ -1,0 +1,1 @@
+"""The ground: errors, geometry, threads, files that appear whole, compiled code kept on disk."""

@@ -1,0 +1,1 @@
+"""The `pancam-graph` command."""

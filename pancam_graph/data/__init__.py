@@ -1,0 +1,31 @@
+"""The data model: what is known of a traverse, and what an adjustment found."""
+
+from pancam_graph.data._cross_validation import CrossValidation as CrossValidation
+from pancam_graph.data._cross_validation import HalfScore as HalfScore
+from pancam_graph.data._cross_validation import Sigmas as Sigmas
+from pancam_graph.data._cross_validation import Splitting as Splitting
+from pancam_graph.data._cross_validation import Spread as Spread
+from pancam_graph.data._matching import Matching as Matching
+from pancam_graph.data._matching import PairMatching as PairMatching
+from pancam_graph.data._matching import Refusal as Refusal
+from pancam_graph.data._matching import StopMatching as StopMatching
+from pancam_graph.data._noise import mean_sigma_px as mean_sigma_px
+from pancam_graph.data._sharing import ENTRIES as ENTRIES
+from pancam_graph.data._sharing import FIXED as FIXED
+from pancam_graph.data._sharing import FOCAL as FOCAL
+from pancam_graph.data._sharing import Freedom as Freedom
+from pancam_graph.data._sharing import Quantity as Quantity
+from pancam_graph.data._sharing import Sharing as Sharing
+from pancam_graph.data._sharing import default_sigma as default_sigma
+from pancam_graph.data._solution import Incremental as Incremental
+from pancam_graph.data._solution import Refined as Refined
+from pancam_graph.data._solution import RigCorrection as RigCorrection
+from pancam_graph.data._solution import Seconds as Seconds
+from pancam_graph.data._solution import Solution as Solution
+from pancam_graph.data._solution import State as State
+from pancam_graph.data._solution import rms_px as rms_px
+from pancam_graph.data._traverse import Frame as Frame
+from pancam_graph.data._traverse import Image as Image
+from pancam_graph.data._traverse import Observations as Observations
+from pancam_graph.data._traverse import Stop as Stop
+from pancam_graph.data._traverse import Traverse as Traverse

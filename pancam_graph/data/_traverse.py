@@ -1,0 +1,323 @@
+"""The data model: stops, frames, images and observations of a rover traverse.
+
+A stop is one place of the mast, a frame one pointing of the head, an image one eye's picture of a
+frame, a track one terrain point seen in several images.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pancam_graph.base.errors import InputError
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, compose, pose_arrays
+from pancam_graph.data._matching import Matching
+from pancam_graph.data._noise import PixelNoise, mean_sigma_px
+from pancam_graph.data._sharing import Sharing
+from pancam_graph.rigs import Rig
+
+__all__ = ["Frame", "Image", "Observations", "Stop", "Traverse"]
+
+_ASYMMETRY = 1e-9
+"""Largest difference of a covariance's two mixed entries, as a share of its larger variance."""
+_FLATTEST = 1e-12
+"""Least determinant of a covariance whose larger variance is 1: less is singular but for rounding."""
+_AGREE = 0.01
+"""Largest share by which a sigma may differ from what goes with its covariance."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stop:
+    """One place where the mast stood."""
+
+    id: str
+    world_T_mast: gtsam.Pose3
+    """As odometry or localisation gives it; the centre of the prior."""
+    sigma_rotation_rad: float
+    """Standard deviation of each rotation component of the prior; 0: held."""
+    sigma_translation_m: float
+    """Standard deviation of each translation component of the prior; 0: held."""
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """Standard deviations (6,) of the prior in the tangent of the pose, rotation first."""
+        return np.repeat([self.sigma_rotation_rad, self.sigma_translation_m], 3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frame:
+    """One pointing of the head, shared by all eyes."""
+
+    id: str
+    stop: str
+    """Id of the stop."""
+    pan_rad: float
+    """As telemetry gives it; positive anticlockwise seen from above."""
+    tilt_rad: float
+    """As telemetry gives it; positive upwards."""
+    sigma_pan_rad: float
+    """Standard deviation of the prior; 0: held."""
+    sigma_tilt_rad: float
+    """Standard deviation of the prior; 0: held."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Image:
+    """One eye's picture of a frame."""
+
+    id: str
+    frame: str
+    """Id of the frame."""
+    camera: str
+    """Name of the eye."""
+    file: str | None = None
+    """Path of the image file relative to the traverse folder, if there is one."""
+    mask: str | None = None
+    """Path of a mask relative to the traverse folder: white where the image may be used, black where not."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Observations:
+    """Pixels at which images see tracks, as columns of equal length n."""
+
+    image: IntArray
+    """(n,) row in the traverse's images."""
+    track: IntArray
+    """(n,) number of the terrain point, 0 or above; numbers may leave gaps."""
+    uv_px: FloatArray
+    """(n, 2) pixel, centre of the top-left one at (0, 0)."""
+    sigma_px: FloatArray
+    """(n,) standard deviation of each coordinate; with covariances, the root of their mean variance."""
+    covariance_px2: FloatArray | None = None
+    """(n, 2, 2) covariance of (u, v) of each, symmetric and positive definite; None: sigma_px^2 I."""
+    origin: Literal["given", "images"] = "given"
+    """"images" where this package measured them: then their noise is a guess that the solve rescales."""
+
+    def __len__(self) -> int:
+        """Number of observations."""
+        return len(self.image)
+
+    @property
+    def noise(self) -> PixelNoise:
+        """By what the observations are weighted."""
+        return PixelNoise(sigma_px=self.sigma_px, covariance_px2=self.covariance_px2)
+
+    def with_covariance(self, covariance_px2: FloatArray) -> "Observations":
+        """The same observations with a covariance (n, 2, 2) each, and the sigmas that go with them."""
+        return replace(self, covariance_px2=covariance_px2, sigma_px=mean_sigma_px(covariance_px2))
+
+    def select(self, rows: BoolArray | IntArray) -> "Observations":
+        """The observations of some rows, by mask or index."""
+        noise = self.noise.select(rows)
+        return replace(
+            self,
+            image=self.image[rows],
+            track=self.track[rows],
+            uv_px=self.uv_px[rows],
+            sigma_px=noise.sigma_px,
+            covariance_px2=noise.covariance_px2,
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Traverse:
+    """Everything known before the adjustment. Constructing one checks that it hangs together.
+
+    Raises InputError naming the entry for duplicate ids, unknown stops, frames or cameras, numbers
+    that are not finite, negative sigmas, and observations out of range.
+    """
+
+    name: str
+    rig: Rig
+    stops: tuple[Stop, ...]
+    frames: tuple[Frame, ...]
+    images: tuple[Image, ...]
+    observations: Observations | None = None
+    """None: to be found in the image files."""
+    sharing: Sharing | None = None
+    """What of the rig is free, and who shares it, where a solve's options do not say; None: nothing said."""
+    folder: Path | None = None
+    """Where image files are relative to; None for a traverse made in memory."""
+    warnings: tuple[str, ...] = field(default=())
+    """What a reader noticed and the user should know."""
+    matching: Matching | None = None
+    """What became of all that was found in the images; None for observations from elsewhere."""
+
+    def __post_init__(self) -> None:
+        """Check ids, references and ranges."""
+        for kind, entries in (("stops", self.stops), ("frames", self.frames), ("images", self.images)):
+            if not entries:
+                raise InputError(f"{kind}: expected at least one entry, found none")
+            _require_unique(kind, [e.id for e in entries])
+        stop_ids, frame_ids = {s.id for s in self.stops}, {f.id for f in self.frames}
+        eye_names = {e.name for e in self.rig.eyes}
+        for stop in self.stops:
+            where = f"stops: {stop.id}"
+            _require_numbers(where, pose=[*stop.world_T_mast.matrix().ravel()])
+            _require_sigmas(
+                where,
+                sigma_rotation_rad=stop.sigma_rotation_rad,
+                sigma_translation_m=stop.sigma_translation_m,
+            )
+        for frame in self.frames:
+            where = f"frames: {frame.id}"
+            if frame.stop not in stop_ids:
+                raise InputError(f"{where}: stop: expected the id of a stop, found {frame.stop!r}")
+            _require_numbers(where, pan_rad=[frame.pan_rad], tilt_rad=[frame.tilt_rad])
+            _require_sigmas(where, sigma_pan_rad=frame.sigma_pan_rad, sigma_tilt_rad=frame.sigma_tilt_rad)
+        for image in self.images:
+            where = f"images: {image.id}"
+            if image.frame not in frame_ids:
+                raise InputError(f"{where}: frame: expected the id of a frame, found {image.frame!r}")
+            if image.camera not in eye_names:
+                raise InputError(
+                    f"{where}: camera: expected one of {', '.join(sorted(eye_names))}, found {image.camera!r}"
+                )
+        _require_unique("images: frame and camera", [f"{i.frame} {i.camera}" for i in self.images])
+        if self.observations is not None:
+            _require_observations(self.observations, len(self.images))
+
+    @cached_property
+    def frame_stop(self) -> IntArray:
+        """(frames,) row of each frame's stop."""
+        row = {s.id: i for i, s in enumerate(self.stops)}
+        return np.array([row[f.stop] for f in self.frames], dtype=np.int64)
+
+    @cached_property
+    def image_frame(self) -> IntArray:
+        """(images,) row of each image's frame."""
+        row = {f.id: i for i, f in enumerate(self.frames)}
+        return np.array([row[i.frame] for i in self.images], dtype=np.int64)
+
+    @cached_property
+    def image_eye(self) -> IntArray:
+        """(images,) index of each image's eye in the rig."""
+        row = {e.name: i for i, e in enumerate(self.rig.eyes)}
+        return np.array([row[i.camera] for i in self.images], dtype=np.int64)
+
+    @cached_property
+    def image_stop(self) -> IntArray:
+        """(images,) row of each image's stop."""
+        return self.frame_stop[self.image_frame]
+
+    @cached_property
+    def calibration(self) -> FloatArray:
+        """(images, 3, 3) K of each image's camera as the rig has it, upper-triangular, without distortion."""
+        return np.array([p.calibration_matrix for p in self.rig.pinholes])[self.image_eye]
+
+    @cached_property
+    def pan_tilt_rad(self) -> FloatArray:
+        """(frames, 2) pan and tilt as telemetry gives them."""
+        return np.array([[f.pan_rad, f.tilt_rad] for f in self.frames])
+
+    def camera_poses(
+        self,
+        world_T_mast: Sequence[gtsam.Pose3] | None = None,
+        pan_tilt_rad: FloatArray | None = None,
+    ) -> tuple[FloatArray, FloatArray]:
+        """World poses of all images by the mast chain: rotations (images, 3, 3), centres (images, 3).
+
+        Default: at the stops and angles that telemetry gives.
+        """
+        poses = world_T_mast if world_T_mast is not None else [s.world_T_mast for s in self.stops]
+        angles = pan_tilt_rad if pan_tilt_rad is not None else self.pan_tilt_rad
+        stops_R, stops_t = pose_arrays(poses)
+        mast_T_camera = self.rig.mast_T_camera(angles[self.image_frame], self.image_eye)
+        return compose(stops_R[self.image_stop], stops_t[self.image_stop], *mast_T_camera)
+
+    def with_observations(
+        self, observations: Observations, warnings: Sequence[str] = (), *, matching: Matching | None = None
+    ) -> "Traverse":
+        """The same traverse with other observations, and perhaps more warnings."""
+        warnings = (*self.warnings, *warnings)
+        return replace(self, observations=observations, warnings=warnings, matching=matching)
+
+
+def _require_unique(kind: str, ids: Sequence[str]) -> None:
+    seen: set[str] = set()
+    for name in ids:
+        if name in seen:
+            raise InputError(f"{kind}: expected different ids, found {name!r} twice")
+        seen.add(name)
+
+
+def _require_numbers(where: str, **numbers: Sequence[float]) -> None:
+    for name, values in numbers.items():
+        if not np.all(np.isfinite(values)):
+            raise InputError(f"{where}: {name}: expected finite numbers, found {list(values)}")
+
+
+def _require_sigmas(where: str, **sigmas: float) -> None:
+    for name, sigma in sigmas.items():
+        if not (np.isfinite(sigma) and sigma >= 0):
+            raise InputError(f"{where}: {name}: expected 0 (held) or a positive number, found {sigma}")
+
+
+def _require_observations(obs: Observations, n_images: int) -> None:
+    n = len(obs.image)
+    for name, column, shape in (
+        ("image", obs.image, (n,)),
+        ("track", obs.track, (n,)),
+        ("uv_px", obs.uv_px, (n, 2)),
+        ("sigma_px", obs.sigma_px, (n,)),
+        ("covariance_px2", obs.covariance_px2, (n, 2, 2)),
+    ):
+        if column is not None and column.shape != shape:
+            raise InputError(f"observations: {name}: expected shape {shape}, found {column.shape}")
+    if n == 0:
+        raise InputError("observations: expected at least one, found none")
+    _require_rows(
+        "image",
+        f"a row of images, 0 to {n_images - 1}",
+        (obs.image < 0) | (obs.image >= n_images),
+        obs.image,
+    )
+    _require_rows("track", "a number of 0 or above", obs.track < 0, obs.track)
+    _require_rows("uv_px", "finite pixels", ~np.isfinite(obs.uv_px).all(axis=1), obs.uv_px)
+    sigma_px, covariance_px2 = obs.sigma_px, obs.covariance_px2
+    # Covariances first: where they stand alone in a file, the sigmas were made of them.
+    if covariance_px2 is not None:
+        _require_covariances(covariance_px2)
+    wrong = ~(np.isfinite(sigma_px) & (sigma_px > 0))
+    _require_rows("sigma_px", "a finite number above 0", wrong, sigma_px)
+    if covariance_px2 is not None:
+        mean = mean_sigma_px(covariance_px2)
+        other = np.abs(sigma_px - mean) > _AGREE * mean
+        right = (
+            f"{mean[np.argmax(other)]:.6g}, the root of the mean variance in covariance_px2, or no sigma_px"
+        )
+        _require_rows("sigma_px", right, other, sigma_px)
+    order = np.lexsort((obs.track, obs.image))
+    image, track = obs.image[order], obs.track[order]
+    twice = (image[1:] == image[:-1]) & (track[1:] == track[:-1])
+    if twice.any():
+        row = int(np.argmax(twice))
+        raise InputError(
+            f"observations: expected an image to see a track once, found image {image[row]}, "
+            f"track {track[row]} twice"
+        )
+
+
+def _require_rows(name: str, expected: str, wrong: ArrayLike, column: FloatArray | IntArray) -> None:
+    """Raise InputError naming the first row that is wrong."""
+    if np.any(wrong):
+        row = int(np.argmax(wrong))
+        found = column[row].tolist()
+        raise InputError(f"observations: {name}, row {row}: expected {expected}, found {found}")
+
+
+def _require_covariances(covariance_px2: FloatArray) -> None:
+    name, c = "covariance_px2", covariance_px2
+    _require_rows(name, "finite numbers", ~np.isfinite(c).all(axis=(1, 2)), c)
+    _require_rows(name, "variances above 0", ~((c[:, 0, 0] > 0) & (c[:, 1, 1] > 0)), c)
+    with np.errstate(over="ignore"):  # what overflows is refused
+        scaled = c / np.maximum(c[:, 0, 0], c[:, 1, 1])[:, None, None]
+        skewed = ~(np.abs(scaled[:, 0, 1] - scaled[:, 1, 0]) <= _ASYMMETRY)
+        determinant = scaled[:, 0, 0] * scaled[:, 1, 1] - scaled[:, 1, 0] ** 2
+    _require_rows(name, "a symmetric matrix", skewed, c)
+    _require_rows(name, "a positive definite matrix", ~(determinant > _FLATTEST), c)

@@ -1,0 +1,351 @@
+"""Rover images with PDS3 labels to a traverse: Mars Exploration Rovers, Curiosity, Perseverance.
+
+What becomes what (docs/conventions.md for the frames):
+- world: the site frame of the labels turned to z up, so x is north, y west;
+- a stop: one site and drive of ROVER_MOTION_COUNTER. The first (lowest counter) defines the world and is
+  held; later ones have the sigma of rover localisation, `LOCALISATION_SIGMA`;
+- a frame: images of one stop with the same mast counter (PMA, RSM) whose measured angles agree to
+  `SAME_POINTING_RAD`, each eye once;
+- an eye: images of one INSTRUMENT_ID with the same size, model type and intrinsics. An image of another
+  size, subframe or zoom is another eye, since its camera model is another: `navcam-left-2`;
+- the rig: the mast's axes of `pancam_graph.rigs`, with mounts averaged over the labels' cameras;
+- pan and tilt: of the chain's head frame, so that the chain reproduces the label's camera. They are the
+  measured angles where those do (MER: through the label's mast quaternion; Curiosity: through the joints'
+  zero points), else angles and axes are fitted to the labels' cameras.
+Labels are turned from z-down to z-up here and nowhere else. Label pixels count from 0 at the centre of
+the first one, as ours do.
+"""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import gtsam
+import numpy as np
+
+from pancam_graph.base.errors import ImageError, InputError
+from pancam_graph.base.geometry import FloatArray, IntArray, wrap_angle
+from pancam_graph.data import Frame, Image, Stop, Traverse
+from pancam_graph.io._image_files import left_out
+from pancam_graph.io._pds_image import PMA_GROUPS, LabelledImage, read_labelled_image
+from pancam_graph.rigs import MER_MAST, MastKinematics, ReferenceSigma, RigFit, RigFitOptions, fit_rig
+
+__all__ = ["LOCALISATION_SIGMA", "SAME_POINTING_RAD", "LocalisationSigma", "read_pds"]
+
+_log = logging.getLogger(__name__)
+
+SAME_POINTING_RAD = 1e-4
+"""Measured angles that differ by less belong to one pointing of the head."""
+
+_LABEL_TOLERANCE = 1e-4
+"""Metres and radians to which the rig must reproduce each label's camera."""
+_FARTHEST_CAMERA_M = 100.0
+_AS_DESIGNED = RigFitOptions(
+    reference_sigma=ReferenceSigma(mast_rad=0.0, mast_m=0.0, axis_rad=0.0, axis_m=0.0)
+)
+_AS_LABELLED = RigFitOptions(
+    angles="free",
+    angle_sigma_rad=5e-3,
+    reference_sigma=ReferenceSigma(mast_rad=5e-3, mast_m=5e-3, axis_rad=5e-3, axis_m=5e-3),
+)
+"""A flight unit's axes may differ from the design, and its angles from the measured ones, by so much."""
+_SAME_FOCAL = 2e-4
+_SAME_PRINCIPAL_POINT_PX = 1.0
+_SAME_POSE = 1e-3
+"""Metres and radians by which rover poses within a stop may differ unnoticed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalisationSigma:
+    """How well a later stop is known relative to the first, one standard deviation."""
+
+    rotation_rad: float = 0.01
+    """Of each rotation component."""
+    translation_m: float = 0.1
+    """Of each translation component, at no distance."""
+    translation_per_m: float = 0.05
+    """More of it for each metre from the first stop: wheel odometry on loose ground."""
+
+
+LOCALISATION_SIGMA = LocalisationSigma()
+
+
+def read_pds(folder: Path | str) -> Traverse:
+    """Read all *.IMG files of a folder, with PDS3 labels attached or in a .LBL beside each.
+
+    The traverse has no observations yet: they are to be found in its images. Its warnings say where the
+    rig misses a label's camera by more than 0.1 mm or 0.1 mrad, and where labels of one stop disagree.
+
+    Raises InputError naming file and entry for a folder without .IMG files, a label that is missing, no
+    label, or lacks an entry (camera model, rover pose, mast angles), a camera that is not on the mast,
+    images of two rovers or two site frames, and ImageError if all files are shorter than their labels say; if
+    only some are, they are warned of and left out.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: expected a folder of rover images, found {_kind(folder)}")
+    files = sorted(f for f in folder.iterdir() if f.suffix.lower() == ".img" and f.is_file())
+    if not files:
+        raise InputError(f"{folder}: expected images with PDS labels (*.IMG), found none")
+    images, unusable = list[LabelledImage](), dict[str, ImageError]()
+    for file in files:
+        _add_image(file, images, unusable)
+    if not images:
+        raise next(iter(unusable.values()))
+    kinematics = _common_mast(images)
+    warnings = left_out(unusable)
+    eye_of, eye_names = _sort_eyes(images)
+    stop_ids, stops = _sort_stops(images, kinematics, warnings)
+    frame_of, frames_first = _sort_frames(images, eye_of)
+    fit = _fit_rig(images, kinematics, frame_of, eye_of, eye_names, frames_first, warnings)
+    # The chain's own mast frame replaces the design's where the axes were fitted.
+    stops = tuple(
+        replace(s, world_T_mast=images[i].world_T_rover * fit.world_T_mast)
+        for s, i in zip(stops, stop_ids.values(), strict=True)
+    )
+    sigma = kinematics.pointing_sigma
+    frame_ids = _frame_ids(images, frames_first)
+    frames = tuple(
+        Frame(
+            id=name,
+            stop=_stop_id(images[i].stop),
+            pan_rad=float(wrap_angle(fit.pan_tilt_rad[i, 0])),
+            tilt_rad=float(fit.pan_tilt_rad[i, 1]),
+            sigma_pan_rad=sigma.pan_rad,
+            sigma_tilt_rad=sigma.tilt_rad,
+        )
+        for name, i in zip(frame_ids, frames_first, strict=True)
+    )
+    order = sorted(range(len(frames)), key=lambda r: (images[frames_first[r]].stop, r))
+    rig = replace(
+        fit.rig(f"{kinematics.name}-pds"),
+        pointing_sigma=sigma,
+        mast_height_m=kinematics.mast_height_m,
+        source=f"PDS labels of {folder.resolve().name}; {kinematics.source}",
+    )
+    return Traverse(
+        name=folder.resolve().name,
+        rig=rig,
+        stops=stops,
+        frames=tuple(frames[r] for r in order),
+        images=tuple(
+            Image(
+                id=image.label.file.stem,
+                frame=frame_ids[frame_of[i]],
+                camera=eye_names[eye_of[i]],
+                file=image.label.file.name,
+            )
+            for i, image in enumerate(images)
+        ),
+        folder=folder,
+        warnings=tuple(warnings),
+    )
+
+
+def _add_image(file: Path, images: list[LabelledImage], unusable: dict[str, ImageError]) -> None:
+    try:
+        images.append(read_labelled_image(file))
+    except ImageError as error:
+        unusable[file.stem] = error
+
+
+def _kind(path: Path) -> str:
+    return "a file" if path.exists() else "none"
+
+
+def _common_mast(images: Sequence[LabelledImage]) -> MastKinematics:
+    """The mast of all images. Raises InputError if they are of two rovers or in two site frames."""
+    first = images[0]
+    for image in images:
+        if image.host != first.host:
+            raise InputError(
+                f"{image.label.label_file}: INSTRUMENT_HOST_ID: expected {first.host} as in "
+                f"{first.label.label_file.name}, found {image.host}: images of two rovers"
+            )
+        if image.stop[0] != first.stop[0]:
+            raise InputError(
+                f"{image.label.label_file}: ROVER_MOTION_COUNTER: expected site {first.stop[0]} as in "
+                f"{first.label.label_file.name}, found {image.stop[0]}: poses in two site frames"
+            )
+    mast = first.mast
+    if mast is MER_MAST:
+        x, y, z = (float(c) for c in first.label.group(*PMA_GROUPS).numbers("ORIGIN_OFFSET_VECTOR", 3))
+        mast = replace(mast, azimuth_point_m=(x, y, z), elevation_point_m=(x, y, z))
+    return mast
+
+
+def _sort_eyes(images: Sequence[LabelledImage]) -> tuple[IntArray, list[str]]:
+    """Eye of each image (n,), and the eyes' names."""
+    firsts: list[LabelledImage] = []
+    eye_of: list[int] = []
+    for image in images:
+        row = next((k for k, first in enumerate(firsts) if _same_eye(first, image)), len(firsts))
+        if row == len(firsts):
+            firsts.append(image)
+        eye_of.append(row)
+    names: list[str] = []
+    for first in firsts:
+        base = first.instrument.lower().replace("_", "-")
+        count = sum(name == base or name.startswith(f"{base}-") for name in names)
+        names.append(base if count == 0 else f"{base}-{count + 1}")
+    return np.array(eye_of, dtype=np.int64), names
+
+
+def _same_eye(first: LabelledImage, image: LabelledImage) -> bool:
+    a, b = first.model, image.model
+    if first.instrument != image.instrument or type(a) is not type(b):
+        return False
+    if (a.width_px, a.height_px) != (b.width_px, b.height_px):
+        return False
+    focal = max(abs(a.fx_px / b.fx_px - 1), abs(a.fy_px / b.fy_px - 1))
+    centre = max(abs(a.cx_px - b.cx_px), abs(a.cy_px - b.cy_px))
+    return focal < _SAME_FOCAL and centre < _SAME_PRINCIPAL_POINT_PX
+
+
+def _stop_id(stop: tuple[int, int]) -> str:
+    return f"site{stop[0]}-drive{stop[1]}"
+
+
+def _sort_stops(
+    images: Sequence[LabelledImage], mast: MastKinematics, warnings: list[str]
+) -> tuple[dict[tuple[int, int], int], tuple[Stop, ...]]:
+    """First image of each stop, in the order of the motion counter, and the stops."""
+    first_of: dict[tuple[int, int], int] = {}
+    for i, image in enumerate(images):
+        first_of.setdefault(image.stop, i)
+    first_of = dict(sorted(first_of.items()))
+    rover_T_mast, _ = mast.chain()
+    for stop, i in first_of.items():
+        poses = [image.world_T_rover for image in images if image.stop == stop]
+        apart = [images[i].world_T_rover.between(pose) for pose in poses]
+        turn = max(float(np.linalg.norm(gtsam.Rot3.Logmap(pose.rotation()))) for pose in apart)
+        shift = max(float(np.linalg.norm(pose.translation())) for pose in apart)
+        if max(turn, shift) > _SAME_POSE:
+            warnings.append(
+                f"stop {_stop_id(stop)}: its labels' rover poses differ by up to {shift * 1e3:.1f} mm and "
+                f"{turn * 1e3:.1f} mrad; that of {images[i].label.file.name} is used"
+            )
+    origin = images[next(iter(first_of.values()))].world_T_rover.translation()
+    stops: list[Stop] = []
+    for stop, i in first_of.items():
+        distance = float(np.linalg.norm(images[i].world_T_rover.translation() - origin))
+        held = not stops
+        sigma = LOCALISATION_SIGMA
+        stops.append(
+            Stop(
+                id=_stop_id(stop),
+                world_T_mast=images[i].world_T_rover * rover_T_mast,
+                sigma_rotation_rad=0.0 if held else sigma.rotation_rad,
+                sigma_translation_m=(
+                    0.0 if held else sigma.translation_m + sigma.translation_per_m * distance
+                ),
+            )
+        )
+    return first_of, tuple(stops)
+
+
+def _sort_frames(images: Sequence[LabelledImage], eye_of: IntArray) -> tuple[IntArray, list[int]]:
+    """Frame of each image (n,), and each frame's first image."""
+    firsts: list[int] = []
+    eyes_in: list[set[int]] = []
+    frame_of: list[int] = []
+    for i, image in enumerate(images):
+        row = len(firsts)
+        for k, j in enumerate(firsts):
+            other = images[j]
+            same_place = (image.stop, image.mast_counter) == (other.stop, other.mast_counter)
+            apart = wrap_angle(np.subtract(image.pan_tilt_rad, other.pan_tilt_rad))
+            if same_place and np.abs(apart).max() < SAME_POINTING_RAD and int(eye_of[i]) not in eyes_in[k]:
+                row = k
+                break
+        if row == len(firsts):
+            firsts.append(i)
+            eyes_in.append(set())
+        eyes_in[row].add(int(eye_of[i]))
+        frame_of.append(row)
+    return np.array(frame_of, dtype=np.int64), firsts
+
+
+def _frame_ids(images: Sequence[LabelledImage], firsts: Sequence[int]) -> list[str]:
+    """Site, drive and mast counter; a number more where that is not unique."""
+    ids: list[str] = []
+    for row, i in enumerate(firsts):
+        site, drive = images[i].stop
+        counter = images[i].mast_counter
+        base = f"{site}-{drive}-{row if counter is None else counter}"
+        count = sum(name == base or name.startswith(f"{base}.") for name in ids)
+        ids.append(base if count == 0 else f"{base}.{count + 1}")
+    return ids
+
+
+def _fit_rig(
+    images: Sequence[LabelledImage],
+    mast: MastKinematics,
+    frame_of: IntArray,
+    eye_of: IntArray,
+    eye_names: Sequence[str],
+    frames_first: Sequence[int],
+    warnings: list[str],
+) -> RigFit:
+    """The chain that reproduces the labels' cameras: the design's, or one fitted to them."""
+    for image in images:
+        if np.linalg.norm(image.model.C) > _FARTHEST_CAMERA_M:
+            raise InputError(
+                f"{image.label.label_file}: camera centre: expected a point within "
+                f"{_FARTHEST_CAMERA_M:g} m of the rover, found {image.model.C.tolist()}"
+            )
+    measured = np.array([images[i].pan_tilt_rad for i in frames_first])
+    rover_T_mast, pan_T_tilt = mast.chain()
+    fit_of = partial(
+        fit_rig,
+        [image.model for image in images],
+        measured[frame_of],
+        eyes=[eye_names[eye] for eye in eye_of],
+        pointings=frame_of.tolist(),
+        world_T_mast=rover_T_mast,
+        pan_T_tilt=pan_T_tilt,
+    )
+    fit = fit_of(options=_AS_DESIGNED)
+    if max(fit.worst_m, fit.worst_rad) > _LABEL_TOLERANCE:
+        fit = fit_of(options=_AS_LABELLED)
+        change = wrap_angle(fit.pan_tilt_rad[frames_first] - measured)
+        _log.info(
+            "mast axes and angles fitted to the labels' cameras; angles moved by up to %.2f mrad",
+            1e3 * np.abs(change).max(),
+        )
+        _warn_of_angles(change, mast, images, frame_of, warnings)
+    metres, radians = np.linalg.norm(fit.residual_m, axis=1), np.linalg.norm(fit.residual_rad, axis=1)
+    misfit = np.maximum(metres, radians)
+    bad = misfit > _LABEL_TOLERANCE
+    if bad.any():
+        worst = int(misfit.argmax())
+        warnings.append(
+            f"the mast model misses the label's camera in {int(bad.sum())} of {len(images)} images by more "
+            f"than 0.1 mm or 0.1 mrad; worst {metres[worst] * 1e3:.2f} mm and "
+            f"{radians[worst] * 1e3:.2f} mrad in {images[worst].label.file.name}"
+        )
+    return fit
+
+
+def _warn_of_angles(
+    change: FloatArray,
+    mast: MastKinematics,
+    images: Sequence[LabelledImage],
+    frame_of: IntArray,
+    warnings: list[str],
+) -> None:
+    # A joint's zero point may differ from the design by the same amount in all frames; a frame that
+    # moves alone was labelled with another pointing than was measured.
+    alone = np.abs(change - np.median(change, axis=0))
+    sigma = np.array([mast.pointing_sigma.pan_rad, mast.pointing_sigma.tilt_rad])
+    frames = np.flatnonzero((alone > 3 * sigma).any(axis=1))
+    if len(frames):
+        worst = int(alone.max(axis=1).argmax())
+        name = images[int(np.flatnonzero(frame_of == worst)[0])].label.file.name
+        warnings.append(
+            f"{len(frames)} of {len(change)} pointings: the label's camera is turned from the measured "
+            f"angles by more than 3 sigma, at most {alone[worst].max() * 1e3:.1f} mrad in {name}; the "
+            "camera's pointing is used"
+        )

@@ -1,0 +1,383 @@
+"""PDS3 labels (ODL text) of rover images, attached in front of the image or detached in a .LBL beside it.
+
+Only what this package needs is read: the groups of the camera model, the rover and the mast, and
+the layout of the pixels. Names differ between missions; the accessors take all spellings.
+Sources: PDS Standards Reference 3.8, chapters 5 and 12 (labels, pointers) and appendix C (sample
+types); the camera SIS of MER, MSL and Mars 2020 (groups).
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+from pvl.decoder import OmniDecoder
+from pvl.exceptions import LexerError, ParseError, QuantityError
+from pvl.grammar import OmniGrammar
+from pvl.parser import PVLParser
+
+from pancam_graph.base.errors import ImageError, InputError
+from pancam_graph.base.geometry import FloatArray
+
+__all__ = ["ImageLayout", "LabelGroup", "PdsLabel", "read_label"]
+
+_MAX_LABEL_BYTES = 1 << 20
+_STARTS = (b"PDS_VERSION_ID", b"ODL_VERSION_ID", b"CCSD3ZF")
+_END = re.compile(rb"^[ \t]*END[ \t]*(?:\r|\n|\x00|\Z)", re.MULTILINE)
+_BLOCK = re.compile(
+    r"[ \t]*(?P<end>BEGIN_|END_)?(?P<kind>GROUP|OBJECT)[ \t]*=[ \t]*(?P<name>.*?)[ \t]*(/\*.*\*/)?[ \t]*"
+)
+_WANTED = re.compile(
+    r"IMAGE|GEOMETRIC_CAMERA_MODEL(_PARMS)?|(ROVER|PMA|RSM)_(COORD_|COORDINATE_)SYSTEM(_PARMS)?"
+    r"|(PMA|RSM)_ARTICULATION_STATE(_PARMS)?"
+)
+_NO_VALUE = 1e29
+"""Labels write 1e30 where telemetry has no number."""
+
+_SAMPLE_KINDS = {
+    "INTEGER": ">i",
+    "MSB_INTEGER": ">i",
+    "MAC_INTEGER": ">i",
+    "SUN_INTEGER": ">i",
+    "UNSIGNED_INTEGER": ">u",
+    "MSB_UNSIGNED_INTEGER": ">u",
+    "MAC_UNSIGNED_INTEGER": ">u",
+    "SUN_UNSIGNED_INTEGER": ">u",
+    "LSB_INTEGER": "<i",
+    "PC_INTEGER": "<i",
+    "VAX_INTEGER": "<i",
+    "LSB_UNSIGNED_INTEGER": "<u",
+    "PC_UNSIGNED_INTEGER": "<u",
+    "VAX_UNSIGNED_INTEGER": "<u",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageLayout:
+    """Where the pixels of a PDS image are, and how they are written."""
+
+    file: Path
+    """The file that holds them; not the label's own where the label is detached."""
+    offset_bytes: int
+    """Of the first line from the start of that file."""
+    width_px: int
+    height_px: int
+    bands: int
+    dtype: np.dtype[Any]
+    """One sample, with its byte order."""
+    line_prefix_bytes: int
+    line_suffix_bytes: int
+    storage: str
+    """BAND_SEQUENTIAL, LINE_INTERLEAVED or SAMPLE_INTERLEAVED."""
+
+    @property
+    def line_bytes(self) -> int:
+        """Bytes of one stored line, of all bands where samples are interleaved."""
+        bands = self.bands if self.storage == "SAMPLE_INTERLEAVED" else 1
+        samples = self.width_px * bands * self.dtype.itemsize
+        return self.line_prefix_bytes + samples + self.line_suffix_bytes
+
+    @property
+    def end_bytes(self) -> int:
+        """Where the last line ends, from the start of the file."""
+        bands = 1 if self.storage == "SAMPLE_INTERLEAVED" else self.bands
+        return self.offset_bytes + self.height_px * bands * self.line_bytes
+
+    def require_complete(self) -> None:
+        """Raise ImageError if the file is missing or shorter than its label says."""
+        if not self.file.is_file():
+            raise ImageError(f"{self.file}: expected an image file, found none")
+        found = self.file.stat().st_size
+        if found < self.end_bytes:
+            raise ImageError(
+                f"{self.file}: ^IMAGE: expected {self.end_bytes} bytes or more for {self.height_px} lines of "
+                f"{self.width_px} samples, found {found}: the file is truncated"
+            )
+
+
+@dataclass(frozen=True)
+class LabelGroup:
+    """A group of a label, or its top level, with errors that name file and entry."""
+
+    where: str
+    """File and group, for errors."""
+    items: Mapping[str, Any]
+
+    def _fail(self, key: str, expected: str, found: object) -> NoReturn:
+        raise InputError(f"{self.where}: {key}: expected {expected}, found {found}")
+
+    def value(self, key: str) -> Any:
+        """The entry as pvl gives it. Raises InputError if it is missing."""
+        if key not in self.items:
+            self._fail(key, "an entry of the label", "none")
+        return self.items[key]
+
+    def text(self, key: str) -> str:
+        """An entry as text, blanks stripped."""
+        return str(_plain(self.value(key))).strip()
+
+    def integer(self, key: str, default: int | None = None) -> int:
+        """An integer of 0 or above."""
+        if default is not None and key not in self.items:
+            return default
+        found = _plain(self.value(key))
+        if isinstance(found, bool) or not isinstance(found, int) or found < 0:
+            self._fail(key, "an integer of 0 or above", repr(found))
+        return found
+
+    def names(self, key: str) -> list[str]:
+        """A list of words."""
+        return [str(v).strip() for v in _as_list(self.value(key))]
+
+    def numbers(self, key: str, count: int | None = None) -> FloatArray:
+        """Finite numbers, (count,) if a count is given, units dropped (angles: see `angles`)."""
+        found = [_plain(v) for v in _as_list(self.value(key))]
+        if count is not None and len(found) != count:
+            self._fail(key, f"{count} numbers", found)
+        return np.array([self._number(key, v) for v in found])
+
+    def _number(self, key: str, found: Any) -> float:
+        if isinstance(found, bool) or not isinstance(found, int | float):
+            self._fail(key, "a number", repr(found))
+        if not np.isfinite(found) or abs(found) > _NO_VALUE:
+            self._fail(key, "a finite number", found)
+        return float(found)
+
+    def angles_rad(self, key: str = "ARTICULATION_DEVICE_ANGLE") -> dict[str, float]:
+        """Angles by the name that the entry's _NAME list gives them; those without a value left out.
+
+        Raises InputError where names and angles differ in number or a unit is no angle.
+        """
+        names, entries = self.names(f"{key}_NAME"), _as_list(self.value(key))
+        if len(names) != len(entries):
+            self._fail(key, f"{len(names)} angles, as many as {key}_NAME has", len(entries))
+        out: dict[str, float] = {}
+        for name, entry in zip(names, entries, strict=True):
+            unit = str(getattr(entry, "units", "rad")).lower()
+            if unit not in {"rad", "radian", "radians", "deg", "degree", "degrees"}:
+                self._fail(key, "radians or degrees", f"{unit!r}")
+            number = _plain(entry)
+            if isinstance(number, int | float) and abs(number) < _NO_VALUE:
+                out[name.upper()] = float(np.deg2rad(number)) if unit.startswith("deg") else float(number)
+        return out
+
+
+@dataclass(frozen=True, kw_only=True)
+class PdsLabel:
+    """The label of one image."""
+
+    file: Path
+    """The image file."""
+    label_file: Path
+    """The file that the label was read from: the same, or a detached label."""
+    top: LabelGroup
+    """Entries outside any group."""
+
+    def group(self, *names: str) -> LabelGroup:
+        """The first group there is of these names. Raises InputError if there is none."""
+        for name in names:
+            items = self.top.items.get(name)
+            if isinstance(items, Mapping):
+                return LabelGroup(f"{self.label_file}: {name}", items)
+        raise InputError(f"{self.label_file}: expected a group {' or '.join(names)}, found none")
+
+    def counter(self, key: str = "ROVER_MOTION_COUNTER") -> dict[str, int]:
+        """The rover's motion counter by name (SITE, DRIVE, ...), names in capitals."""
+        names, values = self.top.names(f"{key}_NAME"), self.top.numbers(key)
+        if len(names) != len(values):
+            raise InputError(f"{self.label_file}: {key}: expected {len(names)} numbers, found {len(values)}")
+        return {n.upper(): int(v) for n, v in zip(names, values, strict=True)}
+
+    def image_layout(self) -> ImageLayout:
+        """Where the pixels are.
+
+        Raises ImageError for a label without an image, or with samples that are not integers of 8 or
+        16 bits.
+        """
+        try:
+            return self._image_layout()
+        except ImageError:
+            raise
+        except InputError as error:
+            raise ImageError(str(error)) from error
+
+    def _image_layout(self) -> ImageLayout:
+        image = self.group("IMAGE")
+        file, offset = self._image_pointer()
+        kind, bits = image.text("SAMPLE_TYPE").upper(), image.integer("SAMPLE_BITS")
+        if kind not in _SAMPLE_KINDS or bits not in {8, 16}:
+            raise ImageError(
+                f"{image.where}: SAMPLE_TYPE, SAMPLE_BITS: expected integers of 8 or 16 bits, "
+                f"found {kind} of {bits}"
+            )
+        width, height, bands = (
+            image.integer("LINE_SAMPLES"),
+            image.integer("LINES"),
+            image.integer("BANDS", 1),
+        )
+        if min(width, height, bands) < 1:
+            raise ImageError(
+                f"{image.where}: LINES, LINE_SAMPLES, BANDS: expected 1 or more of each, "
+                f"found {height}, {width}, {bands}"
+            )
+        storage = "BAND_SEQUENTIAL"
+        if bands > 1 and "BAND_STORAGE_TYPE" in image.items:
+            storage = image.text("BAND_STORAGE_TYPE").upper().replace(" ", "_")
+        if storage not in {"BAND_SEQUENTIAL", "LINE_INTERLEAVED", "SAMPLE_INTERLEAVED"}:
+            raise ImageError(f"{image.where}: BAND_STORAGE_TYPE: expected BAND_SEQUENTIAL, found {storage}")
+        return ImageLayout(
+            file=file,
+            offset_bytes=offset,
+            width_px=width,
+            height_px=height,
+            bands=bands,
+            dtype=np.dtype(f"{_SAMPLE_KINDS[kind]}{bits // 8}"),
+            line_prefix_bytes=image.integer("LINE_PREFIX_BYTES", 0),
+            line_suffix_bytes=image.integer("LINE_SUFFIX_BYTES", 0),
+            storage=storage,
+        )
+
+    def _image_pointer(self) -> tuple[Path, int]:
+        # A pointer is a record (from 1), a byte (from 1, <BYTES>), a file, or a file and one of the two.
+        pointer = _as_list(self.top.value("^IMAGE"))
+        file = self.file
+        if isinstance(pointer[0], str):
+            file = _sibling(self.label_file, str(pointer.pop(0)))
+        if not pointer:
+            return file, 0
+        place = _plain(pointer[0])
+        if len(pointer) > 1 or isinstance(place, bool) or not isinstance(place, int) or place < 1:
+            raise ImageError(
+                f"{self.label_file}: ^IMAGE: expected a record or a byte, 1 or above, found {place!r}"
+            )
+        if str(getattr(pointer[0], "units", "")).upper().startswith("BYTE"):
+            return file, place - 1
+        return file, (place - 1) * self.top.integer("RECORD_BYTES")
+
+
+def read_label(file: Path) -> PdsLabel:
+    """Read the PDS3 label of an image: attached to it, or in a .LBL of the same name beside it.
+
+    Raises InputError if the file is missing or neither has a label that can be parsed.
+    """
+    head = _head(file)
+    label_file = file
+    if not _looks_like_label(head):
+        detached = [file.with_suffix(s) for s in (".LBL", ".lbl", ".Lbl")]
+        label_file = next((f for f in detached if f.is_file()), file)
+        if label_file != file:
+            head = _head(label_file)
+        if not _looks_like_label(head):
+            raise InputError(
+                f"{label_file}: expected a PDS3 label that starts with PDS_VERSION_ID or ODL_VERSION_ID, "
+                f"found {_shown(head)}"
+            )
+    end = _END.search(head)
+    if end is None:
+        raise InputError(
+            f"{label_file}: expected a label that closes with the line END, found none in {len(head)} bytes"
+        )
+    top, groups = _split_groups(label_file, head[: end.start()].decode("latin-1"))
+    items = _parsed(label_file, top)
+    items |= {name: _parsed(f"{label_file}: {name}", text) for name, text in groups.items()}
+    return PdsLabel(file=file, label_file=label_file, top=LabelGroup(str(label_file), items))
+
+
+def _split_groups(label_file: Path, text: str) -> tuple[str, dict[str, str]]:
+    """Text outside all groups and objects, and the text of each one that is used, nested ones apart.
+
+    pvl's own parser does not come to an end on some broken groups, and takes 0.4 s for a whole label.
+    """
+    top: list[str] = []
+    used: dict[str, list[str]] = {}
+    lines = top
+    stack: list[tuple[str, list[str]]] = []
+    for line in text.replace("\r", "").split("\n"):
+        block = _BLOCK.fullmatch(line)
+        if block is None:
+            lines.append(line)
+        elif block["end"] == "END_":
+            name, outer = stack.pop() if stack else ("none open", top)
+            if block["name"].upper() != name:
+                found = f"END_{block['kind']} = {block['name']}"
+                raise InputError(f"{label_file}: expected the end of group {name}, found {found}")
+            lines = outer
+        else:
+            name = block["name"].upper()
+            stack.append((name, lines))
+            lines = []
+            if _WANTED.fullmatch(name):
+                lines = used.setdefault(name, lines)
+    if stack:
+        raise InputError(
+            f"{label_file}: expected the end of group {stack[-1][0]}, found the end of the label"
+        )
+    return "\n".join(top), {name: "\n".join(body) for name, body in used.items()}
+
+
+def _parsed(where: Path | str, text: str) -> dict[str, Any]:
+    """Entries of text without groups; of an entry that is there twice, the first."""
+    try:
+        module = _parser().parse(text + "\nEND\n")
+    except (ParseError, LexerError, QuantityError, ValueError, StopIteration) as error:
+        first_line = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise InputError(
+            f"{where}: expected entries of a PDS3 label, found text that is none: {first_line}"
+        ) from error
+    return dict(reversed(list(module.items())))
+
+
+def _parser() -> Any:
+    """A parser that accepts all dialects, but raises where the lenient one of pvl would loop for ever.
+
+    It leaves dates as text: trying all their formats takes most of a label's time.
+    """
+
+    def no_date(value: str) -> NoReturn:
+        raise ValueError(value)
+
+    decoder = OmniDecoder()
+    decoder.decode_datetime = no_date
+    return PVLParser(grammar=OmniGrammar(), decoder=decoder)
+
+
+def _head(file: Path) -> bytes:
+    try:
+        with file.open("rb") as stream:
+            return stream.read(_MAX_LABEL_BYTES)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise InputError(f"{file}: expected an image file, could not read it: {reason}") from error
+
+
+def _looks_like_label(head: bytes) -> bool:
+    text = re.sub(rb"\A(?:\s|/\*.*?\*/)*", b"", head[:4096], flags=re.DOTALL)
+    return text.startswith(_STARTS)
+
+
+def _shown(head: bytes) -> str:
+    return repr(head[:16].decode("latin-1")) if head else "an empty file"
+
+
+def _sibling(label_file: Path, name: str) -> Path:
+    # A pointer names a file in the label's own folder; archives disagree about the case of its name.
+    if Path(name).name != name or name in {"", ".", ".."}:
+        raise ImageError(f"{label_file}: ^IMAGE: expected a file beside the label, found {name!r}")
+    file = label_file.with_name(name)
+    if not file.exists():
+        for other in label_file.parent.iterdir():
+            if other.name.lower() == name.lower():
+                return other
+    return file
+
+
+def _plain(value: Any) -> Any:
+    return getattr(value, "value", value) if hasattr(value, "units") else value
+
+
+def _as_list(value: Any) -> list[Any]:
+    if isinstance(value, Sequence) and not isinstance(value, str) and not hasattr(value, "units"):
+        return list(value)
+    return [value]

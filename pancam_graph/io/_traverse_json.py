@@ -1,0 +1,260 @@
+"""A traverse as a folder: `traverse.json`, its observations and its image files."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path, PurePosixPath, PureWindowsPath
+
+import numpy as np
+
+from pancam_graph.base.errors import ImageError, InputError
+from pancam_graph.base.whole_files import whole_file
+from pancam_graph.data import Frame, Image, Stop, Traverse
+from pancam_graph.io._image_files import left_out, read_eye_content
+from pancam_graph.io._json import prefixed, read_json, refused_by_schema, short, validated
+from pancam_graph.io._mask_files import mask_file, read_mask
+from pancam_graph.io._observations import observations_npz, read_observations
+from pancam_graph.io._schema import (
+    TRAVERSE_FORMAT,
+    VERSION,
+    FrameEntry,
+    ImageEntry,
+    PoseEntry,
+    SharingEntry,
+    StopEntry,
+    TraverseFile,
+    rig_entry,
+)
+
+__all__ = ["read_traverse", "traverse_entries", "traverse_of", "write_traverse"]
+
+_TRAVERSE_JSON = "traverse.json"
+_OBSERVATIONS = "observations.npz"
+
+
+def read_traverse(folder: Path | str) -> Traverse:
+    """Read a traverse folder: `traverse.json`, the observations and image files that it names.
+
+    Every image file and mask is decoded once, to know that it is there, whole, of its camera's size and,
+    where labels tell, of the same rover; nothing is kept of it. Image files that are not are warned of, and
+    what reads them later does without. `observations` is None where the file says null: they are then to be
+    found in the images.
+
+    Raises InputError with one sentence naming file, entry, what was expected and what was found; ImageError
+    for a mask that cannot be used, and if no image file can be: unless observations are given and all image
+    files are missing.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        found = "a file" if folder.exists() else "nothing there"
+        raise InputError(f"{folder}: expected a traverse folder with {_TRAVERSE_JSON}, found {found}")
+    path = folder / _TRAVERSE_JSON
+    entries = validated(TraverseFile, read_json(path, TRAVERSE_FORMAT, VERSION), path)
+    # Absurdly large numbers overflow; the constructors refuse what that leaves, in one line and not two.
+    with prefixed(path), np.errstate(all="ignore"):
+        traverse = traverse_of(entries, folder)
+        files = [
+            None if i.file is None else _inside(folder, i.file, f"images[{row}].file")
+            for row, i in enumerate(entries.images)
+        ]
+        if entries.observations is None and not any(files):
+            raise InputError(
+                "observations: expected a file, or image files to find them in; found null and no image file"
+            )
+        for row, image in enumerate(entries.images):
+            if image.mask is not None:
+                _inside(folder, image.mask, f"images[{row}].mask")
+        source = None
+        if entries.observations is not None:
+            source = _inside(folder, entries.observations, "observations")
+    if source is not None:
+        observations = read_observations(source)
+        try:
+            traverse = traverse.with_observations(observations)
+        except InputError as error:
+            raise InputError(f"{source}: {str(error).removeprefix('observations: ')}") from error
+    unusable = _unusable_images(files, traverse)
+    # Where observations are to be found in images, that warns of them.
+    return (
+        traverse if source is None else replace(traverse, warnings=(*traverse.warnings, *left_out(unusable)))
+    )
+
+
+def write_traverse(traverse: Traverse, folder: Path | str, *, overwrite: bool = False) -> None:
+    """Write a traverse folder that `read_traverse` reads back, poses and pixels to double precision.
+
+    The rig is written with its own numbers. Image files of a traverse that was read from another folder are
+    copied along. That observations were found in images (`Observations.origin`) is not in the format.
+
+    Raises InputError where `folder` has a `traverse.json` already and `overwrite` is not set, for an image
+    file outside its folder, for names that the format does not take, and for files that cannot be written.
+    """
+    folder = Path(folder)
+    path = folder / _TRAVERSE_JSON
+    if path.exists() and not overwrite:
+        raise InputError(f"{path}: expected a folder without a traverse, found one; overwrite is off")
+    copies = _copies(traverse, folder)
+    observations = traverse.observations
+    with refused_by_schema(path):
+        entries = traverse_entries(traverse)
+    content = entries.model_dump(exclude={"sharing"})
+    for image in content["images"]:
+        if image["mask"] is None:
+            del image["mask"]
+    if entries.sharing is not None:
+        content["sharing"] = entries.sharing.model_dump(exclude_defaults=True)
+    text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for source, target in copies:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(source, target)
+        if observations is not None:
+            whole_file(folder / _OBSERVATIONS, observations_npz(observations))
+        whole_file(path, f"{text}\n".encode())  # last: a folder with it is complete
+    except OSError as error:
+        raise InputError(f"{folder}: expected a folder to write to, found: {error}") from error
+
+
+def traverse_of(entries: TraverseFile, folder: Path) -> Traverse:
+    """The traverse that a file's entries say, without observations."""
+    stops = tuple(
+        Stop(
+            id=s.id,
+            world_T_mast=s.world_T_mast.pose(f"stops[{i}].world_T_mast"),
+            sigma_rotation_rad=s.sigma_rotation_rad,
+            sigma_translation_m=s.sigma_translation_m,
+        )
+        for i, s in enumerate(entries.stops)
+    )
+    return Traverse(
+        name=entries.name if entries.name is not None else folder.resolve().name,
+        rig=entries.rig.rig(),
+        stops=stops,
+        frames=tuple(Frame(**f.model_dump()) for f in entries.frames),
+        images=tuple(Image(**i.model_dump()) for i in entries.images),
+        sharing=None if entries.sharing is None else entries.sharing.sharing(),
+        folder=folder,
+    )
+
+
+def traverse_entries(traverse: Traverse) -> TraverseFile:
+    """A traverse as the entries of its file."""
+    stops = [
+        StopEntry(
+            id=s.id,
+            world_T_mast=PoseEntry.of(s.world_T_mast),
+            sigma_rotation_rad=float(s.sigma_rotation_rad),
+            sigma_translation_m=float(s.sigma_translation_m),
+        )
+        for s in traverse.stops
+    ]
+    frames = [
+        FrameEntry(
+            id=f.id,
+            stop=f.stop,
+            pan_rad=float(f.pan_rad),
+            tilt_rad=float(f.tilt_rad),
+            sigma_pan_rad=float(f.sigma_pan_rad),
+            sigma_tilt_rad=float(f.sigma_tilt_rad),
+        )
+        for f in traverse.frames
+    ]
+    return TraverseFile(
+        name=traverse.name,
+        rig=rig_entry(traverse.rig),
+        stops=stops,
+        frames=frames,
+        images=[
+            ImageEntry(id=i.id, frame=i.frame, camera=i.camera, file=i.file, mask=i.mask)
+            for i in traverse.images
+        ],
+        observations=None if traverse.observations is None else _OBSERVATIONS,
+        sharing=None if traverse.sharing is None else SharingEntry.of(traverse.sharing),
+    )
+
+
+def _inside(folder: Path, name: str, entry: str) -> Path:
+    """Path of a file that an entry names. Raises InputError unless it lies in the folder, links followed."""
+    expected = f"{entry}: expected a path inside the traverse folder"
+    for kind in (PurePosixPath, PureWindowsPath):
+        pure = kind(name)
+        if pure.is_absolute() or pure.drive or ".." in pure.parts:
+            raise InputError(f"{expected}, found {short(name)}")
+    try:
+        inside = (folder / name).resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError, ValueError) as error:  # a ring of links, a NUL in the name
+        raise InputError(f"{expected}, found {short(name)} ({error})") from error
+    if not inside:
+        raise InputError(f"{expected}, found {short(name)}, a link that leads out of it")
+    return folder / name
+
+
+def _unusable_images(files: list[Path | None], traverse: Traverse) -> dict[str, ImageError]:
+    """The image files that cannot be used, by id.
+
+    Raises ImageError for a mask that cannot be used and if no image file can, InputError for images of two
+    rovers.
+    """
+    hosts: dict[str, Path] = {}
+    masks: set[tuple[Path, int, int]] = set()
+    unusable: dict[int, ImageError] = {}
+    for row, file in enumerate(files):
+        if file is None:
+            continue
+        eye = int(traverse.image_eye[row])
+        camera = traverse.rig.eyes[eye].camera
+        mask = mask_file(traverse, row)
+        try:
+            # One mask most often serves many images.
+            if mask is not None and (mask, camera.width_px, camera.height_px) not in masks:
+                read_mask(mask, camera.width_px, camera.height_px, file.name)
+                masks.add((mask, camera.width_px, camera.height_px))
+        except ImageError as error:
+            raise _at(traverse, row, error) from error
+        try:
+            content = read_eye_content(file, traverse.rig, eye)
+        except ImageError as error:
+            unusable[row] = error
+            continue
+        if content.host is not None:
+            hosts.setdefault(content.host, file)
+            first = next(iter(hosts))
+            if content.host != first:
+                raise InputError(
+                    f"{file}: INSTRUMENT_HOST_ID: expected {first} as in {hosts[first].name}, "
+                    f"found {content.host}: images of two rovers"
+                )
+    named = [file for file in files if file is not None]
+    lost = traverse.observations is not None and not any(file.exists() for file in named)
+    if len(unusable) == len(named) > 0 and not lost:
+        row, first_error = next(iter(unusable.items()))
+        raise _at(traverse, row, first_error) from first_error
+    return {traverse.images[row].id: error for row, error in unusable.items()}
+
+
+def _at(traverse: Traverse, row: int, error: ImageError) -> ImageError:
+    """An error that says which entry of the traverse it is about."""
+    return ImageError(
+        f"{traverse.folder}/{_TRAVERSE_JSON}: images[{row}] ({traverse.images[row].id}): {error}"
+    )
+
+
+def _copies(traverse: Traverse, folder: Path) -> list[tuple[Path, Path]]:
+    if traverse.folder is None or traverse.folder.resolve() == folder.resolve():
+        return []
+    named = [
+        (f"images[{row}].{kind}", name)
+        for row, i in enumerate(traverse.images)
+        for kind, name in (("file", i.file), ("mask", i.mask))
+        if name is not None
+    ]
+    files = {folder / name: _inside(traverse.folder, name, entry) for entry, name in named}
+    for row in range(len(traverse.images)):
+        mask = mask_file(traverse, row)  # it may be known by its name alone
+        if mask is not None:
+            files[folder / mask.relative_to(traverse.folder)] = mask
+    for source in files.values():
+        if not source.is_file():
+            raise ImageError(f"{source}: expected an image file to copy along, found none")
+    return [(source, target) for target, source in files.items()]

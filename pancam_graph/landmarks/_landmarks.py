@@ -1,0 +1,326 @@
+"""Landmarks as unit 4-vectors: linear triangulation, refinement with cameras held, redundancy.
+
+A landmark is (X, w) on the sphere S^3 (thesis eq. 4.1, without its surplus scale), relative to an origin
+of its own near the cameras that see it: the point is origin + X / w. Projection is linear in (X, w) but
+for its division, so a ridge on the horizon (w near 0) is an ordinary landmark, and one that starts beyond
+infinity (w below 0) can come back.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.base.threads import in_parallel
+from pancam_graph.landmarks import kernel
+from pancam_graph.landmarks._losses import SQUARED, Loss
+
+_GRAIN = 1024
+_RAY_GRAIN = 16384
+SETTLED = 1e-9
+"""A landmark is refined until that promises no more than this share of its cost."""
+
+__all__ = [
+    "SETTLED",
+    "CameraViews",
+    "Landmarks",
+    "Measurements",
+    "evaluate",
+    "free_derivatives",
+    "point_sigma_m",
+    "rays_of",
+    "refine",
+    "residual_cofactor",
+    "residuals",
+    "triangulate",
+]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraViews:
+    """Pinhole cameras of all images."""
+
+    world_R_camera: FloatArray
+    """(images, 3, 3)"""
+    world_t_camera: FloatArray
+    """(images, 3) metres"""
+    calibration: FloatArray
+    """(images, 3, 3) upper-triangular K"""
+
+    @cached_property
+    def to_pixel(self) -> FloatArray:
+        """(images, 3, 3) K camera_R_world: takes world directions to homogeneous pixels."""
+        return np.asarray(self.calibration @ self.world_R_camera.transpose(0, 2, 1))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Measurements:
+    """Observations as pinhole pixels, sorted by landmark; n rows."""
+
+    row: IntArray
+    """(n,) row in the traverse's observations"""
+    image: IntArray
+    """(n,)"""
+    landmark: IntArray
+    """(n,) landmark row, ascending, without gaps"""
+    uv_px: FloatArray
+    """(n, 2) pixels of the pinhole of the same camera"""
+    whitening: FloatArray
+    """(n, 2, 2) takes a residual of the pinhole to raw pixels, and these to unit covariance"""
+
+    @property
+    def n_landmarks(self) -> int:
+        """Number of landmarks."""
+        return int(self.landmark[-1]) + 1 if len(self.landmark) else 0
+
+    @cached_property
+    def begin(self) -> IntArray:
+        """(landmarks + 1,) first row of each landmark, and n."""
+        return _begin(self.landmark)
+
+    @property
+    def starts(self) -> IntArray:
+        """(landmarks,) first row of each landmark."""
+        return self.begin[:-1]
+
+    @cached_property
+    def typical_sigma_px(self) -> float:
+        """Median standard deviation of a measurement's coordinate."""
+        w = self.whitening
+        return float(np.median(1 / np.sqrt(np.abs(w[:, 0, 0] * w[:, 1, 1] - w[:, 0, 1] * w[:, 1, 0]))))
+
+    def part(self, rows: IntArray) -> "Measurements":
+        """Rows of whole landmarks, ascending; landmarks numbered anew without gaps."""
+        landmark = self.landmark[rows]
+        return replace(
+            self,
+            row=self.row[rows],
+            image=self.image[rows],
+            landmark=np.cumsum(np.diff(landmark, prepend=landmark[:1]) > 0),
+            uv_px=self.uv_px.take(rows, axis=0),
+            whitening=self.whitening.take(rows, axis=0),
+        )
+
+    def scaled(self, factor: FloatArray | float) -> "Measurements":
+        """The same with every sigma multiplied by a factor, one for all or (n,)."""
+        return replace(self, whitening=self.whitening / np.reshape(factor, (-1, 1, 1)))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Landmarks:
+    """Unit 4-vectors with their origins."""
+
+    vector: FloatArray
+    """(landmarks, 4) (X, w) of unit length, its sign such that most cameras have it in front"""
+    origin_m: FloatArray
+    """(landmarks, 3) world point that X / w is relative to"""
+
+    @cached_property
+    def length(self) -> FloatArray:
+        """(landmarks,) of X; the distance from the origin is that over w."""
+        x = self.vector[:, :3]
+        return np.asarray(np.sqrt(np.einsum("ij,ij->i", x, x)))
+
+    def points_m(self, furthest_m: FloatArray) -> FloatArray:
+        """World points (landmarks, 3); those further than `furthest_m` (landmarks,) are brought to it.
+
+        A landmark beyond infinity is placed at that distance too; one without a direction at its origin.
+        """
+        x, w = self.vector[:, :3], self.vector[:, 3]
+        depth = np.maximum(w, self.length / furthest_m).clip(1e-300)
+        return np.asarray(self.origin_m + x / depth[:, None])
+
+    def about(self, origin_m: FloatArray) -> "Landmarks":
+        """The same points relative to other origins (landmarks, 3)."""
+        x = self.vector[:, :3] + self.vector[:, 3:] * (self.origin_m - origin_m)
+        vector = np.column_stack([x, self.vector[:, 3]])
+        return Landmarks(vector=vector / np.linalg.norm(vector, axis=1, keepdims=True), origin_m=origin_m)
+
+    def moved_to(self, points_m: FloatArray) -> "Landmarks":
+        """Landmarks of the same origins at world points (landmarks, 3)."""
+        vector = np.column_stack([points_m - self.origin_m, np.ones(len(points_m))])
+        return replace(self, vector=vector / np.linalg.norm(vector, axis=1, keepdims=True))
+
+
+def triangulate(
+    centre_m: FloatArray, direction: FloatArray, landmark: IntArray, weight: FloatArray
+) -> Landmarks:
+    """Linear triangulation in homogeneous coordinates from n rays sorted by landmark.
+
+    Ray centres (n, 3), unit directions (n, 3), landmark rows (n,) ascending without gaps, weights (n,).
+    Minimises the weighted squared distances |(I - d d')(X - w c)|^2 over unit (X, w), w in units of the
+    baseline across the rays so that the answer is the same in any unit of length; then once more with
+    weights divided by the squared ranges so that angles count, not metres. One ray alone, or rays along
+    one line, show no parallax: the landmark then lies on them at infinity. Where all weights of a landmark
+    are 0, all its rays count alike.
+    """
+    begin, n = _begin(landmark), len(landmark)
+    centre_m, direction = as_floats(centre_m, (n, 3)), as_floats(direction, (n, 3))
+    weight = as_floats(weight, (n,))
+    vector, origin = np.empty((len(begin) - 1, 4)), np.empty((len(begin) - 1, 3))
+    over_landmarks(
+        kernel.triangulate, np.arange(len(vector)), begin, centre_m, direction, weight, vector, origin
+    )
+    return Landmarks(vector=vector, origin_m=origin)
+
+
+def rays_of(measurements: Measurements, views: CameraViews) -> tuple[FloatArray, FloatArray]:
+    """Centres (n, 3) and unit directions (n, 3) of the measurements' lines of sight, in the world."""
+    seen = seen_by(measurements, views)
+    n_images, direction = len(views.calibration), np.empty((len(seen.image), 3))
+    calibration = as_floats(views.calibration, (n_images, 3, 3))
+    rotation = as_floats(views.world_R_camera, (n_images, 3, 3))
+    in_parallel(
+        lambda first, last: kernel.rays(
+            seen.image, seen.uv_px, calibration, rotation, first, last, direction
+        ),
+        len(direction),
+        grain=_RAY_GRAIN,
+    )
+    return views.world_t_camera[seen.image], direction
+
+
+def evaluate(
+    landmarks: Landmarks, measurements: Measurements, views: CameraViews
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Whitened residuals (n, 2), their derivatives (n, 2, 3) by the tangents of S^3, and what is in front.
+
+    Residuals of landmarks behind a camera are those of the mirrored point and mean nothing.
+    """
+    seen, n = seen_by(measurements, views), len(measurements.image)
+    vector, origin = _arrays(landmarks, measurements)
+    residual, b, in_front = np.empty((n, 2)), np.empty((n, 2, 3)), np.empty(n, dtype=bool)
+    over_landmarks(kernel.evaluate, np.arange(len(vector)), seen, vector, origin, residual, b, in_front)
+    return residual, b, in_front
+
+
+def residuals(
+    landmarks: Landmarks, measurements: Measurements, views: CameraViews
+) -> tuple[FloatArray, BoolArray]:
+    """`evaluate` without derivatives: whitened residuals (n, 2), and what is in front (n,)."""
+    seen, n = seen_by(measurements, views), len(measurements.image)
+    vector, origin = _arrays(landmarks, measurements)
+    residual, in_front = np.empty((n, 2)), np.empty(n, dtype=bool)
+    over_landmarks(kernel.residuals, np.arange(len(vector)), seen, vector, origin, residual, in_front)
+    return residual, in_front
+
+
+def free_derivatives(b: FloatArray, landmarks: Landmarks, measurements: Measurements) -> FloatArray:
+    """`evaluate`'s derivatives (n, 2, 3) along those directions that `refine` leaves free.
+
+    A landmark that `refine` holds at infinity (w is 0) does not follow its observations beyond it: its
+    derivatives lose their part along w.
+    """
+    vector, _ = _arrays(landmarks, measurements)
+    free: FloatArray = as_floats(b, (len(measurements.image), 2, 3)).copy()
+    over_landmarks(kernel.free_derivatives, np.arange(len(vector)), measurements.begin, vector, free)
+    return free
+
+
+def refine(
+    landmarks: Landmarks,
+    measurements: Measurements,
+    views: CameraViews,
+    weight: FloatArray,
+    loss: Loss = SQUARED,
+    *,
+    beyond_infinity: bool = False,
+    only: IntArray | None = None,
+) -> Landmarks:
+    """Best landmarks with all cameras held: Levenberg-Marquardt for each on its own.
+
+    `only` are the rows of those to refine; default: all.
+
+    `weight` (n,) multiplies each observation's cost; 0 leaves it out. A step that would raise a landmark's
+    cost or move it behind a camera is not taken; directions that its rays leave free are not moved along.
+    Landmarks whose rays diverge end at infinity, or beyond it where that is allowed.
+    """
+    seen = seen_by(measurements, views)
+    start, origin = _arrays(landmarks, measurements)
+    own, vector = as_floats(weight, (len(measurements.image),)), start.copy()
+    which = np.arange(len(vector)) if only is None else only
+    over_landmarks(
+        kernel.refine, which, seen, origin, own, loss.kind, loss.width, beyond_infinity, SETTLED, vector
+    )
+    return replace(landmarks, vector=vector)
+
+
+def residual_cofactor(b: FloatArray, measurements: Measurements, weight: FloatArray) -> FloatArray:
+    """Covariance (n, 2, 2) of whitened residuals, cameras taken as known: what noise alone makes of them.
+
+    For observations that take part (weight above 0) it is I - B V^-1 B', since the landmark follows them;
+    for the others I + B V^-1 B'. `b` (n, 2, 3) are `evaluate`'s derivatives. Source: Baarda, A testing
+    procedure for use in geodetic networks, 1968.
+    """
+    n = len(measurements.image)
+    derivatives, own, out = as_floats(b, (n, 2, 3)), as_floats(weight, (n,)), np.empty((n, 2, 2))
+    which = np.arange(measurements.n_landmarks)
+    over_landmarks(kernel.cofactors, which, measurements.begin, derivatives, own, out)
+    return out
+
+
+def point_sigma_m(
+    points_m: FloatArray, measurements: Measurements, views: CameraViews, accepted: BoolArray
+) -> FloatArray:
+    """Standard deviation (landmarks,) of world points (landmarks, 3) in their worst direction, cameras held.
+
+    That direction is the line of sight but for points between their cameras. Infinite for landmarks that
+    fewer than two accepted observations see.
+    """
+    seen, n = seen_by(measurements, views), measurements.n_landmarks
+    points, weight = as_floats(points_m, (n, 3)), as_floats(accepted, (len(measurements.image),))
+    smallest = np.empty(n)
+    over_landmarks(kernel.smallest_information, np.arange(n), seen, points, weight, smallest)
+    few = np.bincount(measurements.landmark, weight, minlength=n) < 2
+    return np.where(few | (smallest <= 0), np.inf, 1 / np.sqrt(smallest.clip(1e-300)))
+
+
+def over_landmarks(
+    loop: Callable[..., None], which: IntArray, *arguments: object, grain: int = _GRAIN
+) -> None:
+    """Call loop(part, *arguments) for parts of the landmarks `which`, over all threads."""
+    in_parallel(lambda first, last: loop(which[first:last], *arguments), len(which), grain=grain)
+
+
+# --- arrays as the compiled loops take them ---
+
+
+def as_floats(array: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+    """The array as contiguous float64; raises ValueError where its shape is another.
+
+    Writable, so that every caller's arrays are of one type and a loop is compiled once.
+    """
+    floats: FloatArray = np.require(array, np.float64, ["C", "W"])
+    if floats.shape != shape:
+        raise ValueError(f"expected an array of shape {shape}, found {floats.shape}")
+    return floats
+
+
+def seen_by(measurements: Measurements, views: CameraViews) -> kernel.Seen:
+    """Measurements with the cameras that made them. Raises IndexError for an image without a camera."""
+    n, n_images = len(measurements.image), len(views.world_t_camera)
+    image = np.require(measurements.image, np.int64, ["C", "W"])
+    if n and not 0 <= image.min() <= image.max() < n_images:
+        raise IndexError(f"image: expected 0 to {n_images - 1}, found {image.min()} to {image.max()}")
+    return kernel.Seen(
+        begin=measurements.begin,
+        image=image,
+        uv_px=as_floats(measurements.uv_px, (n, 2)),
+        whitening=as_floats(measurements.whitening, (n, 2, 2)),
+        to_pixel=as_floats(views.to_pixel, (n_images, 3, 3)),
+        centre_m=as_floats(views.world_t_camera, (n_images, 3)),
+    )
+
+
+def _arrays(landmarks: Landmarks, measurements: Measurements) -> tuple[FloatArray, FloatArray]:
+    """Vectors (landmarks, 4) and origins (landmarks, 3), as many as measurements tell of."""
+    n = measurements.n_landmarks
+    return as_floats(landmarks.vector, (n, 4)), as_floats(landmarks.origin_m, (n, 3))
+
+
+def _begin(landmark: IntArray) -> IntArray:
+    n_landmarks = int(landmark[-1]) + 1 if len(landmark) else 0
+    return np.searchsorted(landmark, np.arange(n_landmarks + 1)).astype(np.int64, copy=False)

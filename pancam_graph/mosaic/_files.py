@@ -1,0 +1,232 @@
+"""Mosaics as files: pictures, pictures with axes, and where their pixels are in the world."""
+
+import json
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pancam_graph.base.errors import InputError
+from pancam_graph.data import Solution
+from pancam_graph.io import MOSAIC_FORMAT, VERSION
+from pancam_graph.mosaic._draw import close_ups, comparison, with_axes
+from pancam_graph.mosaic._make import Mosaic, StopGround, StopMosaics, make_mosaics, stop_ground
+from pancam_graph.mosaic._options import MosaicOptions
+from pancam_graph.mosaic._placed import POINTINGS, Pointing, copies
+from pancam_graph.mosaic._projections import Cylinder
+from pancam_graph.mosaic._seam_error import CASES, Case
+
+__all__ = ["MOSAIC_INDEX", "Blink", "WrittenMosaics", "write_mosaics"]
+
+MOSAIC_INDEX = "mosaics.json"
+"""The file in a folder of mosaics that lists the others."""
+_MAX_NAME = 40
+_QUALITY = 88
+_BLINK_BUDGET = 6_000_000
+"""Bytes that the pictures for the report may take together."""
+_BLINK_QUALITY = 80
+_BLINK_WIDTH_PX = 1500
+_BLINK_GROUND_PX = 800
+_CLOSE_UPS = 4
+
+Json = dict[str, object]
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Blink:
+    """Two pictures of the same, one with each pointing, that the report shows in turn."""
+
+    group: str
+    """Stop and camera."""
+    title: str
+    captions: dict[Pointing, str]
+    """What is said under each."""
+    jpeg: dict[Pointing, bytes]
+    width_px: int
+    height_px: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class WrittenMosaics:
+    """What `write_mosaics` wrote, for the report and for the list of warnings."""
+
+    blinks: tuple[Blink, ...]
+    lines: tuple[str, ...]
+    """The seam error of each panorama, in words."""
+    warnings: tuple[str, ...]
+
+
+def write_mosaics(
+    solution: Solution,
+    folder: Path,
+    options: MosaicOptions = MosaicOptions(),  # noqa: B008  frozen
+    *,
+    progress: Progress | None = None,
+) -> WrittenMosaics:
+    """Write the mosaics of every eye at every stop into a folder, which must exist (docs/files.md).
+
+    What cannot be shown, an image or all images of an eye at a stop, becomes a warning. `progress` is called
+    with a stage, how many of its parts are done, and how many there are.
+    """
+    traverse = solution.traverse
+    pairs = sorted(set(zip(traverse.image_stop.tolist(), traverse.image_eye.tolist(), strict=True)))
+    entries: list[Json] = []
+    blinks: list[Blink] = []
+    lines, warnings = [], []
+    ground: tuple[int, StopGround] | None = None
+    twice = copies(traverse)
+    spent = 0
+    for n, (stop, eye) in enumerate(pairs):
+        stop_id, camera = traverse.stops[stop].id, traverse.rig.eyes[eye].name
+        try:
+            if ground is None or ground[0] != stop:
+                ground = stop, stop_ground(solution, stop, twice)
+            made = make_mosaics(solution, stop_id, camera, options, ground=ground[1])
+        except InputError as error:
+            warnings.append(str(error))
+        else:
+            name = f"{stop + 1:03d}-{eye + 1}_{_plain(stop_id)}_{_plain(camera)}"
+            title = f"stop {stop_id}, camera {camera}"
+            entries += _write(made, folder, name, title)
+            lines.append(f"{title}: {_in_words(made)}")
+            warnings += made.warnings
+            if spent < _BLINK_BUDGET:
+                new = _blinks(made, title)
+                spent += sum(len(data) for blink in new for data in blink.jpeg.values())
+                blinks += new
+        if progress is not None:
+            progress("mosaics", n + 1, len(pairs))
+    index = {"format": MOSAIC_FORMAT, "version": VERSION, "mosaics": entries}
+    text = json.dumps(index, indent=1, allow_nan=False, ensure_ascii=False)
+    (folder / MOSAIC_INDEX).write_text(text + "\n", encoding="utf-8", newline="\n")
+    return WrittenMosaics(blinks=tuple(blinks), lines=tuple(lines), warnings=tuple(warnings))
+
+
+def _plain(name: str) -> str:
+    """A name as every file system takes it; numbers before it keep files apart."""
+    return re.sub(r"[^A-Za-z0-9]+", "-", name).strip("-")[:_MAX_NAME] or "x"
+
+
+def _in_words(made: StopMosaics) -> str:
+    seams = made.seams
+    if not seams.used:
+        return "no overlap with texture enough to measure a seam error"
+    own = seams.median_px("telemetry_own_surface")
+    return (
+        f"seam error {seams.median_px('telemetry'):.2f} px with telemetry ({own:.2f} px on the surface that "
+        f"its own landmarks span), {seams.median_px('refined'):.2f} px refined; median of {seams.used} "
+        f"windows in {len(seams.overlaps)} overlaps"
+    )
+
+
+def _write(made: StopMosaics, folder: Path, name: str, title: str) -> list[Json]:
+    """Write the pictures of a stop's eye; their entries in the index."""
+    entries = []
+    for kind, mosaic in (("cylinder", made.cylinder), ("ground", made.ground)):
+        if mosaic is None:
+            continue
+        files: Json = {}
+        for pointing in POINTINGS:
+            plain, drawn = (f"{name}_{kind}_{pointing}{end}" for end in (".png", "_axes.jpg"))
+            _save(folder / plain, mosaic.pictures[pointing])
+            _save(folder / drawn, with_axes(mosaic, pointing, f"{title}: {_POINTING[pointing]} pointing"))
+            files |= {pointing: plain, f"{pointing}_axes": drawn}
+            if mosaic.samples is not None:
+                deep = f"{name}_{kind}_{pointing}_16bit.png"
+                _save(folder / deep, mosaic.samples[pointing])
+                files[f"{pointing}_16bit"] = deep
+        if kind == "cylinder":
+            files["comparison"] = f"{name}_comparison.jpg"
+            _save(folder / f"{name}_comparison.jpg", comparison(made, title))
+        entry: Json = {"stop": made.stop, "camera": made.camera, "kind": kind, "images": list(made.images)}
+        entry |= {"files": files} | _place(mosaic)
+        entry |= {"dark": mosaic.dark, "bright": mosaic.bright}
+        if kind == "cylinder":
+            entry["brightness"] = _brightness(made)
+            entry["seam_error"] = _seam_error(made)
+        entries.append(entry)
+    return entries
+
+
+_POINTING: dict[Pointing, str] = {"telemetry": "telemetry's", "refined": "refined"}
+
+
+def _place(mosaic: Mosaic) -> Json:
+    p = mosaic.projection
+    place: Json = {"width_px": p.width_px, "height_px": p.height_px, "origin_m": p.origin_m.tolist()}
+    if isinstance(p, Cylinder):
+        return place | {
+            "px_per_degree": p.px_per_degree,
+            "left_azimuth_deg": p.left_deg,
+            "top_elevation_deg": p.top_deg,
+            "closed": p.closed,
+        }
+    return place | {
+        "m_per_px": p.m_per_px,
+        "left_x_m": float(p.origin_m[0]) + p.left_m,
+        "top_y_m": float(p.origin_m[1]) + p.top_m,
+    }
+
+
+def _brightness(made: StopMosaics) -> Json:
+    evening = made.evening
+    gains = {name: evening.gain.get(n) for n, name in enumerate(made.images)}
+    return {"gain": gains, "vignetting": evening.vignetting.tolist(), "vignetting_sigma": evening.sigma}
+
+
+def _seam_error(made: StopMosaics) -> Json:
+    def medians(median_px: Callable[[Case], float]) -> Json:
+        found = {case: median_px(case) for case in CASES}
+        return {f"{case}_px": None if math.isnan(px) else px for case, px in found.items()}
+
+    overlaps: list[Json] = []
+    for o in made.seams.overlaps:
+        counts = {"windows": o.windows, "plain": o.plain, "unlike": o.unlike, "used": len(o.azimuth_deg)}
+        overlaps.append({"images": list(o.images), **counts, **medians(o.median_px)})
+    return {"used": made.seams.used, **medians(made.seams.median_px), "overlaps": overlaps}
+
+
+def _save(path: Path, picture: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
+    path.write_bytes(_encoded(picture, path.suffix, _QUALITY))
+
+
+def _encoded(picture: NDArray[np.uint8] | NDArray[np.uint16], suffix: str, quality: int) -> bytes:
+    setting = [cv2.IMWRITE_JPEG_QUALITY, quality] if suffix == ".jpg" else []
+    done, data = cv2.imencode(suffix, picture, setting)
+    assert done
+    return data.tobytes()
+
+
+def _blinks(made: StopMosaics, group: str) -> list[Blink]:
+    """The panorama, pieces of its overlaps, and the view from above."""
+    found = [_blink_of(made.cylinder, group, "panorama", _BLINK_WIDTH_PX)]
+    for k, pieces in close_ups(made, _CLOSE_UPS):
+        overlap = made.seams.overlaps[k]
+        captions: dict[Pointing, str] = {
+            "telemetry": f"telemetry: displaced by {overlap.median_px('telemetry'):.2f} px (median)",
+            "refined": f"refined: displaced by {overlap.median_px('refined'):.2f} px (median)",
+        }
+        title = f"overlap of {overlap.images[0]} and {overlap.images[1]}"
+        found.append(_blink(group, title, captions, pieces))
+    if made.ground is not None:
+        found.append(_blink_of(made.ground, group, "from above", _BLINK_GROUND_PX))
+    return found
+
+
+def _blink_of(mosaic: Mosaic, group: str, title: str, width_px: int) -> Blink:
+    captions = {p: f"{_POINTING[p]} pointing" for p in POINTINGS}
+    return _blink(group, title, captions, {p: with_axes(mosaic, p, "", width_px) for p in POINTINGS})
+
+
+def _blink(
+    group: str, title: str, captions: dict[Pointing, str], pictures: dict[Pointing, NDArray[np.uint8]]
+) -> Blink:
+    height, width = pictures["refined"].shape[:2]
+    jpeg = {p: _encoded(pictures[p], ".jpg", _BLINK_QUALITY) for p in POINTINGS}
+    return Blink(group=group, title=title, captions=captions, jpeg=jpeg, width_px=width, height_px=height)

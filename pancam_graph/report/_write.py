@@ -1,0 +1,20 @@
+"""The report as a file."""
+
+from pathlib import Path
+
+from pancam_graph.data import Solution
+from pancam_graph.mosaic import WrittenMosaics
+from pancam_graph.report._page import make_page
+
+__all__ = ["write_report"]
+
+
+def write_report(solution: Solution, path: Path | str, mosaics: WrittenMosaics | None = None) -> None:
+    """Write the report of a solution as one self-contained HTML file.
+
+    It needs no network: Plotly's script is inside, compressed. The same solution gives the same bytes. An
+    existing file is replaced; its folder must exist. Pictures are taken from the traverse's folder where
+    it has image files that can be read; where not, residuals are drawn on an empty frame. `mosaics` are what
+    `write_mosaics` wrote beside; the page has a section of them then.
+    """
+    Path(path).write_text(make_page(solution, mosaics), encoding="utf-8", newline="\n")

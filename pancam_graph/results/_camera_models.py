@@ -1,0 +1,77 @@
+"""The refined cameras of a solution as CAHV, CAHVOR and CAHVORE text files, one an image."""
+
+from pathlib import Path
+
+import gtsam
+import numpy as np
+
+from pancam_graph.base.errors import CameraError, InputError
+from pancam_graph.cameras import CAHV, Camera, as_cahv
+from pancam_graph.data import Solution, Traverse
+from pancam_graph.io import cahvor_text
+from pancam_graph.results._exported import file_names, whole_export, write_export_json
+
+__all__ = ["fill_cameras", "require_cahv_family", "world_models", "write_cameras"]
+
+_FRAME = (
+    "frame: the world of the traverse, z up, right-handed, metres",
+    "a site frame that is z down (PDS labels) has y and z, of points and of vectors, with the other sign",
+    "pixels: the centre of the first is (0, 0); S: zeros, not known",
+)
+
+
+def write_cameras(solution: Solution, folder: Path | str) -> None:
+    """Write each image's refined camera as a text file, `IMAGE.cahvor`, into the folder `folder`.
+
+    Vectors are in the world frame of the traverse, z up. A camera keeps the model that the rig has; a pinhole
+    is written as CAHV, a Brown lens with k1 and k2 alone as CAHVOR: both exactly. Whole or not at all: an
+    older export is replaced at the end. Images without a finite pose are left out. `export.json` says which
+    file is of which image.
+
+    Raises InputError for a Brown lens with p1, p2 or k3, which the family cannot say, for a folder with
+    anything else in it, and where writing fails.
+    """
+    with whole_export(Path(folder)) as partial:
+        fill_cameras(solution, partial)
+
+
+def fill_cameras(solution: Solution, folder: Path) -> None:
+    """Write the files of `write_cameras` into an empty folder."""
+    require_cahv_family(solution.traverse)
+    images = solution.traverse.images
+    names = file_names([image.id for image in images])
+    listed = []
+    for image, name, model in zip(images, names, world_models(solution), strict=True):
+        if model is not None:
+            text = cahvor_text(model, [f"pancam_graph, image {image.id.replace('=', '-')}", *_FRAME])
+            (folder / f"{name}.cahvor").write_text(text, encoding="utf-8", newline="\n")
+            listed.append({"id": image.id, "file": f"{name}.cahvor"})
+    write_export_json(folder, "cahvor", {"frame": "world", "images": listed})
+
+
+def world_models(solution: Solution) -> list[CAHV | None]:
+    """Each image's refined camera with its vectors in the world frame; None without a finite pose."""
+    made: dict[int, CAHV] = {}
+    out: list[CAHV | None] = []
+    for camera, rotation, centre in zip(
+        solution.image_cameras, solution.final.world_R_camera, solution.final.world_t_camera, strict=True
+    ):
+        if not (np.isfinite(rotation).all() and np.isfinite(centre).all()):
+            out.append(None)
+            continue
+        model = made.setdefault(id(camera), as_cahv(camera))
+        out.append(model.transformed(gtsam.Pose3(gtsam.Rot3(rotation), centre)))
+    return out
+
+
+def require_cahv_family(traverse: Traverse) -> None:
+    """Raise InputError naming a camera that no CAHV, CAHVOR or CAHVORE model is the equal of."""
+    for eye in traverse.rig.eyes:
+        _require(eye.name, eye.camera)
+
+
+def _require(name: str, camera: Camera) -> None:
+    try:
+        as_cahv(camera)
+    except CameraError as error:
+        raise InputError(f"cahvor: camera {name}: {error}") from error

@@ -1,0 +1,268 @@
+"""The numbers of a solution: `solution.json`."""
+
+import json
+import math
+from pathlib import Path
+from typing import Annotated, Literal
+
+import gtsam
+import numpy as np
+from pydantic import Field
+
+from pancam_graph.base.geometry import FloatArray, IntArray
+from pancam_graph.data import Incremental, Solution
+from pancam_graph.io import (
+    SOLUTION_FORMAT,
+    VERSION,
+    CameraEntry,
+    Entry,
+    PoseEntry,
+    camera_entry,
+    read_json,
+    validated,
+)
+from pancam_graph.results._cross_validation import CrossValidationEntry
+
+__all__ = ["SolutionFile", "read_solution_json", "solution_file", "solution_json"]
+
+Vector6 = Annotated[list[float], Field(min_length=6, max_length=6)]
+
+
+class SecondsEntry(Entry):
+    """Wall-clock time of each part."""
+
+    read: float
+    initialise: float
+    solve: float
+    report: float
+
+
+class BeforeAfterEntry(Entry):
+    """A number at the start and at the end; null where it is not defined."""
+
+    initial: float | None
+    final: float | None
+
+
+class CountsEntry(Entry):
+    """How many observations took part, and how many did not."""
+
+    used: int
+    rejected: int
+
+
+class SolvedStopEntry(Entry):
+    """Mast pose of a stop; null where it is not finite."""
+
+    id: str
+    world_T_mast: PoseEntry | None
+    covariance: Annotated[list[Vector6], Field(min_length=6, max_length=6)] | None
+    """6 x 6, rotation first, body frame; 0 for a held stop, null where unknown."""
+
+
+class SolvedFrameEntry(Entry):
+    """Angles of a frame with their formal standard deviations; null where not finite."""
+
+    id: str
+    pan_rad: float | None
+    tilt_rad: float | None
+    sigma_pan_rad: float | None
+    sigma_tilt_rad: float | None
+
+
+class SolvedImageEntry(Entry):
+    """Camera pose of an image; count and RMS residual length of its used observations."""
+
+    id: str
+    world_T_camera: PoseEntry | None
+    rms_px: float | None
+    """Null without used observations."""
+    observations: int
+
+
+class RefinedEntry(Entry):
+    """An entry of the rig that was free; null where there is none: no such owner, or not finite."""
+
+    quantity: Literal["calibration", "mounts", "pan_T_tilt", "radius"]
+    entry: str
+    camera: str | None
+    stop: str | None
+    image: str | None
+    nominal: float | None
+    change: float | None
+    sigma: float | None
+    prior_sigma: float | None
+
+
+class IncrementalEntry(Entry):
+    """What each stop took, in order."""
+
+    seconds_per_stop: list[float]
+    cost_per_stop: list[float]
+    relinearised_per_stop: list[int]
+
+    @staticmethod
+    def of(found: Incremental) -> "IncrementalEntry":
+        """The entry of what a smoother did."""
+        return IncrementalEntry(
+            seconds_per_stop=[float(s) for s in found.seconds_per_stop],
+            cost_per_stop=[float(c) for c in found.cost_per_stop],
+            relinearised_per_stop=[int(n) for n in found.relinearised_per_stop],
+        )
+
+
+class SolutionFile(Entry):
+    """`solution.json`."""
+
+    format: Literal["pancam-graph/solution"] = "pancam-graph/solution"
+    version: Literal[1] = 1
+    model: str
+    landmarks: str
+    converged: bool
+    stop_reason: str
+    iterations: int
+    seconds: SecondsEntry
+    cost: BeforeAfterEntry
+    """Half the sum of squares, priors included."""
+    rms_px: BeforeAfterEntry
+    observations: CountsEntry
+    stops: list[SolvedStopEntry]
+    frames: list[SolvedFrameEntry]
+    images: list[SolvedImageEntry]
+    cameras: list[CameraEntry]
+    """As the cameras of a rig in `traverse.json`, refined where an eye has one correction for all images."""
+    method: str = "joint"
+    """The key is missing where it was joint."""
+    refined: list[RefinedEntry] = Field(default_factory=list)
+    """Entries of the rig that were free; no such key where none was."""
+    warnings: list[str]
+    cross_validation: CrossValidationEntry | None = None
+    """Where it was asked for; else the key is missing."""
+    incremental: IncrementalEntry | None = None
+    """Where stops were added one by one; else the key is missing."""
+
+
+def read_solution_json(path: Path | str) -> SolutionFile:
+    """Read a `solution.json`. Raises InputError naming file, entry, expected and found."""
+    path = Path(path)
+    return validated(SolutionFile, read_json(path, SOLUTION_FORMAT, VERSION), path)
+
+
+def solution_json(solution: Solution) -> bytes:
+    """A solution as the content of `solution.json`; null in place of what is not finite."""
+    missing = {
+        "method": solution.method == "joint",
+        "refined": not solution.refined,
+        "cross_validation": solution.cross_validation is None,
+        "incremental": solution.incremental is None,
+    }
+    data = solution_file(solution).model_dump(exclude={name for name, gone in missing.items() if gone})
+    return f"{json.dumps(data, indent=1, allow_nan=False, ensure_ascii=False)}\n".encode()
+
+
+def solution_file(solution: Solution) -> SolutionFile:
+    """A solution as the model of its file."""
+    traverse, final = solution.traverse, solution.final
+    stops = [
+        SolvedStopEntry(id=stop.id, world_T_mast=_pose(pose), covariance=_covariance(covariance))
+        for stop, pose, covariance in zip(
+            traverse.stops, final.world_T_mast, solution.stop_covariance, strict=True
+        )
+    ]
+    frames = [
+        SolvedFrameEntry(
+            id=frame.id,
+            pan_rad=_number(angles[0]),
+            tilt_rad=_number(angles[1]),
+            sigma_pan_rad=_number(sigmas[0]),
+            sigma_tilt_rad=_number(sigmas[1]),
+        )
+        for frame, angles, sigmas in zip(
+            traverse.frames, final.pan_tilt_rad, solution.angle_sigma_rad, strict=True
+        )
+    ]
+    seconds, validation = solution.seconds, solution.cross_validation
+    n_used = int(np.count_nonzero(solution.used))
+    return SolutionFile(
+        model=solution.model,
+        landmarks=solution.landmarks,
+        converged=bool(solution.converged),
+        stop_reason=solution.stop_reason,
+        iterations=int(solution.iterations),
+        seconds=SecondsEntry(
+            read=float(seconds.read),
+            initialise=float(seconds.initialise),
+            solve=float(seconds.solve),
+            report=float(seconds.report),
+        ),
+        cost=BeforeAfterEntry(initial=_number(solution.cost_initial), final=_number(solution.cost_final)),
+        rms_px=BeforeAfterEntry(
+            initial=_number(solution.rms_initial_px) if n_used else None,
+            final=_number(solution.rms_final_px) if n_used else None,
+        ),
+        observations=CountsEntry(used=n_used, rejected=len(solution.used) - n_used),
+        stops=stops,
+        frames=frames,
+        images=_images(solution),
+        cameras=[camera_entry(e) for e in solution.rig.eyes],
+        refined=[
+            RefinedEntry(
+                quantity=r.quantity,
+                entry=r.entry,
+                camera=r.camera,
+                stop=r.stop,
+                image=r.image,
+                nominal=r.nominal,
+                change=_number(r.change),
+                sigma=_number(r.sigma),
+                prior_sigma=_number(r.prior_sigma),
+            )
+            for r in solution.refined
+        ],
+        # What the reader noticed comes first, once, whether or not the solver passed it on.
+        warnings=list(dict.fromkeys([*traverse.warnings, *solution.warnings])),
+        method=solution.method,
+        cross_validation=None if validation is None else CrossValidationEntry.of(validation, traverse),
+        incremental=None if solution.incremental is None else IncrementalEntry.of(solution.incremental),
+    )
+
+
+def _images(solution: Solution) -> list[SolvedImageEntry]:
+    traverse, final = solution.traverse, solution.final
+    n = len(traverse.images)
+    count: IntArray = np.zeros(n, dtype=np.int64)
+    squared: FloatArray = np.zeros(n)
+    if traverse.observations is not None:
+        image = traverse.observations.image[solution.used]
+        length2 = np.sum(solution.residual_final_px[solution.used] ** 2, axis=1)
+        count = np.bincount(image, minlength=n)
+        squared = np.asarray(np.bincount(image, weights=length2, minlength=n), dtype=float)
+    return [
+        SolvedImageEntry(
+            id=entry.id,
+            world_T_camera=_pose_of(rotation, translation),
+            rms_px=_number(np.sqrt(total / views)) if views else None,
+            observations=int(views),
+        )
+        for entry, rotation, translation, views, total in zip(
+            traverse.images, final.world_R_camera, final.world_t_camera, count, squared, strict=True
+        )
+    ]
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _pose(pose: gtsam.Pose3) -> PoseEntry | None:
+    return PoseEntry.of(pose) if np.isfinite(pose.matrix()).all() else None
+
+
+def _pose_of(rotation: FloatArray, translation: FloatArray) -> PoseEntry | None:
+    if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
+        return None
+    return PoseEntry.of(gtsam.Pose3(gtsam.Rot3(rotation), translation))
+
+
+def _covariance(covariance: FloatArray) -> list[list[float]] | None:
+    return covariance.tolist() if np.isfinite(covariance).all() else None

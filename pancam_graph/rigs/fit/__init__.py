@@ -1,0 +1,1 @@
+"""Fit of a rig to cameras whose poses are known."""

@@ -1,0 +1,107 @@
+"""A traverse followed stop by stop, as the rover would have: its solution, and what each stop took."""
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from pancam_graph.base.errors import InputError
+from pancam_graph.base.geometry import IntArray
+from pancam_graph.base.threads import blas_on_one_thread
+from pancam_graph.data import Frame, Image, Incremental, Observations, Seconds, Solution, Stop, Traverse
+from pancam_graph.smoother._options import SmootherOptions, Update
+from pancam_graph.smoother._smoother import TraverseSmoother
+from pancam_graph.solve import Adjustment, SolveOptions
+
+__all__ = ["solve_incrementally", "stops_of"]
+
+_LOG = logging.getLogger(__name__)
+
+
+def stops_of(traverse: Traverse) -> Iterator[tuple[Stop, list[Frame], list[Image], Observations]]:
+    """A traverse's stops, each as `TraverseSmoother.add_stop` takes it.
+
+    Raises InputError for a traverse without observations.
+    """
+    observations = traverse.observations
+    if observations is None:
+        raise InputError("observations: expected some, found none; find them in the images first")
+    of_stop = traverse.image_stop[observations.image]
+    for number, stop in enumerate(traverse.stops):
+        frames = [traverse.frames[i] for i in np.flatnonzero(traverse.frame_stop == number)]
+        rows = np.flatnonzero(traverse.image_stop == number)
+        own = observations.select(of_stop == number)
+        images = [traverse.images[i] for i in rows]
+        yield stop, frames, images, replace(own, image=np.searchsorted(rows, own.image))
+
+
+def solve_incrementally(
+    traverse: Traverse,
+    options: SolveOptions | None = None,
+    *,
+    on_stop: Callable[[Update], None] | None = None,
+) -> Solution:
+    """As `solve`, by adding stop after stop in their order; `on_stop` is told of every one.
+
+    Raises InputError for what the smoother has not: another model than the rigid mast, explicit landmarks,
+    alternation, and a robust loss other than that observations are judged as they come.
+    """
+    options = options or SolveOptions()
+    for name, found, expected in (
+        ("model", options.model, "mast"),
+        ("tie", options.firm_tie, "hard"),
+        ("landmarks", options.landmarks, "eliminated"),
+        ("method", options.method, "joint"),
+    ):
+        if found != expected:
+            raise InputError(f"incremental: {name}: expected {expected}, found {found}")
+    begin = time.perf_counter()
+    smoother = TraverseSmoother(
+        traverse.rig,
+        SmootherOptions(
+            sharing=options.sharing or traverse.sharing,
+            outlier_sigma=None if options.loss == "none" else options.outlier_sigma,
+        ),
+    )
+    updates = []
+    for stop, frames, images, observations in stops_of(traverse):
+        updates.append(smoother.add_stop(stop, frames, images, observations))
+        _LOG.info("%s: cost %.6g, %.3f s", stop.id, updates[-1].cost, updates[-1].seconds)
+        if on_stop is not None:
+            on_stop(updates[-1])
+    solved = time.perf_counter()
+    solution = _as_solution(traverse, options, smoother, updates)
+    done = time.perf_counter()
+    return replace(solution, seconds=Seconds(initialise=0.0, solve=solved - begin, report=done - solved))
+
+
+def _as_solution(
+    traverse: Traverse, options: SolveOptions, smoother: TraverseSmoother, updates: list[Update]
+) -> Solution:
+    """What the smoother found, as a solution of the traverse."""
+    assert traverse.observations is not None
+    used = np.zeros(len(traverse.observations), dtype=bool)
+    used[_rows_as_added(traverse)] = smoother.used
+    costs = tuple(u.cost for u in updates)
+    with blas_on_one_thread():
+        adjustment = Adjustment(traverse, options, None, None)
+        adjustment.take_over(smoother.values(), used, costs, f"{len(updates)} stops added one by one")
+        solution = adjustment.solution()
+    warnings = (w for u in updates for w in u.warnings)
+    return replace(
+        solution,
+        warnings=tuple(dict.fromkeys((*solution.warnings, *warnings))),
+        incremental=Incremental(
+            seconds_per_stop=tuple(u.seconds for u in updates),
+            cost_per_stop=costs,
+            relinearised_per_stop=tuple(u.relinearised for u in updates),
+        ),
+    )
+
+
+def _rows_as_added(traverse: Traverse) -> IntArray:
+    """Rows of the traverse's observations in the order in which its stops bring them."""
+    assert traverse.observations is not None
+    return np.argsort(traverse.image_stop[traverse.observations.image], kind="stable")

@@ -1,0 +1,132 @@
+"""Uncertainties at a solution: one elimination of the landmarks, then those entries of the inverse needed."""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from scipy.linalg import eigh
+
+from pancam_graph.base.errors import SolveError
+from pancam_graph.base.geometry import BoolArray, FloatArray
+from pancam_graph.data import State
+from pancam_graph.elimination import Covariance, FreeDirectionError, Root
+from pancam_graph.graph import FactorTemplate
+from pancam_graph.solve._problem import Problem
+from pancam_graph.solve._reduced import ReducedSystem, held_columns, loosened_root
+
+__all__ = ["Uncertainty", "covariance_of", "uncertainty"]
+
+_LOOSER = 10.0
+"""By how much sigmas of priors are multiplied to see what they hold."""
+_HELD = 10.0
+"""A variance that grows by more then is held by priors: images tell less than a tenth of what these do."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Uncertainty:
+    """Formal: from the linearised system at the solution, taking noise models at their word."""
+
+    stop_covariance: FloatArray
+    """(stops, 6, 6) rotation first, body frame; 0 where held"""
+    angle_sigma_rad: FloatArray
+    """(frames, 2); 0 where held"""
+    landmark_covariance_m2: FloatArray | None
+    """(landmarks, 3, 3), if asked for; NaN for those that take no part"""
+    undetermined: BoolArray
+    """(landmarks,) whether rays leave a direction free that the weak prior alone holds"""
+    rig_sigmas: list[FloatArray] | None
+    """(entries,) of each variable of the rig; None where unknown"""
+    unseen: tuple[str, ...] = ()
+    """Directions of the rig that images do not tell, by the entries that they consist of"""
+
+
+def uncertainty(
+    problem: Problem, state: State, reduced: ReducedSystem, *, landmarks: bool, unseen: bool
+) -> Uncertainty:
+    """Covariances, everything else marginalised, from what is left of the landmarks at the problem's values.
+
+    `landmarks` and `unseen` say whether these are wanted. Raises SolveError where a direction is held by
+    nothing.
+    """
+    template, m, system, rows = problem.template, problem.measurements, reduced.system, reduced.rows
+    covariance = covariance_of(template, reduced)
+    undetermined = np.zeros(m.n_landmarks, dtype=bool)
+    undetermined[rows] = system.undetermined
+    spread = None
+    if landmarks:
+        spread = np.full((m.n_landmarks, 3, 3), np.nan)
+        spread[rows] = system.landmark_covariance_m2(covariance)
+    return Uncertainty(
+        stop_covariance=template.stop_covariance(covariance),
+        angle_sigma_rad=template.angle_sigma_rad(covariance, state),
+        landmark_covariance_m2=spread,
+        undetermined=undetermined,
+        rig_sigmas=template.rig_sigmas(covariance, problem.values),
+        unseen=_unseen(problem, reduced, covariance) if unseen and template.rig_variables.variables else (),
+    )
+
+
+def _unseen(problem: Problem, reduced: ReducedSystem, covariance: Covariance) -> tuple[str, ...]:
+    """Directions of the rig of which images tell less than priors, of the rig or of telemetry.
+
+    These are the ones that become looser where all priors do. A turn of all mounts about the tilt axis, for
+    one, is to images a turn of all tilts. And those that have no prior and are all but free.
+    """
+    template, link, free = problem.template, problem.template.linkage, problem.template.rig_variables
+    loose = _inverse(template, loosened_root(problem, reduced.system, _LOOSER))
+    out = []
+    for g in sorted({free.group(v) for v in free.variables}):
+        own = [v for v in free.variables if free.group(v) == g]
+        columns = np.concatenate([np.arange(c.start, c.stop) for v in own for c in [link.columns_of(v.key)]])
+        names = [free.name(v, entry) for v in own for entry in v.entries]
+        firm, wide = (c.block(g, g)[np.ix_(columns, columns)] for c in (covariance, loose))
+        size = np.sqrt(np.diag(firm))
+        usual, prior = (np.concatenate([getattr(v, what) for v in own]) for what in ("usual", "sigma"))
+        out += [names[i] for i in np.flatnonzero(np.isinf(prior) & (size > _LOOSER * usual))]
+        firm, wide = firm / np.outer(size, size), wide / np.outer(size, size)
+        # A correlation of 1 but for rounding is no reason to fail.
+        ratio, functional = eigh(wide, firm + 1e-12 * np.eye(len(size)))
+        for k in np.flatnonzero(ratio > _HELD)[::-1]:
+            direction = np.abs(firm @ functional[:, k])
+            most = np.argsort(-direction)
+            out.append(" with ".join(names[i] for i in most if direction[i] > 0.5 * direction[most[0]]))
+    return tuple(out)
+
+
+def covariance_of(template: FactorTemplate, reduced: ReducedSystem) -> Covariance:
+    """Covariance of a template's variables where the system was linearised; 0 where held.
+
+    Raises SolveError where a direction is held by nothing.
+    """
+    return _inverse(template, reduced.root)
+
+
+def _inverse(template: FactorTemplate, root: Root) -> Covariance:
+    try:
+        covariance = root.covariance()
+    except FreeDirectionError as error:
+        raise SolveError(f"nothing holds {_name(template, error)}") from error
+    covariance.release(held_columns(template))
+    return covariance
+
+
+def _name(template: FactorTemplate, free: FreeDirectionError) -> str:
+    """What a column of a group is, for a user."""
+    t, link = template.traverse, template.linkage
+    for key in link.key:
+        columns = link.columns_of(key)
+        if link.group[link.row[key]] != free.group or not columns.start <= free.column < columns.stop:
+            continue
+        component, kind = free.column - columns.start, chr(gtsam.symbolChr(key))
+        if kind in "MX":
+            what = ("rotation about x", "rotation about y", "rotation about z", "x", "y", "z")[component]
+            entries = t.stops if kind == "M" else t.images
+            return f"the {what} of {entries[gtsam.symbolIndex(key)].id}, with what moves along"
+        if kind == "P":
+            return f"an entry of the projection matrix of {t.images[gtsam.symbolIndex(key)].id}"
+        for v in template.rig_variables.variables:
+            if v.key == key:
+                name = template.rig_variables.name(v, v.entries[component])
+                return f"{name} of the rig, with what moves along"
+        return f"pan or tilt at {t.stops[free.group].id}"
+    return "a direction of the solution"

@@ -1,0 +1,85 @@
+"""What the user should know about a traverse before believing its solution."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from pancam_graph.base.geometry import BoolArray, IntArray
+from pancam_graph.data import Traverse
+
+__all__ = ["components", "connection_warnings", "listed"]
+
+_NAMED = 6
+
+
+def components(n_members: int, member: IntArray, landmark: IntArray) -> tuple[int, IntArray]:
+    """Groups of members (images, frames or stops) joined by common landmarks.
+
+    `member` and `landmark` (n,) are the observations. Returns the number of groups, and the group of each
+    member (members,).
+    """
+    n_landmarks = int(landmark.max()) + 1 if len(landmark) else 0
+    n = n_members + n_landmarks
+    links = coo_array((np.ones(len(member)), (member, n_members + landmark)), shape=(n, n))
+    _, label = connected_components(links, directed=False)
+    names, group = np.unique(label[:n_members], return_inverse=True)
+    return len(names), group
+
+
+def connection_warnings(traverse: Traverse, used: BoolArray) -> list[str]:
+    """Warnings of images without observations, separate groups of frames, and stops that nothing connects."""
+    obs = traverse.observations
+    assert obs is not None
+    warnings: list[str] = []
+    image, track = obs.image[used], np.unique(obs.track[used], return_inverse=True)[1]
+    count = np.bincount(image, minlength=len(traverse.images))
+    empty = [traverse.images[i].id for i in np.flatnonzero(count == 0)]
+    if empty:
+        warnings.append(
+            f"{_number(empty, 'image')} without a used observation: {_names(empty)}; "
+            "only telemetry tells where they point"
+        )
+
+    # Eyes of one frame hang together by the rig, so groups are of frames.
+    frame_of = traverse.image_frame
+    n, group = components(len(traverse.frames), frame_of[image], track)
+    seen = np.bincount(frame_of[image], minlength=len(traverse.frames)) > 0
+    groups = [np.flatnonzero((group == g) & seen) for g in range(n)]
+    groups = sorted((g for g in groups if len(g)), key=lambda g: int(g[0]))
+    if len(groups) > 1:
+        listed = "; ".join(
+            f"({i}) {_names([traverse.frames[f].id for f in g])}"
+            for i, g in enumerate(groups[:_NAMED], start=1)
+        )
+        rest = f"; and {len(groups) - _NAMED} more" if len(groups) > _NAMED else ""
+        warnings.append(
+            f"{len(groups)} groups of frames share no track: {listed}{rest}; "
+            "between them only telemetry joins the panorama"
+        )
+    if len(traverse.stops) > 1:
+        stop_of = traverse.image_stop
+        _, stop_group = components(len(traverse.stops), stop_of[image], track)
+        size = np.bincount(stop_group)
+        alone = [traverse.stops[s].id for s in np.flatnonzero(size[stop_group] == 1)]
+        if alone:
+            warnings.append(
+                f"{_number(alone, 'stop')} that no track connects to another: {_names(alone)}; "
+                "their place is what odometry says"
+            )
+    return warnings
+
+
+def listed(names: Sequence[str], what: str) -> str:
+    """How many, and which, of these the first few: "2 tracks (4, 7)"."""
+    return f"{_number(names, what)} ({_names(names)})"
+
+
+def _number(names: Sequence[str], what: str) -> str:
+    return f"{len(names)} {what}{'s' if len(names) != 1 else ''}"
+
+
+def _names(names: Sequence[str]) -> str:
+    shown = ", ".join(names[:_NAMED])
+    return shown if len(names) <= _NAMED else f"{shown} and {len(names) - _NAMED} more"

@@ -1,0 +1,171 @@
+"""Landmarks as variables of the graph."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from pancam_graph.base.errors import SolveError
+from pancam_graph.base.geometry import BoolArray, FloatArray
+from pancam_graph.graph import ExplicitLandmarks, SoftTemplate
+from pancam_graph.landmarks import SQUARED, Loss, point_sigma_m, refine
+from pancam_graph.solve._optimise import Elimination, Iteration, OnGraph, Outcome, optimise, parameters_of
+from pancam_graph.solve._problem import Problem, Solver
+from pancam_graph.solve._stopping import StopRule
+
+__all__ = ["ExplicitSolver"]
+
+_WEAK_RANGE_SIGMA = 0.3
+"""A landmark whose range is known to no better than this share of it gets the weak prior."""
+_STRETCHED = 500.0
+"""A landmark this many times less certain in range than sideways is too much for GTSAM's Cholesky."""
+_ROUNDS = 6
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Weak:
+    """Landmarks whose range is all but free."""
+
+    needs_prior: BoolArray
+    """(landmarks,) whether the weak prior keeps the system regular"""
+    prior_m: FloatArray
+    """(landmarks,) its sigma: ten times the distance, so that it says nothing"""
+    stretched: BoolArray
+    """(landmarks,) which are too long in range for GTSAM's Cholesky"""
+    bearable_m: FloatArray
+    """(landmarks,) sigma of a prior that it bears, for steps whose landmarks are placed anew anyway"""
+
+
+class ExplicitSolver(Solver):
+    """A `L` variable per landmark: simple, slow, and independent of the eliminated way."""
+
+    def __init__(self, on_iteration: Callable[[Iteration], None] | None) -> None:
+        super().__init__(on_iteration)
+        self._is_near = False
+
+    def approach(self, problem: Problem, rule: StopRule, loss: Loss, stage: str) -> Problem:
+        """Gauss-Newton on everything; see `_approach`."""
+        return self._approach(problem, rule, loss, stage)[0]
+
+    def _approach(
+        self, problem: Problem, rule: StopRule, loss: Loss, stage: str
+    ) -> tuple[Problem, list[float]]:
+        """Gauss-Newton on everything, landmarks placed anew after every step.
+
+        Far from the optimum a landmark's linear prediction goes astray (behind a camera, beyond infinity)
+        and would hold back all others; its best place for the cameras found is what counts.
+        """
+        problem = _placed(problem, loss)
+        template = _soft(problem)
+        explicit, present = ExplicitLandmarks(template, problem.measurements), problem.present
+        observed = explicit.calibrations.in_place(template.factors(apart=True))
+        observed.push_back(explicit.factors(problem.kept, loss))
+
+        def values_of(p: Problem) -> gtsam.Values:
+            return explicit.with_landmarks(p.values, p.points_m(), present)
+
+        cost = float(observed.error(values_of(problem)))
+        costs = [cost]
+        elimination = Elimination(observed, values_of(problem))
+        for number in range(1, rule.max_iterations + 1):
+            weak = _weak(problem)
+            graph = gtsam.NonlinearFactorGraph(observed)
+            graph.push_back(explicit.proximal_factors(problem.points_m(), weak.bearable_m, weak.stretched))
+            step = elimination.step(graph, values_of(problem))
+            before = cost
+            for shrink in (1.0, 0.25, 0.0625, 0.0156):
+                moved = explicit.retract(problem.values, step, shrink)
+                trial = _placed(replace(problem, values=moved), loss)
+                cost = float(observed.error(values_of(trial)))
+                if cost < before:
+                    break
+            else:
+                break
+            problem = trial
+            costs.append(cost)
+            if self.on_iteration is not None:
+                self.on_iteration(Iteration(stage=stage, number=number, cost=cost))
+            if before - cost <= rule.relative_decrease * cost:
+                break
+        return problem, costs
+
+    def adjust(self, problem: Problem, rule: StopRule) -> tuple[Problem, Outcome]:
+        """Levenberg-Marquardt on everything, again while landmarks that a weak prior held have further to go.
+
+        The first time it is approached from afar. What is behind its camera then is no longer accepted.
+        """
+        costs: list[float] = []
+        if not self._is_near:
+            rule_afar = StopRule(max_iterations=20, relative_decrease=1e-4)
+            problem, costs = self._approach(problem, rule_afar, SQUARED, "approach")
+            _, in_front = problem.residuals()
+            problem = replace(problem, accepted=problem.accepted & in_front)
+            self._is_near = True
+        for _ in range(_ROUNDS):
+            problem, outcome = self._adjust(problem, rule)
+            gained = outcome.costs[0] - outcome.costs[-1]
+            costs += outcome.costs[1:] if costs else outcome.costs
+            if not outcome.converged:
+                break
+            if gained <= 1e-6 * costs[-1] or not _weak(problem).needs_prior.any():
+                break
+        return problem, replace(outcome, costs=tuple(costs))
+
+    def _adjust(self, problem: Problem, rule: StopRule) -> tuple[Problem, Outcome]:
+        problem = _placed(problem, SQUARED)
+        template = _soft(problem)
+        explicit, present, weak = (
+            ExplicitLandmarks(template, problem.measurements),
+            problem.present,
+            _weak(problem),
+        )
+        points = problem.points_m()
+        graph = explicit.calibrations.in_place(template.factors(apart=True))
+        graph.push_back(explicit.factors(problem.kept))
+        graph.push_back(explicit.proximal_factors(points, weak.prior_m, weak.needs_prior))
+        values = explicit.with_landmarks(problem.values, points, present)
+        elimination = Elimination(graph, values, by_qr=bool(weak.stretched.any()))
+        held = explicit.calibrations.held(template.held_columns())
+        parameters = parameters_of(rule, elimination)
+        outcome = optimise(
+            lambda: OnGraph(graph, values, parameters, held),
+            rule,
+            n_observations=int(problem.kept.sum()),
+            on_iteration=self.on_iteration,
+        )
+        points = np.where(present[:, None], explicit.points_m(outcome.values, present), points)
+        found = problem.at(explicit.only_cameras(outcome.values), problem.landmarks.moved_to(points))
+        if explicit.calibrations.any and not found.residuals()[1][problem.kept].all():
+            raise SolveError(
+                "explicit landmarks: expected all in front of their cameras, found some behind, which "
+                "GTSAM's factor of a free calibration does not count; eliminated landmarks bear it"
+            )
+        return found, outcome
+
+
+def _soft(problem: Problem) -> SoftTemplate:
+    assert isinstance(problem.template, SoftTemplate)
+    return problem.template
+
+
+def _placed(problem: Problem, loss: Loss) -> Problem:
+    """Landmarks where they fit best with the cameras as they are."""
+    if not problem.kept.any():
+        raise SolveError("observations: expected tracks that agree in two or more images, found none")
+    m, weight = problem.measurements, problem.accepted.astype(float)
+    return replace(problem, landmarks=refine(problem.landmarks, m, problem.views, weight, loss))
+
+
+def _weak(problem: Problem) -> _Weak:
+    """Which landmarks are hard to hold in range, and for which the weak prior must help."""
+    m, views, points, present = problem.measurements, problem.views, problem.points_m(), problem.present
+    distance = np.linalg.norm(points - problem.landmarks.origin_m, axis=1)
+    sigma = point_sigma_m(points, m, views, problem.accepted)
+    sideways = distance * m.typical_sigma_px / float(np.median(views.calibration[:, 0, 0]))
+    return _Weak(
+        needs_prior=present & (sigma > _WEAK_RANGE_SIGMA * distance),
+        prior_m=10 * distance,
+        stretched=present & (sigma > _STRETCHED * sideways),
+        bearable_m=2 * _STRETCHED * sideways,
+    )

@@ -1,0 +1,190 @@
+"""A problem as GTSAM's Levenberg-Marquardt optimises it fastest: all groups of variables but one eliminated.
+
+Where each image has variables of its own, GTSAM's elimination took ten times as long as all else together.
+So groups (stops) are eliminated here, as landmarks are, with the damping that GTSAM is about to use; it
+gets the square root of what is left, in the columns of the last group, and decides: how far to damp, and
+whether to take a step. The others follow by back substitution. That is the step of the whole system, damped
+alike in all variables. After each step the problem moves and the vector begins at 0 again: so no chart is
+ever far from where it is good.
+"""
+
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from pancam_graph.base.geometry import FloatArray, IntArray
+from pancam_graph.elimination import LandmarkSystem, Linkage, Panels, Root
+from pancam_graph.solve._optimise import MOST_DAMPING, InOrder, parameters_of
+from pancam_graph.solve._problem import Problem
+from pancam_graph.solve._reduced import held_columns, joint_panels
+from pancam_graph.solve._stopping import StopRule
+
+__all__ = ["JointSystem", "OnLastGroup", "all_columns", "retracted"]
+
+_KEY = 0
+"""GTSAM's, of the one vector: a step of the last group's columns, and one number for all other groups."""
+_UNIT = 1e-7
+"""Step of that number which stands for the whole step of the others: so short that no damping holds it."""
+
+
+def retracted(linkage: Linkage, values: gtsam.Values, step: FloatArray) -> gtsam.Values:
+    """Values after a step (columns,) of all variables, group by group."""
+    vector = gtsam.VectorValues()
+    for key, group in zip(linkage.key, linkage.group, strict=True):
+        own, begin = linkage.columns_of(key), int(linkage.group_column[group])
+        vector.insert(key, step[begin + own.start : begin + own.stop])
+    return values.retract(vector)
+
+
+def all_columns(linkage: Linkage, columns: dict[int, IntArray]) -> IntArray:
+    """Columns of groups as columns of all."""
+    begin = linkage.group_column
+    return np.concatenate([np.zeros(0, dtype=np.int64), *(begin[g] + own for g, own in columns.items())])
+
+
+class JointSystem:
+    """Where a problem stands, its linearisation there, and the cost elsewhere.
+
+    The landmarks are state of this object, as in LandmarkBlocks: it is for one optimiser at a time.
+    """
+
+    def __init__(self, problem: Problem, system: LandmarkSystem) -> None:
+        self.template, self.factors, self.system = problem.template, problem.factors, system
+        self.values = problem.values
+        """Where it stands"""
+        link = self.template.linkage
+        self.last = next(g for g in reversed(system.structure.order) if link.group_dim[g])
+        """The group that is not eliminated"""
+        self._held = all_columns(link, held_columns(self.template))
+        posture = self.template.posture(self.values)
+        self.cost = system.cost_at(posture) + self.factors.error(self.values)
+        """There"""
+        self._forget()
+
+    def _forget(self) -> None:
+        self._panels: Panels | None = None
+        self._root: Root | None = None
+        self._damped: tuple[float, Root] | None = None
+        self._tried: tuple[FloatArray, gtsam.Values, float] | None = None
+
+    def panels(self) -> Panels:
+        """The system (S, s) there, landmarks eliminated, priors and ties included."""
+        if self._panels is None:
+            panels = self.system.linearise(self.template.posture(self.values))
+            self._panels = joint_panels(self.template, self.factors, self.values, panels)
+        return self._panels
+
+    def root(self) -> Root:
+        """Its square root."""
+        if self._root is None:
+            self._root = self.panels().copy().root()
+        return self._root
+
+    @property
+    def known_root(self) -> Root | None:
+        """`root`, where that is known already."""
+        return self._root
+
+    def damped_root(self, damping: float) -> Root:
+        """The same with a damping on the diagonal of all groups but the last."""
+        if self._damped is None or self._damped[0] != damping:
+            panels = self.panels().copy()
+            for g, panel in enumerate(panels.panel):
+                if g != self.last:
+                    own = np.arange(len(panel))
+                    panel[own, own] += damping
+            self._damped = damping, panels.root()
+        return self._damped[1]
+
+    def gradient(self) -> float:
+        """Largest component of the gradient there; 0 of what telemetry holds."""
+        return float(np.abs(self.panels().right()).max(initial=0.0))
+
+    def cost_after(self, own: FloatArray, damping: float) -> float:
+        """The true cost after a step of the last group (columns,), the other groups and landmarks along."""
+        step = self.damped_root(damping).step(known={self.last: own})
+        step[self._held] = 0.0  # bit for bit
+        if self._tried is None or not np.array_equal(self._tried[0], step):
+            values = retracted(self.template.linkage, self.values, step)
+            costs = self.system.try_step(self.template.posture(values), step)
+            self._tried = step, values, float(costs.sum()) + self.factors.error(values)
+        return self._tried[2]
+
+    def move(self, own: FloatArray, damping: float) -> None:
+        """Take that step."""
+        self.cost = self.cost_after(own, damping)
+        assert self._tried is not None
+        self.values = self._tried[1]
+        self.system.adopt()
+        self._forget()
+
+
+class OnLastGroup:
+    """GTSAM's Levenberg-Marquardt on what is left of a joint system: an Optimiser."""
+
+    def __init__(self, joint: JointSystem, rule: StopRule) -> None:
+        self._joint = joint
+        self._parameters = parameters_of(rule, InOrder([_KEY]))
+        self._damping = float(self._parameters.getlambdaInitial())
+        self._start = gtsam.Values()
+        self._start.insert(_KEY, np.zeros(int(joint.template.linkage.group_dim[joint.last]) + 1))
+        # No noise model: everything is whitened, and the number of rows is the rank found.
+        no_noise: Any = None
+        self._graph = gtsam.NonlinearFactorGraph()
+        self._graph.push_back(gtsam.CustomFactor(no_noise, [_KEY], self._evaluate))
+
+    def _evaluate(
+        self, _this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
+    ) -> FloatArray:
+        joint = self._joint
+        if jacobians is None:
+            vector = values.atVector(_KEY)
+            cost = joint.cost_after(vector[:-1], self._damping) if vector.any() else joint.cost
+            return np.array([np.sqrt(2 * cost)])
+        root = joint.damped_root(self._damping)
+        rows = root.rows[joint.last]
+        n, own2 = len(rows), float(np.sum(rows[:, -1] ** 2))
+        others2 = 2 * root.gain() - own2
+        error, jacobian = np.zeros(n + 2), np.zeros((n + 2, rows.shape[1]), order="F")
+        jacobian[:n, :-1], error[:n] = rows[:, :-1], rows[:, -1]
+        # What the others gain, and what the cost has beyond the squares of all e.
+        error[n] = np.sqrt(max(others2, 0.0))
+        jacobian[n, -1] = error[n] / _UNIT
+        error[n + 1] = np.sqrt(max(2 * (joint.cost - root.gain()), 0.0))
+        jacobians[0] = jacobian
+        return error
+
+    def iterate(self) -> None:
+        """Take the next step that lowers the cost.
+
+        One try of GTSAM's at a time, since what is eliminated depends on the damping.
+        """
+        while True:
+            tried, parameters = self._damping, self._parameters
+            parameters.setlambdaInitial(tried)
+            parameters.setlambdaUpperBound(2 * tried)
+            optimizer = gtsam.LevenbergMarquardtOptimizer(self._graph, self._start, parameters)
+            optimizer.iterate()
+            vector = optimizer.values().atVector(_KEY)
+            if vector.any():
+                self._joint.move(vector[:-1], tried)
+            self._damping = optimizer.lambda_()
+            if vector.any() or not tried < self._damping < MOST_DAMPING:
+                return
+
+    def error(self) -> float:
+        """The cost where it stands."""
+        return self._joint.cost
+
+    def damping(self) -> float:
+        """Lambda of the next step."""
+        return self._damping
+
+    def values(self) -> gtsam.Values:
+        """Where it stands."""
+        return self._joint.values
+
+    def gradient(self) -> float:
+        """Largest component of the gradient there, but for what telemetry holds."""
+        return self._joint.gradient()

@@ -1,0 +1,150 @@
+"""What a solver of either kind is given and returns."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import gtsam
+import numpy as np
+
+from pancam_graph.base.errors import SolveError
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.elimination import LandmarkSystem
+from pancam_graph.graph import FactorTemplate
+from pancam_graph.landmarks import SQUARED, CameraViews, Landmarks, Loss, Measurements, refine, residuals
+from pancam_graph.solve._optimise import Iteration, Outcome
+from pancam_graph.solve._stopping import StopRule
+
+__all__ = ["Problem", "Solver", "reach_m", "system_of"]
+
+_FURTHEST_PARALLAX_SIGMAS = 0.01
+"""Points are placed no further out than where their parallax is this many sigmas of a pixel."""
+_LEAST_BASELINE_M = 2e-3
+"""Cameras that are nearer to each other count as if they were so far apart."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Problem:
+    """Cameras, landmarks and observations at one moment of a solve."""
+
+    template: FactorTemplate
+    factors: gtsam.NonlinearFactorGraph
+    """The template's: priors and ties."""
+    measurements: Measurements
+    accepted: BoolArray
+    """(n,) measurements that take part, but for those of landmarks with fewer than two of them"""
+    values: gtsam.Values
+    """The template's variables."""
+    landmarks: Landmarks
+
+    @cached_property
+    def views(self) -> CameraViews:
+        """Cameras at the values."""
+        return self.template.views(self.values)
+
+    @property
+    def present(self) -> BoolArray:
+        """(landmarks,) which have two accepted observations or more."""
+        m = self.measurements
+        return np.asarray(np.bincount(m.landmark, self.accepted, minlength=m.n_landmarks) >= 2)
+
+    @property
+    def kept(self) -> BoolArray:
+        """(n,) measurements that take part."""
+        return np.asarray(self.accepted & self.present[self.measurements.landmark])
+
+    def points_m(self) -> FloatArray:
+        """World points (landmarks, 3), none further than where parallax tells nothing."""
+        length, w = self.landmarks.length, self.landmarks.vector[:, 3]
+        # Most are nearer than any limit.
+        beyond = length * _FURTHEST_PARALLAX_SIGMAS > w * _LEAST_BASELINE_M * _resolution(self)
+        furthest = np.full(len(w), np.inf)
+        furthest[beyond] = reach_m(self, beyond) / _FURTHEST_PARALLAX_SIGMAS
+        return self.landmarks.points_m(furthest)
+
+    def cost(self, loss: Loss = SQUARED) -> float:
+        """True cost: half the squares of priors and ties, and the loss of what takes part."""
+        residual, _ = self.residuals()
+        return float(self.factors.error(self.values) + loss.cost(residual)[self.kept].sum())
+
+    def residuals(self) -> tuple[FloatArray, BoolArray]:
+        """Whitened residuals (n, 2), and whether the landmark is in front of its camera (n,)."""
+        return residuals(self.landmarks, self.measurements, self.views)
+
+    def placed(self, loss: Loss = SQUARED) -> "Problem":
+        """Landmarks where they fit best with the cameras as they are, be it beyond infinity."""
+        weight = self.accepted.astype(float)
+        best = refine(self.landmarks, self.measurements, self.views, weight, loss, beyond_infinity=True)
+        return replace(self, landmarks=best)
+
+    def on(self, template: FactorTemplate) -> "Problem":
+        """The same with other variables, cameras as near to where they are as these allow."""
+        values = template.values(self.template.state(self.values, np.zeros((0, 3))))
+        return replace(self, template=template, factors=template.factors(), values=values)
+
+    def at(self, values: gtsam.Values, landmarks: Landmarks) -> "Problem":
+        """The same elsewhere."""
+        return replace(self, values=values, landmarks=landmarks)
+
+
+def reach_m(problem: Problem, of: BoolArray | None = None) -> FloatArray:
+    """Distance where the parallax over a landmark's cameras is one sigma of a pixel.
+
+    Of the landmarks in the mask `of` (landmarks,), one after the other; of all without it.
+    """
+    m, views = problem.measurements, problem.views
+    rows = slice(None) if of is None else np.flatnonzero(of[m.landmark])
+    landmark = m.landmark[rows]
+    if len(landmark) == 0:
+        return np.zeros(0)
+    arm = np.linalg.norm(views.world_t_camera[m.image[rows]] - problem.landmarks.origin_m[landmark], axis=1)
+    starts = np.flatnonzero(np.diff(landmark, prepend=-1))
+    baseline = (2 * np.maximum.reduceat(arm, starts)).clip(_LEAST_BASELINE_M)
+    return np.asarray(baseline * _resolution(problem))
+
+
+def _resolution(problem: Problem) -> float:
+    """One over the angle, radians, that a sigma of a pixel is, typically."""
+    focal_px = float(np.median(problem.views.calibration[:, 0, 0]))
+    return focal_px / problem.measurements.typical_sigma_px
+
+
+class Solver(ABC):
+    """A way to minimise."""
+
+    def __init__(self, on_iteration: Callable[[Iteration], None] | None) -> None:
+        self.on_iteration = on_iteration
+
+    def require(self, template: FactorTemplate) -> None:  # noqa: B027  most ways have nothing to ask for
+        """Raise InputError where a template has not what this way needs."""
+
+    @abstractmethod
+    def approach(self, problem: Problem, rule: StopRule, loss: Loss, stage: str) -> Problem:
+        """The problem about where a robust loss is least, however far that is."""
+
+    @abstractmethod
+    def adjust(self, problem: Problem, rule: StopRule) -> tuple[Problem, Outcome]:
+        """The problem at the least-squares optimum near by."""
+
+
+def system_of(
+    problem: Problem, loss: Loss = SQUARED, cliques: Iterable[Iterable[int]] = ()
+) -> tuple[LandmarkSystem, IntArray]:
+    """The landmark system of what takes part, and its rows among the landmarks.
+
+    `cliques` are more groups of variables between which its square root is to have room. Raises SolveError
+    where nothing is left.
+    """
+    m = problem.measurements
+    take = problem.kept
+    if not take.any():
+        raise SolveError("observations: expected tracks that agree in two or more images, found none")
+    rows = np.flatnonzero(np.bincount(m.landmark, take, minlength=m.n_landmarks))
+    if not take.all():
+        m = m.part(np.flatnonzero(take))
+    landmarks = Landmarks(vector=problem.landmarks.vector[rows], origin_m=problem.landmarks.origin_m[rows])
+    template = problem.template
+    cliques = [*template.cliques, *cliques]
+    refined = template.refines_landmarks
+    return LandmarkSystem(template.linkage, m, landmarks, loss, cliques=cliques, refined=refined), rows

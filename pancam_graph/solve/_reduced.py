@@ -1,0 +1,96 @@
+"""A problem with its landmarks eliminated: the square root of the system in the cameras' variables."""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from pancam_graph.base.geometry import IntArray
+from pancam_graph.elimination import LandmarkSystem, Linkage, Panels, Root
+from pancam_graph.graph import FactorTemplate
+from pancam_graph.solve._problem import Problem, system_of
+
+__all__ = ["ReducedSystem", "add_factors", "held_columns", "joint_panels", "joint_root", "loosened_root"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ReducedSystem:
+    """What is left of a problem at its values, linearised, priors and ties included."""
+
+    system: LandmarkSystem
+    """Linearised there."""
+    rows: IntArray
+    """Its landmarks among all."""
+    root: Root
+
+    @staticmethod
+    def of(problem: Problem, arranged: tuple[LandmarkSystem, IntArray] | None = None) -> "ReducedSystem":
+        """Linearise a problem; `arranged` is its landmark system and rows, where these are known.
+
+        Raises SolveError where no observation takes part.
+        """
+        system, rows = arranged or system_of(problem)
+        panels = system.linearise(problem.template.posture(problem.values))
+        root = joint_root(problem.template, problem.factors, problem.values, panels)
+        return ReducedSystem(system=system, rows=rows, root=root)
+
+
+def joint_root(
+    template: FactorTemplate, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, panels: Panels
+) -> Root:
+    """Square root of what is left of the landmarks, with priors and ties added. Destroys the panels."""
+    return joint_panels(template, factors, values, panels).root()
+
+
+def joint_panels(
+    template: FactorTemplate, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, panels: Panels
+) -> Panels:
+    """What is left of the landmarks, with priors and ties added in place."""
+    add_factors(panels, template.linkage, factors.linearize(values))
+    panels.hold(held_columns(template))
+    return panels
+
+
+def loosened_root(problem: Problem, system: LandmarkSystem, factor: float) -> Root:
+    """The square root at a problem's values, with the sigmas of all priors multiplied; not those of ties.
+
+    `system` is the problem's, and is linearised anew.
+    """
+    template, link = problem.template, problem.template.linkage
+    priors, ties = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
+    for i in range(problem.factors.size()):
+        one = problem.factors.at(i)
+        # Where telemetry holds all else, a tie is of its camera pose alone.
+        of_camera = any(chr(gtsam.symbolChr(key)) == "X" for key in one.keys())  # noqa: SIM118  a gtsam factor
+        (ties if of_camera else priors).push_back(one)
+    panels = system.linearise(template.posture(problem.values))
+    add_factors(panels, link, ties.linearize(problem.values))
+    add_factors(panels, link, priors.linearize(problem.values), weight=factor**-2)
+    panels.hold(held_columns(template))
+    return panels.root()
+
+
+def held_columns(template: FactorTemplate) -> dict[int, IntArray]:
+    """By group, the columns that telemetry holds."""
+    return template.linkage.by_group(template.held_columns().items())
+
+
+def add_factors(
+    panels: Panels, linkage: Linkage, linear: gtsam.GaussianFactorGraph, weight: float = 1.0
+) -> None:
+    """Add priors and ties, as GTSAM linearises them."""
+    for i in range(linear.size()):
+        factor = linear.at(i)
+        if factor is None:
+            continue
+        keys = factor.keys()
+        # The right-hand side comes as a last column, and is minus the residual.
+        normal = weight * factor.augmentedInformation()
+        group = [int(linkage.group[linkage.row[key]]) for key in keys]
+        columns = [linkage.columns_of(key) for key in keys]
+        end = np.cumsum([c.stop - c.start for c in columns])
+        own = [slice(e - (c.stop - c.start), e) for c, e in zip(columns, end, strict=True)]
+        for a in range(len(keys)):
+            panels.add_right(group[a], columns[a], -normal[own[a], -1])
+            for b in range(a, len(keys)):
+                panels.add_block(group[a], columns[a], group[b], columns[b], normal[own[a], own[b]])

@@ -1,0 +1,135 @@
+"""Which observations to believe: data snooping with cameras held, one observation at a time.
+
+Each residual is compared with what noise alone makes of it, given that the landmark follows its own
+observations (Baarda 1968). A track loses only its worst observation at a time and is triangulated again;
+rejected observations that fit again come back.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import chdtri, erfc
+
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.landmarks import (
+    SETTLED,
+    SQUARED,
+    CameraViews,
+    Landmarks,
+    Measurements,
+    as_floats,
+    kernel,
+    over_landmarks,
+    rays_of,
+    seen_by,
+)
+
+__all__ = ["Screening", "screen"]
+
+_SWEEPS = 12
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Screening:
+    """Outcome of one screening."""
+
+    landmarks: Landmarks
+    accepted: BoolArray
+    """(n,)"""
+    scale: float
+    """Robust estimate of the noise in units of the given sigmas."""
+    behind: BoolArray
+    """(n,) whether the landmark is behind the camera."""
+
+
+def screen(
+    landmarks: Landmarks,
+    measurements: Measurements,
+    views: CameraViews,
+    accepted: BoolArray,
+    *,
+    cutoff_sigma: float,
+    min_scale: float,
+    scale: float | None = None,
+) -> Screening:
+    """Reject and re-admit observations with all cameras held.
+
+    `accepted` (n,) is where to start. An observation goes when its test exceeds the chi-square quantile
+    that a Gaussian exceeds beyond `cutoff_sigma`, in units of a robust scale that is at least `min_scale`, or
+    of `scale` where these are not all, but those that look wrong.
+    Of a track with two observations that disagree both go, for nothing tells which is wrong.
+    """
+    seen, n, n_landmarks = seen_by(measurements, views), len(measurements.image), measurements.n_landmarks
+    begin, starts = measurements.begin, measurements.starts
+    centre, direction = rays_of(measurements, views)
+    vector = as_floats(landmarks.vector, (n_landmarks, 4)).copy()
+    origin = as_floats(landmarks.origin_m, (n_landmarks, 3)).copy()
+    weight = as_floats(_revived(accepted, measurements), (n,))
+    residual, b, cofactor = np.empty((n, 2)), np.empty((n, 2, 3)), np.empty((n, 2, 2))
+    test, freedom, in_front = np.empty(n), np.empty(n, dtype=np.int64), np.empty(n, dtype=bool)
+    lost, changed = np.empty(n_landmarks, dtype=bool), np.empty(n_landmarks, dtype=bool)
+    tail = erfc(cutoff_sigma / np.sqrt(2.0))  # of a Gaussian beyond the cutoff, on either side
+    limit = np.array([np.inf, chdtri(1, tail), chdtri(2, tail)])
+    known, scale = scale, min_scale if scale is None else scale
+    which = np.arange(n_landmarks)
+    fresh = np.flatnonzero(np.minimum.reduceat(weight, starts) > 0)
+    for sweep in range(_SWEEPS):
+        over_landmarks(kernel.triangulate, fresh, begin, centre, direction, weight, vector, origin)
+        over_landmarks(
+            kernel.refine,
+            which,
+            seen,
+            origin,
+            weight,
+            SQUARED.kind,
+            SQUARED.width,
+            False,
+            SETTLED,
+            vector,
+        )
+        over_landmarks(kernel.evaluate, which, seen, vector, origin, residual, b, in_front)
+        over_landmarks(kernel.free_derivatives, which, begin, vector, b)
+        over_landmarks(kernel.cofactors, which, begin, b, weight, cofactor)
+        over_landmarks(kernel.tests, which, begin, residual, cofactor, test, freedom)
+        if sweep == 0 and known is None:
+            counts = (weight > 0) & in_front
+            scale = max(min_scale, _robust_scale(test[counts], freedom[counts]))
+        over_landmarks(
+            kernel.reject,
+            which,
+            begin,
+            residual,
+            test,
+            freedom,
+            in_front,
+            scale,
+            limit,
+            sweep == 0,
+            weight,
+            lost,
+            changed,
+        )
+        which = which[changed[which]]
+        if len(which) == 0:
+            break
+        fresh = which[lost[which] & (np.add.reduceat(weight, starts)[which] > 0)]
+    return Screening(
+        landmarks=Landmarks(vector=vector, origin_m=origin),
+        accepted=weight > 0,
+        scale=scale,
+        behind=~in_front,
+    )
+
+
+def _revived(accepted: BoolArray, measurements: Measurements) -> BoolArray:
+    """Give landmarks that lost their observations all of them back, to be judged anew."""
+    k = measurements.landmark
+    few = np.bincount(k, accepted, minlength=measurements.n_landmarks) < 2
+    return np.asarray(accepted | few[k])
+
+
+def _robust_scale(test: FloatArray, dof: IntArray) -> float:
+    """Noise scale from the median of the tests, each over the median that noise of scale 1 would give."""
+    expected = np.array([np.nan, chdtri(1, 0.5), chdtri(2, 0.5)])
+    ratio = test[dof > 0] / expected[dof[dof > 0]]
+    return float(np.sqrt(np.median(ratio))) if len(ratio) else 0.0

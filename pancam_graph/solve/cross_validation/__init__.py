@@ -1,0 +1,1 @@
+"""Cross-validation: a traverse solved again with halves of its tracks."""

@@ -1,0 +1,109 @@
+"""Tracks in two halves: drawn by lot, or by image halves; and what a half does not see or cuts off."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import minimum_spanning_tree
+
+from pancam_graph.base.geometry import BoolArray, IntArray
+from pancam_graph.data import Traverse
+from pancam_graph.landmarks import Measurements
+from pancam_graph.solve._diagnose import components
+from pancam_graph.solve._problem import Problem
+
+__all__ = ["Groups", "neighbours", "random_half", "upper_half"]
+
+
+def random_half(traverse: Traverse, measurements: Measurements, lots: np.random.Generator) -> BoolArray:
+    """(landmarks,) by lot one of every two landmarks that join the same frames.
+
+    So the halves are alike in strength everywhere, and no frame is lost that need not be.
+    """
+    n, frame = measurements.n_landmarks, traverse.image_frame[measurements.image]
+    first, last = (side.reduceat(frame, measurements.starts) for side in (np.minimum, np.maximum))
+    order = np.lexsort((lots.random(n), last, first))
+    coins = lots.random((n + 1) // 2) < 0.5
+    half = np.empty(n, dtype=bool)
+    half[order] = np.column_stack([coins, ~coins]).ravel()[:n]
+    return half
+
+
+def upper_half(traverse: Traverse, measurements: Measurements) -> BoolArray:
+    """(landmarks,) whether observations lie above the middle of their images, in the mean of each landmark.
+
+    A landmark may be low in one image and high in another, as between the rows of a panorama; its tie is
+    kept whole, for a half of it would tie nothing.
+    """
+    assert traverse.observations is not None
+    height = np.array([eye.camera.height_px for eye in traverse.rig.eyes])
+    height = height[traverse.image_eye][measurements.image]
+    v_px = traverse.observations.uv_px[measurements.row, 1]
+    return np.asarray(np.add.reduceat((v_px - (height - 1) / 2) / height, measurements.starts) < 0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Groups:
+    """Members (frames or stops) in groups that tracks join."""
+
+    seen: BoolArray
+    """(members,) whether a measurement that takes part is of it"""
+    group: IntArray
+    """(members,)"""
+
+    @staticmethod
+    def of(problem: Problem, member_of_image: IntArray, n_members: int) -> "Groups":
+        """Groups by the measurements of a problem that take part."""
+        m, kept = problem.measurements, problem.kept
+        member = member_of_image[m.image[kept]]
+        return Groups(
+            seen=np.bincount(member, minlength=n_members) > 0,
+            group=components(n_members, member, m.landmark[kept])[1],
+        )
+
+    def lost_in(self, half: "Groups") -> BoolArray:
+        """(members,) what is seen here but not in a half, or cut off there from the most of its group."""
+        lost = self.seen & ~half.seen
+        rows = np.flatnonzero(self.seen & half.seen)
+        parts, part, size = np.unique(
+            np.column_stack([self.group, half.group])[rows], axis=0, return_inverse=True, return_counts=True
+        )
+        # The largest part of each group comes first; of equals, the one that was first.
+        order = np.lexsort((-size, parts[:, 0]))
+        first = np.unique(parts[order, 0], return_index=True)[1]
+        largest = np.zeros(len(parts), dtype=bool)
+        largest[order[first]] = True
+        lost[rows] |= ~largest[part.ravel()]
+        return np.asarray(lost)
+
+    def joins(self, members: IntArray) -> BoolArray:
+        """(n,) whether members (n, k) are all seen and of one group."""
+        group = np.where(self.seen, self.group, -1)[members]
+        return np.asarray((group == group[:, :1]).all(axis=1) & (group[:, 0] >= 0))
+
+    def joins_landmarks(self, measurements: Measurements, member_of_image: IntArray) -> BoolArray:
+        """(landmarks,) whether all that see a landmark are seen here and of one group."""
+        group = np.where(self.seen, self.group, -1)[member_of_image[measurements.image]]
+        low, high = (side.reduceat(group, measurements.starts) for side in (np.minimum, np.maximum))
+        return np.asarray((low == high) & (low >= 0))
+
+
+def neighbours(traverse: Traverse, problem: Problem) -> tuple[IntArray, IntArray]:
+    """Pairs of frames of one stop that share tracks (pairs, 2), and how many they share (pairs,).
+
+    Those of a tree over each group of frames that has the most tracks in common: all relative pointing
+    within the group is made of them. By the first frame, then the second.
+    """
+    m, kept, n = problem.measurements, problem.kept, len(traverse.frames)
+    frame = traverse.image_frame[m.image[kept]]
+    sights = coo_array((np.ones(len(frame)), (frame, m.landmark[kept])), shape=(n, m.n_landmarks)).tocsr()
+    sights.data[:] = 1  # a frame sees a landmark once, with however many eyes
+    shared = coo_array(sights @ sights.T)
+    i, j = shared.coords
+    of_one_stop = (traverse.frame_stop[i] == traverse.frame_stop[j]) & (i < j)
+    i, j, count = i[of_one_stop], j[of_one_stop], shared.data[of_one_stop]
+    tree = coo_array(minimum_spanning_tree(coo_array((-count, (i, j)), shape=(n, n)).tocsr()))
+    rows, columns = tree.coords
+    order = np.lexsort((columns, rows))
+    pairs = np.column_stack([rows, columns])[order].astype(np.int64)
+    return pairs, (-tree.data[order]).astype(np.int64)

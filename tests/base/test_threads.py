@@ -1,0 +1,152 @@
+"""Ranges over threads: all of them once, the same for any number of threads, and errors that come through."""
+
+import multiprocessing
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from pancam_graph.base.errors import InputError
+from pancam_graph.base.threads import each, in_order, in_parallel, n_workers
+
+
+def ranges_of(n: int, grain: int) -> list[tuple[int, int]]:
+    seen = []
+    in_parallel(lambda begin, end: seen.append((begin, end)), n, grain=grain)
+    return sorted(seen)
+
+
+@pytest.mark.parametrize("threads", ["1", "2", "3"])
+@pytest.mark.parametrize(("n", "grain"), [(0, 10), (1, 10), (9, 10), (14, 10), (16, 10), (1000, 7), (3, 1)])
+def test_ranges_follow_each_other_and_do_not_depend_on_the_threads(monkeypatch, threads, n, grain) -> None:
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", "1")
+    alone = ranges_of(n, grain)
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", threads)
+    assert ranges_of(n, grain) == alone
+    assert [i for begin, end in alone for i in range(begin, end)] == list(range(n))
+    lengths = [end - begin for begin, end in alone]
+    assert not lengths or max(lengths) - min(lengths) <= 1
+    assert len(lengths) <= 1 or 0.6 * grain < np.mean(lengths) < 1.5 * grain
+
+
+def test_two_threads_work_at_once(monkeypatch) -> None:
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", "2")
+    both = threading.Barrier(2, timeout=10)
+    in_parallel(lambda begin, end: both.wait() and None, 2, grain=1)
+
+
+def test_one_range_runs_in_the_thread_of_the_caller(monkeypatch) -> None:
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", "2")
+    names = []
+    in_parallel(lambda begin, end: names.append(threading.current_thread()), 5, grain=10)
+    assert names == [threading.current_thread()]
+
+
+@pytest.mark.parametrize("threads", ["1", "2"])
+def test_the_first_error_comes_through(monkeypatch, threads) -> None:
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", threads)
+
+    def fails(begin: int, end: int) -> None:
+        if begin >= 2:
+            raise ValueError(begin)
+
+    with pytest.raises(ValueError, match="2"):
+        in_parallel(fails, 10, grain=1)
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "two", "1.5", "²"])
+def test_a_number_of_threads_that_is_none_is_named(monkeypatch, text) -> None:
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", text)
+    with pytest.raises(InputError, match=r"PANCAM_GRAPH_THREADS: expected .* found"):
+        n_workers()
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork on this system")
+@pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
+def test_a_forked_process_starts_threads_of_its_own(monkeypatch) -> None:
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", "2")
+    assert len(ranges_of(10, 1)) == 10
+    child = multiprocessing.get_context("fork").Process(target=ranges_of, args=(10, 1))
+    child.start()
+    child.join(20)
+    hangs = child.is_alive()
+    child.kill()
+    assert not hangs
+    assert child.exitcode == 0
+
+
+@pytest.mark.parametrize("threads", ["1", "2"])
+def test_ranges_within_ranges_run_in_the_thread_of_the_outer_one(monkeypatch, threads) -> None:
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", threads)
+    ran = []
+
+    def outer(begin: int, end: int) -> None:
+        own = threading.current_thread()
+        in_parallel(lambda a, b: ran.append((begin, a, threading.current_thread() is own)), 4, grain=1)
+
+    in_parallel(outer, 6, grain=1)
+    assert sorted(ran) == [(i, j, True) for i in range(6) for j in range(4)]
+    # And when all is done, ranges are for all threads again.
+    if threads == "2":
+        both = threading.Barrier(2, timeout=10)
+        in_parallel(lambda begin, end: both.wait() and None, 2, grain=1)
+
+
+def test_each_keeps_the_order(monkeypatch) -> None:
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", "2")
+    assert each(lambda x: 10 * x, [3, 1, 2]) == [30, 10, 20]
+    assert each(lambda x: x, []) == []
+
+
+@pytest.mark.parametrize("threads", ["1", "2", "3"])
+def test_results_are_in_the_order_of_the_items(monkeypatch, threads) -> None:
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", threads)
+    told = []
+
+    def squared(item: int) -> int:
+        time.sleep(0.002 * (item % 3))
+        return item * item
+
+    found = in_order(squared, range(20), lambda k, result: told.append((k, result)))
+    assert found == [i * i for i in range(20)]
+    assert told == list(enumerate(found))
+
+
+@pytest.mark.parametrize("threads", ["1", "2"])
+def test_a_task_may_share_its_ranges_out_and_an_error_ends_the_rest(monkeypatch, threads) -> None:
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", threads)
+    begun = []
+
+    def task(item: int) -> int:
+        begun.append(item)
+        if item == 3:
+            raise ValueError(item)
+        return len(ranges_of(10, 1))
+
+    with pytest.raises(ValueError, match="3"):
+        in_order(task, range(100))
+    assert len(begun) < 10
+    assert in_order(task, range(3)) == [10, 10, 10]
+
+
+def test_two_tasks_run_at_once(monkeypatch) -> None:
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", "2")
+    both = threading.Barrier(2, timeout=10)
+    assert in_order(lambda _: both.wait() >= 0, range(2)) == [True, True]
+
+
+def test_after_an_interrupt_ranges_are_for_all_threads_again(monkeypatch) -> None:
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", "2")
+    caller, began = threading.current_thread(), threading.Event()
+
+    def interrupted(begin: int, end: int) -> None:
+        if threading.current_thread() is caller:
+            began.set()
+            raise KeyboardInterrupt
+        began.wait(10)
+
+    with pytest.raises(KeyboardInterrupt):
+        in_parallel(interrupted, 1000, grain=1)
+    both = threading.Barrier(2, timeout=10)
+    in_parallel(lambda begin, end: both.wait() and None, 2, grain=1)

@@ -1,0 +1,390 @@
+"""Ties between stops: patches, terrain, alignment, and rendered stereo panoramas with known truth."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from pancam_graph import (
+    Observations,
+    Rendering,
+    RenderOptions,
+    SimulationOptions,
+    Solution,
+    Traverse,
+    find_observations,
+    read_traverse,
+    render,
+    simulate,
+    solve,
+    write_rendering,
+)
+from pancam_graph.base.geometry import HEAD_R_FORWARD_CAMERA, FloatArray
+from pancam_graph.base.threads import n_workers
+from pancam_graph.cameras import Pinhole
+from pancam_graph.data import StopMatching
+from pancam_graph.images import FrontEndOptions, _refine, _steps
+from pancam_graph.images._alignment import Ties, fit_pose, telemetry_alignment
+from pancam_graph.images._between import StopMatcher, StopTies
+from pancam_graph.images._pairs import PairGeometry
+from pancam_graph.images._patches import align_patches
+from pancam_graph.images._splines import Splines
+from pancam_graph.images._terrain import Terrain, terrain_arrays, terrain_from
+from pancam_graph.rigs import Eye, Rig, rig_template
+
+QUICK = FrontEndOptions(max_features=1500, max_ties=700)
+
+# --- patches ---
+
+
+def coefficients(image: FloatArray) -> np.ndarray:
+    blurred = ndimage.gaussian_filter(image, 0.7)
+    return ndimage.spline_filter(blurred, 3, mode="mirror").astype(np.float32)
+
+
+def test_patches_are_found_from_afar_and_through_an_unknown_affine_map() -> None:
+    rng = np.random.default_rng(0)
+    image_a = 100 * ndimage.gaussian_filter(rng.standard_normal((220, 240)), 1.5)
+    affine, middle, shift = (
+        np.array([[1.1, 0.05], [-0.03, 0.95]]),
+        np.array([120.0, 110.0]),
+        np.array([4.3, -2.7]),
+    )
+    v, u = np.mgrid[:220, :240]
+    source = (np.stack([u, v], -1).reshape(-1, 2) - middle - shift) @ np.linalg.inv(affine).T + middle
+    image_b = ndimage.map_coordinates(image_a, source.T[::-1], order=3, mode="mirror").reshape(220, 240)
+    uv_a = rng.uniform(70, 150, (300, 2))
+    truth = (uv_a - middle) @ affine.T + middle + shift
+    start = truth + rng.uniform(-4, 4, truth.shape)
+    found, fit = start.copy(), np.empty((300, 5))
+    unknown = np.tile(np.eye(2), (300, 1, 1))
+    reach = np.full((300, 2), 6, dtype=np.int64)
+    pictures = coefficients(image_a), coefficients(image_b)
+    align_patches(0, 300, *pictures, uv_a, unknown, reach, 10, found, fit)
+    error = np.linalg.norm(found - truth, axis=1)
+    assert np.quantile(error, 0.99) < 0.03
+    assert fit[:, 1].min() > 0.99
+    assert np.all(fit[:, 1] >= fit[:, 0])
+    # Of a patch that has a likeness nowhere else, the second best is far behind.
+    assert np.median(fit[:, 2]) < 0.8
+
+
+# --- terrain and alignment, from simulated points ---
+
+
+@pytest.fixture(scope="module")
+def simulated() -> tuple[Terrain, tuple[gtsam.Pose3, ...]]:
+    """The terrain of two stops that share no track, and the true masts."""
+    options = SimulationOptions(
+        stops=2, pans=8, tilts_rad=(-0.3,), points_per_image=60, link_stops=0, noise_px=0.1, spacing_m=5.0
+    )
+    simulation = simulate(rig_template("mer-navcam"), options, seed=3)
+    traverse = simulation.traverse
+    assert traverse.observations is not None
+    order = np.lexsort((traverse.observations.image, traverse.observations.track))
+    ordered = traverse.with_observations(traverse.observations.select(order))
+    return terrain_from(ordered, **terrain_arrays(solve(ordered))), simulation.truth.world_T_mast
+
+
+def seen_rows(terrain: Terrain, mast: gtsam.Pose3) -> Ties:
+    """What the images of stop 1 see of the terrain of stop 0, without any error."""
+    parts = []
+    for i in np.unique(terrain.image[terrain.stop == 0]).tolist():
+        rows = np.flatnonzero(terrain.image == i)
+        for j in np.flatnonzero(terrain.traverse.image_stop == 1).tolist():
+            seen = terrain.sighting(rows, j, mast)
+            on = seen.valid & terrain.camera(j).contains(seen.uv_px)
+            count = int(on.sum())
+            parts.append(
+                Ties(row=rows[on], image=np.full(count, j), uv_px=seen.uv_px[on], sigma_px=np.ones(count))
+            )
+    return Ties.concatenate(parts)
+
+
+def test_derivatives_of_sightings(simulated: tuple[Terrain, tuple[gtsam.Pose3, ...]]) -> None:
+    terrain, masts = simulated
+    ties = seen_rows(terrain, masts[1])
+    first, image = int(terrain.image[ties.row[0]]), int(ties.image[0])
+    rows = ties.row[(terrain.image[ties.row] == first) & (ties.image == image)]
+    seen = terrain.sighting(rows, image, masts[1])
+    for k in range(6):
+        change = 1e-6 * np.eye(6)[k]
+        ahead, behind = (terrain.sighting(rows, image, masts[1].retract(s * change)).uv_px for s in (1, -1))
+        numeric = (ahead - behind) / 2e-6
+        np.testing.assert_allclose(seen.d_pose[:, :, k], numeric, rtol=1e-5, atol=1e-3)
+    step = 1e-7
+    ahead, behind = (
+        replace(terrain, inverse_depth=terrain.inverse_depth + s * step).sighting(rows, image, masts[1]).uv_px
+        for s in (1, -1)
+    )
+    np.testing.assert_allclose(seen.d_inverse_depth, (ahead - behind) / (2 * step), rtol=1e-4, atol=1e-2)
+
+
+def test_slopes_are_those_of_the_ground(simulated: tuple[Terrain, tuple[gtsam.Pose3, ...]]) -> None:
+    """On a level plane the pixel beside lands on the plane, too."""
+    terrain, _ = simulated
+    for i in np.unique(terrain.image)[:4].tolist():
+        rows = np.flatnonzero(terrain.image == i)
+        near = rows[terrain.inverse_depth[rows] > 0.1]
+        rise = terrain.points_m(near, (0.0, -2.0)) - terrain.points_m(near)
+        steepness = rise[:, 2] / np.linalg.norm(rise[:, :2], axis=1)
+        assert np.median(np.abs(steepness)) < 0.2
+
+
+def test_pose_is_found_among_wrong_ties(simulated: tuple[Terrain, tuple[gtsam.Pose3, ...]]) -> None:
+    terrain, masts = simulated
+    rng = np.random.default_rng(1)
+    ties = seen_rows(terrain, masts[1])
+    uv = ties.uv_px + rng.normal(scale=0.3, size=ties.uv_px.shape)
+    wrong = rng.random(len(ties)) < 0.5
+    uv[wrong] += rng.uniform(-80, 80, (int(wrong.sum()), 2))
+    prior = telemetry_alignment(terrain, 0, 1)
+    found = fit_pose(terrain, replace(ties, uv_px=uv), prior, prior, 80.0)
+    error = gtsam.Pose3.Logmap(masts[1].between(found.world_T_mast))
+    start = gtsam.Pose3.Logmap(masts[1].between(prior.world_T_mast))
+    assert np.abs(start[3:]).max() > 0.05
+    assert np.abs(error[3:]).max() < 0.02
+    assert np.abs(error[:3]).max() < 3e-3  # the heading is as good as the pan of the first stop
+
+
+# --- rendered images ---
+
+
+def small_rig() -> Rig:
+    """A Navcam of a third of the resolution."""
+    camera = Pinhole(width_px=352, height_px=352, fx_px=420.0, fy_px=420.0, cx_px=175.5, cy_px=175.5)
+    eyes = tuple(
+        Eye(
+            name=name,
+            camera=camera,
+            head_T_camera=gtsam.Pose3(gtsam.Rot3(HEAD_R_FORWARD_CAMERA), np.array([0.1, y, 0.0])),
+        )
+        for name, y in (("left", 0.15), ("right", -0.15))
+    )
+    return replace(rig_template("mer-navcam"), name="small navcam", eyes=eyes)
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[Rendering, Traverse]:
+    folder = tmp_path_factory.mktemp("rendered") / "traverse"
+    options = RenderOptions(
+        spacing_m=3.0, pans=3, sweep_rad=float(np.deg2rad(105)), heading_change_rad=0.05, sigma_stop_m=0.05
+    )
+    rendering = render(small_rig(), options, seed=5)
+    write_rendering(rendering, folder)
+    return rendering, read_traverse(folder)
+
+
+Fitted = list[tuple[PairGeometry, FloatArray, FloatArray, FloatArray]]
+"""Pairs of images, pixels in the first, and in the second as the features have them and as fitted."""
+
+
+@pytest.fixture(scope="module")
+def small_run(small: tuple[Rendering, Traverse]) -> tuple[Traverse, Fitted, int]:
+    """What is found, what the least-squares matching within stops made of what, and how much was untied."""
+    fitted: Fitted = []
+    untied: list[int] = []
+    original, tied = _refine._refine_pair, _steps.Steps.tied
+
+    def counted(
+        steps: _steps.Steps, observations: Observations, feature: np.ndarray
+    ) -> tuple[Observations, list[StopMatching]]:
+        untied.append(len(observations))
+        return tied(steps, observations, feature)
+
+    def recorded(
+        pair: PairGeometry, spline: Splines, uv_a: FloatArray, uv_b: FloatArray, options: FrontEndOptions
+    ) -> tuple[FloatArray, np.ndarray]:
+        found, good = original(pair, spline, uv_a, uv_b, options)
+        fitted.append((pair, uv_a[good], uv_b[good], found[good]))
+        return found, good
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_refine, "_refine_pair", recorded)
+        patch.setattr(_steps.Steps, "tied", counted)
+        return find_observations(small[1], QUICK), fitted, untied[0]
+
+
+@pytest.fixture(scope="module")
+def small_found(small_run: tuple[Traverse, Fitted, int]) -> Traverse:
+    return small_run[0]
+
+
+def errors_px(rendering: Rendering, traverse: Traverse) -> tuple[FloatArray, np.ndarray]:
+    """By how much (n,) observations miss the point that their track's first one sees, and its row (n,)."""
+    obs, truth = traverse.observations, rendering.truth
+    assert obs is not None
+    first = np.searchsorted(obs.track, obs.track)
+    R, centre = traverse.camera_poses(truth.world_T_mast, truth.pan_tilt_rad)
+    points, hit = np.empty((len(obs), 3)), np.empty(len(obs), dtype=bool)
+    for i in np.unique(obs.image).tolist():
+        points[obs.image == i], hit[obs.image == i] = rendering.points(i, obs.uv_px[obs.image == i])
+    error = np.empty(len(obs))
+    for i in np.unique(obs.image).tolist():
+        k = obs.image == i
+        camera = traverse.rig.eyes[traverse.image_eye[i]].camera
+        error[k] = np.linalg.norm(
+            camera.project((points[first[k]] - centre[i]) @ R[i])[0] - obs.uv_px[k], axis=1
+        )
+    error[~hit[first] | (first == np.arange(len(obs)))] = np.nan
+    return error, first
+
+
+def linking(traverse: Traverse, first: np.ndarray) -> np.ndarray:
+    """Which observations (n,) are of another stop than their track's first."""
+    assert traverse.observations is not None
+    stop = traverse.image_stop[traverse.observations.image]
+    return np.asarray(stop != stop[first])
+
+
+def test_ties_between_stops_lie_on_the_terrain(
+    small: tuple[Rendering, Traverse], small_found: Traverse
+) -> None:
+    error, first = errors_px(small[0], small_found)
+    link = linking(small_found, first) & np.isfinite(error)
+    assert np.count_nonzero(link) > 40
+    assert np.mean(error[link] < 1.5) > 0.7
+    assert np.median(error[link]) < 0.6
+
+
+def test_least_squares_matching_beats_the_features_own_places(
+    small: tuple[Rendering, Traverse], small_run: tuple[Traverse, Fitted, int]
+) -> None:
+    rendering, traverse = small
+    R, centre = traverse.camera_poses(rendering.truth.world_T_mast, rendering.truth.pan_tilt_rad)
+    errors: tuple[list[FloatArray], list[FloatArray]] = ([], [])
+    for pair, uv_a, *both in small_run[1]:
+        points, hit = rendering.points(pair.a, uv_a)
+        truth, _ = pair.camera_b.project((points - centre[pair.b]) @ R[pair.b])
+        for error, uv_b in zip(errors, both, strict=True):
+            error.append(np.linalg.norm(uv_b - truth, axis=1)[hit])
+    before, after = (float(np.median(np.concatenate(e))) for e in errors)
+    assert after < 0.5 * before
+
+
+@pytest.mark.slow
+def test_the_same_on_any_number_of_threads_and_from_the_cache(
+    small: tuple[Rendering, Traverse], small_found: Traverse, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def not_again(*_: object) -> None:
+        raise AssertionError("what was kept is made anew")
+
+    before = small_found.observations
+    assert before is not None
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", "1" if n_workers() > 1 else "2")
+    for _ in range(2):
+        again = find_observations(small[1], QUICK, cache=tmp_path)
+        assert again.observations is not None
+        assert again.warnings == small_found.warnings
+        for name in ("image", "track", "uv_px", "sigma_px"):
+            assert getattr(again.observations, name).tobytes() == getattr(before, name).tobytes()
+        for name in ("find_features", "match_pair", "refine_tracks", "terrain_arrays"):
+            monkeypatch.setattr(_steps, name, not_again)
+        monkeypatch.setattr(StopMatcher, "ties", not_again)
+
+
+@pytest.mark.slow
+def test_ties_that_were_found_before_an_interrupt_are_kept(
+    small: tuple[Rendering, Traverse], small_found: Traverse, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("PANCAM_GRAPH_THREADS", "1")
+    ties, done = StopMatcher.ties, list[tuple[int, int]]()
+
+    def interrupted(matcher: StopMatcher, one: int, other: int) -> StopTies:
+        if done == [(0, 1)]:
+            done.append((one, other))
+            raise KeyboardInterrupt
+        done.append((one, other))
+        return ties(matcher, one, other)
+
+    def not_again(*_: object) -> None:
+        raise AssertionError("what was kept is made anew")
+
+    monkeypatch.setattr(StopMatcher, "ties", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        find_observations(small[1], QUICK, cache=tmp_path)
+    assert len(list(tmp_path.glob("ties-*"))) == 1
+    monkeypatch.setattr(_steps, "terrain_arrays", not_again)
+    again = find_observations(small[1], QUICK, cache=tmp_path)
+    assert done == [(0, 1), (1, 0), (1, 0)]
+    assert again.matching == small_found.matching
+    assert again.observations is not None
+    assert small_found.observations is not None
+    for name in ("image", "track", "uv_px", "sigma_px"):
+        assert (
+            getattr(again.observations, name).tobytes() == getattr(small_found.observations, name).tobytes()
+        )
+
+
+def test_all_that_was_looked_at_is_accounted_for(
+    small_found: Traverse, small_run: tuple[Traverse, Fitted, int]
+) -> None:
+    found = small_found.matching
+    assert found is not None
+    assert {(s.a, s.b) for s in found.stops} == {(0, 1), (1, 0)}
+    for s in found.stops:
+        assert s.sought == s.kept + s.unlike + s.ambiguous + s.unstable + s.masked + s.off_pose
+        assert s.kept > 10
+        assert s.unlike > 0
+    for p in found.pairs:
+        assert bool(p.refusal) == (p.kept == 0)
+        if not p.refusal:
+            assert p.candidates == p.kept + p.rover + p.off_line
+    assert sum(p.off_line for p in found.pairs) > 0
+    observations = small_found.observations
+    assert observations is not None
+    assert len(observations) - small_run[2] == sum(s.kept for s in found.stops)
+
+
+def test_small_panoramas_place_the_second_stop(
+    small: tuple[Rendering, Traverse], small_found: Traverse
+) -> None:
+    solution = solve(small_found)
+    assert solution.converged
+    assert place_error(small[0], solution) < 0.01
+    assert relative_rms_rad(small[0], solution).max() < 0.15e-3
+
+
+def place_error(rendering: Rendering, solution: Solution) -> float:
+    """Of the second stop in the mast frame of the first, as a share of the distance."""
+    true, found = (
+        m[0].between(m[1]).translation() for m in (rendering.truth.world_T_mast, solution.final.world_T_mast)
+    )
+    return float(np.linalg.norm(found - true) / np.linalg.norm(true))
+
+
+def relative_rms_rad(rendering: Rendering, solution: Solution) -> FloatArray:
+    """RMS error (stops, 2) of pan and tilt relative to the mean of the stop."""
+    error = solution.final.pan_tilt_rad - rendering.truth.pan_tilt_rad
+    error = np.arctan2(np.sin(error), np.cos(error))
+    stop = solution.traverse.frame_stop
+    return np.array([np.std(error[stop == s], axis=0) for s in range(len(solution.traverse.stops))])
+
+
+def wac_pair() -> Rig:
+    rig = rig_template("exomars-pancam")
+    return replace(rig, name="exomars-wac", eyes=rig.eyes[:2])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "rig", [lambda: rig_template("mer-navcam"), wac_pair], ids=["mer-navcam", "exomars-wac"]
+)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_two_stereo_panoramas_reach_the_target(rig: Callable[[], Rig], seed: int, tmp_path: Path) -> None:
+    """Two stops 7 m apart, ten azimuths, two eyes, 1024 x 1024, telemetry's errors; from files alone."""
+    rendering = render(rig(), RenderOptions(), seed=seed)
+    write_rendering(rendering, tmp_path / "traverse")
+    solution = solve(find_observations(read_traverse(tmp_path / "traverse")))
+    assert solution.converged
+    assert relative_rms_rad(rendering, solution).max() < 0.15e-3
+    assert place_error(rendering, solution) < 0.003
+    error, first = errors_px(rendering, solution.traverse)
+    judged = solution.used & solution.used[first] & np.isfinite(error)
+    assert np.sqrt(np.mean(np.minimum(error[judged], 3.0) ** 2) / 2) < 0.35
+    assert np.mean(solution.used) > 0.9
+    assert not any("stops" in w for w in solution.warnings)
