@@ -1,7 +1,7 @@
 """CAHV, CAHVOR and CAHVORE: the camera models of planetary rovers, as vectors in one frame.
 
 Sources: Yakimovsky and Cunningham 1978 (CAHV); Gennery 2001 and 2006 (CAHVOR, CAHVORE). The
-formulas, with d = P - C, are those of docs/conventions.md, section "CAHV family".
+formulas, with d = P - C, are those of docs/method.md, section "CAHV family".
 """
 
 from collections.abc import Mapping

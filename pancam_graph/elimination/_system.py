@@ -223,6 +223,8 @@ class LandmarkSystem:
     def linearise(self, posture: Posture) -> Panels:
         """The system (S, s) in the cameras' variables at the landmarks' present places.
 
+        The normal equations of cameras and landmarks (thesis eq. 3.40), landmarks eliminated (eq. 3.42).
+
         The panels are this object's own and are filled anew by the next call.
         """
         bearings = self.bearings(posture)
@@ -323,6 +325,7 @@ class LandmarkSystem:
     def try_step(self, posture: Posture, step: FloatArray) -> FloatArray:
         """Costs (blocks,) where a step of all variables (columns,) leads, landmarks moved along.
 
+        Landmarks follow by back substitution (thesis eq. 3.43), and are refined where that leaves them off.
         `posture` is that after the step. A landmark that cannot be brought in front of its cameras costs
         kernel.BEHIND_COST.
         """

@@ -14,8 +14,8 @@ Tie = Literal["hard", "soft"]
 
 Model = Literal["mast", "circle", "free", "projective"]
 """How camera poses hang together: `mast` on the pan-tilt chain, `circle` with their centres on the mast's
-circles and their rotations free (thesis 4.6 to 4.9), `free` each on its own but for a loose telemetry tie,
-`projective` the same for the 12 entries of each camera's projection matrix (thesis 4.2 to 4.4)."""
+circles and their rotations free (thesis eq. 4.6 to 4.9), `free` each on its own but for a loose telemetry
+tie, `projective` the same for the 12 entries of each camera's projection matrix (thesis eq. 4.2 to 4.4)."""
 
 
 @dataclass(frozen=True, kw_only=True)

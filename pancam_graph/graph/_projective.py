@@ -1,4 +1,4 @@
-"""Projection matrices as variables: 12 numbers per image, tied to the mast (thesis 4.2 to 4.4).
+"""Projection matrices as variables: 12 numbers per image, tied to the mast (thesis eq. 4.2 to 4.4).
 
 Variables: `P` the entries of an image's conditioned projection matrix (vector of 12); `M` and `A` as in the
 models with camera poses. The landmark blocks take the matrices as poses and calibrations do: K, R and C and

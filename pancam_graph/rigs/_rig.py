@@ -1,4 +1,4 @@
-"""A mast rig: the pan-tilt chain and the eyes on it (docs/conventions.md, "The mast")."""
+"""A mast rig: the pan-tilt chain and the eyes on it (docs/conventions.md, "Signs")."""
 
 from dataclasses import dataclass, field
 from functools import cached_property

@@ -1,0 +1,140 @@
+"""The pages in docs/ keep their word: what they name exists, and what the code cites is in the table."""
+
+import importlib
+import re
+from functools import reduce
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
+
+NUMBER = r"\d\.\d+"
+CITED = re.compile(rf"\beq\.\s+({NUMBER}(?:(?:\s*,|\s+and|\s+to)\s+{NUMBER})*)")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _of_the_repository() -> None:
+    if not DOCS.is_dir():
+        pytest.skip("no docs/: they are part of the repository, not of the installed package")
+
+
+def rows_of(page: str, after: str) -> list[dict[str, str]]:
+    """Rows of all tables between a heading and the next of its level, by the titles of their columns."""
+    level = after.split(maxsplit=1)[0]
+    text = page[page.index(f"\n{after}\n") + len(after) + 2 :]
+    text = re.split(rf"(?m)^#{{1,{len(level)}}} ", text)[0]
+    rows, titles = [], list[str]()
+    for line in text.splitlines():
+        if not line.startswith("|"):
+            titles = []
+            continue
+        cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
+        if not titles:
+            titles = cells
+        elif not set("".join(cells)) <= set("-: "):
+            rows.append(dict(zip(titles, cells, strict=True)))
+    return rows
+
+
+def expanded(numbers: str) -> set[str]:
+    """The single numbers of a citation: "3.3, 3.30 to 3.34" has six."""
+    out, words = set[str](), re.findall(rf"{NUMBER}|to", numbers)
+    for i, word in enumerate(words):
+        if word == "to":
+            (chapter, first), (_, last) = (words[j].split(".") for j in (i - 1, i + 1))
+            out |= {f"{chapter}.{n}" for n in range(int(first), int(last) + 1)}
+        else:
+            out.add(word)
+    return out
+
+
+def cited_equations() -> dict[str, list[str]]:
+    """Each equation number that the package's source cites, with the files that do."""
+    out: dict[str, list[str]] = {}
+    files = {
+        path.resolve() for folder in ("pancam_graph", "factors") for path in (ROOT / folder).rglob("*.py")
+    }
+    assert files
+    for path in sorted(files):
+        for numbers in CITED.findall(path.read_text(encoding="utf-8")):
+            for number in expanded(numbers):
+                out.setdefault(number, []).append(str(path.relative_to(ROOT)))
+    return out
+
+
+@pytest.fixture(scope="module")
+def method() -> str:
+    return (DOCS / "method.md").read_text(encoding="utf-8")
+
+
+def test_every_place_of_the_table_exists(method: str) -> None:
+    rows = rows_of(method, "## Where a formula lives")
+    assert len(rows) > 50
+    wrong = []
+    for row in rows:
+        file, name = row["file"].strip("`"), row["name"].strip("`")
+        module = file.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+        if module.startswith("factors"):
+            module = f"pancam_graph.{module}"
+        if not (ROOT / file).is_file():
+            wrong.append(f"{file}: no such file")
+            continue
+        try:
+            reduce(getattr, name.split("."), importlib.import_module(module))
+        except AttributeError as error:
+            wrong.append(f"{file}: {error}")
+    assert wrong == []
+
+
+def test_equations_of_code_and_table_are_the_same(method: str) -> None:
+    table = set[str]()
+    for row in rows_of(method, "### Numbered equations of the thesis"):
+        assert "to" not in row["equation"], "each number by itself, so that a search finds it"
+        table |= expanded(row["equation"])
+    code = cited_equations()
+    assert {n: files for n, files in code.items() if n not in table} == {}, "cited in the code only"
+    assert table - set(code) == set(), "in the table only"
+    assert {"4.8", "3.40", "4.11"} <= table
+
+
+@pytest.mark.parametrize(
+    "what", ["CAHVOR", "where pan wraps", "where outliers are judged", "4.8", "3.40", "4.11"]
+)
+def test_two_opened_files_lead_from_the_readme_to_the_code(method: str, what: str) -> None:
+    """README links to the table, and one row of the table has what is sought, its file and its function."""
+    assert "(docs/method.md#where-a-formula-lives)" in (ROOT / "README.md").read_text(encoding="utf-8")
+    rows = rows_of(method, "## Where a formula lives")
+    found = [
+        row for row in rows if any(re.search(rf"(?<![\d.]){re.escape(what)}\b", c) for c in row.values())
+    ]
+    assert found
+    assert all((ROOT / row["file"].strip("`")).is_file() for row in found)
+
+
+def slug(heading: str) -> str:
+    """The anchor that GitHub and the site give a heading of plain words."""
+    return re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
+
+
+def pages() -> list[Path]:
+    return [ROOT / "README.md", *sorted(ROOT.glob("C*.md")), *sorted(DOCS.rglob("*.md"))]
+
+
+@pytest.mark.parametrize("page", pages(), ids=lambda page: page.name)
+def test_links_lead_to_pages_and_headings(page: Path) -> None:
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    wrong = []
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if re.match(r"(https?|mailto):", target):
+            continue
+        file, _, anchor = target.partition("#")
+        path = page.parent / file if file else page
+        if not path.exists():
+            wrong.append(target)
+        elif anchor and path.suffix == ".md":
+            headings = re.findall(r"(?m)^#+ (.+)$", path.read_text(encoding="utf-8"))
+            if anchor not in {slug(heading) for heading in headings}:
+                wrong.append(target)
+    assert wrong == []
