@@ -6,9 +6,10 @@ import numpy as np
 
 from pancam_graph.base.errors import CameraError
 from pancam_graph.base.geometry import BoolArray, FloatArray
-from pancam_graph.cameras._camera import Pinhole, require_finite
+from pancam_graph.cameras._camera import PINHOLE_FIELDS, Pinhole, require_finite
+from pancam_graph.cameras._lens import Lens, LensField, linear_vectors
 
-__all__ = ["Brown"]
+__all__ = ["BROWN_LENS", "Brown"]
 
 _BROWN_STEPS = 50
 _BROWN_TOLERANCE = 1e-14
@@ -72,3 +73,29 @@ class Brown(Pinhole):
         value, d = self.distort(xy)
         error = np.linalg.norm(value - xy_distorted, axis=1)
         return xy, (error < 1e-10) & (np.linalg.det(d) > 0)
+
+
+def _cahv_vectors(camera: Brown) -> dict[str, FloatArray]:
+    """The same lens as CAHVOR: O = A and R = (0, k1, k2). Without distortion CAHV.
+
+    With w = z, CAHVOR's t is the squared radius of Brown 1971, and d' differs from d in x and y alone.
+    Raises CameraError for p1, p2 or k3, of which CAHVOR has no equal.
+    """
+    linear = linear_vectors(camera.calibration_matrix)
+    if not any(camera.distortion):
+        return linear
+    k1, k2, p1, p2, k3 = camera.distortion
+    if p1 or p2 or k3:
+        raise CameraError(
+            f"distortion: expected k1 and k2 alone, all that CAHVOR can say, found p1 {p1:g}, p2 {p2:g}, "
+            f"k3 {k3:g}"
+        )
+    return linear | {"O": linear["A"], "R": np.array([0.0, k1, k2])}
+
+
+BROWN_LENS = Lens(
+    name="brown",
+    camera=Brown,
+    fields=(*PINHOLE_FIELDS, LensField(key="distortion", attribute="distortion", kind="vector", length=5)),
+    cahv_vectors=_cahv_vectors,
+)

@@ -7,8 +7,9 @@ import numpy as np
 
 from pancam_graph.base.errors import CameraError
 from pancam_graph.base.geometry import BoolArray, FloatArray
+from pancam_graph.cameras._lens import MOUNT, Lens, LensField, linear_vectors
 
-__all__ = ["Camera", "Pinhole", "Rays", "require_finite"]
+__all__ = ["PINHOLE_FIELDS", "PINHOLE_LENS", "Camera", "Pinhole", "Rays", "require_finite"]
 
 _MIN_DEPTH = 1e-9
 
@@ -216,6 +217,21 @@ class Pinhole(Camera):
         along = np.einsum("ni,nij->nj", direction, d_ray)
         d_direction = (d_ray - direction[:, :, None] * along[:, None, :]) / norm[:, None, None]
         return rays, np.zeros_like(d_direction), d_direction
+
+
+PINHOLE_FIELDS = (
+    *(LensField(key=key, attribute=key) for key in ("fx_px", "fy_px", "cx_px", "cy_px")),
+    LensField(key="skew_px", attribute="skew_px", default=0.0),
+    MOUNT,
+)
+"""The entries of a pinhole; a model with more than these lists its own after them."""
+
+PINHOLE_LENS = Lens(
+    name="pinhole",
+    camera=Pinhole,
+    fields=PINHOLE_FIELDS,
+    cahv_vectors=lambda camera: linear_vectors(camera.calibration_matrix),
+)
 
 
 def require_finite(where: str, **numbers: float | FloatArray) -> None:

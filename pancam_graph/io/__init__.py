@@ -2,6 +2,14 @@
 
 from pancam_graph.io._cahvor import cahvor_text as cahvor_text
 from pancam_graph.io._cahvor import read_cahvor as read_cahvor
+from pancam_graph.io._camera_entry import AnyCamera as AnyCamera
+from pancam_graph.io._camera_entry import CameraEntry as CameraEntry
+from pancam_graph.io._camera_entry import camera_entry as camera_entry
+from pancam_graph.io._entries import MOSAIC_FORMAT as MOSAIC_FORMAT
+from pancam_graph.io._entries import SOLUTION_FORMAT as SOLUTION_FORMAT
+from pancam_graph.io._entries import VERSION as VERSION
+from pancam_graph.io._entries import Entry as Entry
+from pancam_graph.io._entries import PoseEntry as PoseEntry
 from pancam_graph.io._image_files import GreyImage as GreyImage
 from pancam_graph.io._image_files import left_out as left_out
 from pancam_graph.io._image_files import read_eye_content as read_eye_content
@@ -17,15 +25,8 @@ from pancam_graph.io._json import validated as validated
 from pancam_graph.io._mask_files import mask_file as mask_file
 from pancam_graph.io._mask_files import read_mask as read_mask
 from pancam_graph.io._pds import read_pds as read_pds
-from pancam_graph.io._schema import MOSAIC_FORMAT as MOSAIC_FORMAT
-from pancam_graph.io._schema import SOLUTION_FORMAT as SOLUTION_FORMAT
-from pancam_graph.io._schema import VERSION as VERSION
-from pancam_graph.io._schema import CameraEntry as CameraEntry
-from pancam_graph.io._schema import Entry as Entry
-from pancam_graph.io._schema import PoseEntry as PoseEntry
 from pancam_graph.io._schema import SharingEntry as SharingEntry
 from pancam_graph.io._schema import TraverseFile as TraverseFile
-from pancam_graph.io._schema import camera_entry as camera_entry
 from pancam_graph.io._traverse_json import read_traverse as read_traverse
 from pancam_graph.io._traverse_json import traverse_entries as traverse_entries
 from pancam_graph.io._traverse_json import traverse_of as traverse_of

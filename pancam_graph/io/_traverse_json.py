@@ -10,16 +10,14 @@ import numpy as np
 from pancam_graph.base.errors import ImageError, InputError
 from pancam_graph.base.whole_files import whole_file
 from pancam_graph.data import Frame, Image, Stop, Traverse
+from pancam_graph.io._entries import TRAVERSE_FORMAT, VERSION, PoseEntry
 from pancam_graph.io._image_files import left_out, read_eye_content
 from pancam_graph.io._json import prefixed, read_json, refused_by_schema, short, validated
 from pancam_graph.io._mask_files import mask_file, read_mask
 from pancam_graph.io._observations import observations_npz, read_observations
 from pancam_graph.io._schema import (
-    TRAVERSE_FORMAT,
-    VERSION,
     FrameEntry,
     ImageEntry,
-    PoseEntry,
     SharingEntry,
     StopEntry,
     TraverseFile,

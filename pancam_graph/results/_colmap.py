@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pancam_graph.base.geometry import FloatArray, wxyz_from_rotation
-from pancam_graph.cameras import straightening_map
+from pancam_graph.cameras import lens_of, straightening_map
 from pancam_graph.data import Solution, rms_px
 from pancam_graph.results._brightness import Brightness, brightness_of, readable_image
 from pancam_graph.results._colmap_scene import (
@@ -289,7 +289,7 @@ def _about(
             {
                 "camera_id": number,
                 "camera": solution.traverse.images[i].camera,
-                "model": type(s.camera).__name__.lower(),
+                "model": lens_of(s.camera).name,
                 "range_m": s.range_m if moving else None,
                 "largest_shift_px": float(placed.shift_px[own].max(initial=0.0)) if moving else 0.0,
             }

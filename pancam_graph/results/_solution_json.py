@@ -14,7 +14,7 @@ from pancam_graph.data import Incremental, Solution
 from pancam_graph.io import (
     SOLUTION_FORMAT,
     VERSION,
-    CameraEntry,
+    AnyCamera,
     Entry,
     PoseEntry,
     camera_entry,
@@ -129,7 +129,7 @@ class SolutionFile(Entry):
     stops: list[SolvedStopEntry]
     frames: list[SolvedFrameEntry]
     images: list[SolvedImageEntry]
-    cameras: list[CameraEntry]
+    cameras: list[AnyCamera]
     """As the cameras of a rig in `traverse.json`, refined where an eye has one correction for all images."""
     method: str = "joint"
     """The key is missing where it was joint."""

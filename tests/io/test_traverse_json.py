@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from pancam_graph import Freedom, Image, Observations, Sharing, Traverse
 from pancam_graph.base.errors import InputError
-from pancam_graph.cameras import CAHV, Camera
+from pancam_graph.cameras import CAHV, Camera, Pinhole
 from pancam_graph.io import read_input, read_traverse, write_traverse
 from pancam_graph.rigs import TEMPLATES
 from support import io_samples
@@ -63,6 +63,23 @@ def test_all_camera_models_return(tmp_path: Path) -> None:
     write_traverse(expected, tmp_path)
     assert_same(read_traverse(tmp_path), expected)
     assert_same(read_input(str(tmp_path)), expected)
+
+
+def test_a_camera_that_is_not_registered_is_not_written(tmp_path: Path) -> None:
+    """As a pinhole, which it inherits from, it would lose what it has of its own."""
+
+    class OwnLens(Pinhole):
+        pass
+
+    sample = io_samples.traverse()
+    numbers = {"fx_px": 70.0, "fy_px": 71.5, "cx_px": 31.5, "cy_px": 23.25}
+    eye = replace(sample.rig.eyes[0], camera=OwnLens(**io_samples.SIZE, **numbers))
+    made = replace(sample, rig=replace(sample.rig, eyes=(eye, *sample.rig.eyes[1:])))
+    with pytest.raises(InputError) as caught:
+        write_traverse(made, tmp_path / "out")
+    expected = "camera pinhole: expected pinhole, brown, cahv, cahvor or cahvore, found OwnLens"
+    assert str(caught.value) == expected
+    assert not (tmp_path / "out").exists()
 
 
 def test_cahv_vectors_are_written_in_the_head_frame(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray, IntArray, correction_twists, pose_arrays
 from pancam_graph.base.threads import blas_on_one_thread
-from pancam_graph.cameras import CAHV, CAHVOR, CAHVORE, Camera
+from pancam_graph.cameras import CAHV, Camera, lens_of
 from pancam_graph.rigs._chain import Chain, PosedCameras
 from pancam_graph.rigs._rig import Eye, PointingSigma, Rig
 from pancam_graph.rigs.fit._free_directions import FreeDirection, free_directions
@@ -280,16 +281,13 @@ def _mean_cameras(
 
 
 def _mean_model(models: Sequence[CAHV]) -> CAHV:
-    def mean(name: str) -> FloatArray:
-        return np.asarray(np.mean([getattr(model, name) for model in models], axis=0))
-
     first = models[0]
-    out: CAHV = replace(first, C=mean("C"), A=mean("A"), H=mean("H"), V=mean("V"))
-    if isinstance(out, CAHVOR):
-        out = replace(out, O=mean("O"), R=mean("R"))
-    if isinstance(out, CAHVORE):
-        out = replace(out, E=mean("E"), linearity=float(mean("linearity")))
-    return out
+    means: dict[str, Any] = {
+        name: np.mean([getattr(model, name) for model in models], axis=0)
+        for name in lens_of(first).attributes()
+    }
+    numbers: dict[str, Any] = {n: value if np.ndim(value) else float(value) for n, value in means.items()}
+    return replace(first, **numbers)
 
 
 def _result(

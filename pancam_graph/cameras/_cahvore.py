@@ -1,0 +1,192 @@
+"""CAHVORE: CAHVOR with an entrance pupil that moves, for wide angles and fish-eyes.
+
+Source: Gennery 2006; docs/method.md, section "CAHV family".
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pancam_graph.base.geometry import BoolArray, FloatArray
+from pancam_graph.cameras._cahv import MIN_DEPTH, NEWTON_STEPS, own_vectors
+from pancam_graph.cameras._cahvor import CAHVOR, CAHVOR_FIELDS
+from pancam_graph.cameras._camera import Rays, require_finite
+from pancam_graph.cameras._lens import Lens, LensField
+
+__all__ = ["CAHVORE", "CAHVORE_LENS"]
+
+_MIN_RANGE_M = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CAHVORE(CAHVOR):
+    """CAHVOR with an entrance pupil that moves along O (E), for wide angles and fish-eyes."""
+
+    E: FloatArray
+    """(3,) entrance pupil coefficients e0, e1, e2, metres."""
+    linearity: float
+    """L: 1 perspective, 0 fish-eye (equidistant), and anything between; negative beyond."""
+
+    def __post_init__(self) -> None:
+        """Check the linearity."""
+        super().__post_init__()
+        require_finite("CAHVORE", linearity=self.linearity)
+
+    @classmethod
+    def _vector_names(cls) -> tuple[str, ...]:
+        return ("C", "A", "H", "V", "O", "R", "E")
+
+    @property
+    def _unit_axis(self) -> FloatArray:
+        return np.asarray(self.O / np.linalg.norm(self.O))
+
+    def _angle_of(self, x: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Field angle of the linearised radius x, its derivative, and where it exists."""
+        k = self.linearity
+        if k > 1e-12:
+            return np.arctan(k * x) / k, 1 / (1 + (k * x) ** 2), np.ones(len(x), dtype=bool)
+        if k < -1e-12:
+            inside = np.abs(k * x) < 1
+            y = np.where(inside, k * x, 0.0)
+            return np.arcsin(y) / k, 1 / np.sqrt(1 - y**2), inside
+        return x, np.ones_like(x), np.ones(len(x), dtype=bool)
+
+    def _radius_of(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Inverse of `_angle_of`, its derivative, and where it exists."""
+        k = self.linearity
+        inside = np.abs(k * theta) < np.pi / 2 - 1e-9
+        y = np.where(inside, k * theta, 0.0)
+        if k > 1e-12:
+            return np.tan(y) / k, 1 / np.cos(y) ** 2, inside
+        if k < -1e-12:
+            return np.sin(y) / k, np.cos(y), inside
+        return theta, np.ones_like(theta), np.ones(len(theta), dtype=bool)
+
+    @property
+    def pupil_moves(self) -> bool:
+        """True: where a ray starts depends on its angle."""
+        return True
+
+    def _pupil(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Shift of the entrance pupil along O, metres, and its derivative by the field angle."""
+        e0, e1, e2 = self.E
+        t2 = theta**2
+        small = np.abs(theta) < 1e-3
+        safe = np.where(small, 1.0, theta)
+        sin, cos = np.sin(safe), np.cos(safe)
+        ratio = np.where(small, t2 / 6 + 7 * t2**2 / 360, safe / sin - 1)
+        d_ratio = np.where(small, theta / 3 + 7 * theta**3 / 90, (sin - safe * cos) / sin**2)
+        e = e0 + t2 * (e1 + t2 * e2)
+        d_e = theta * (2 * e1 + 4 * e2 * t2)
+        return ratio * e, d_ratio * e + ratio * d_e
+
+    def project_with_jacobian(self, points_m: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Pixels, derivatives and validity; see `Camera.project_with_jacobian`.
+
+        Newton's method finds the field angle: cos(th) |l| = sin(th) (z - s(th)).
+        """
+        axis = self._unit_axis
+        d = points_m - self.C
+        z = d @ axis
+        lateral = d - z[:, None] * axis
+        length = np.linalg.norm(lateral, axis=1)
+        theta = np.arctan2(length, z)
+        for _ in range(NEWTON_STEPS):
+            s, d_s = self._pupil(theta)
+            sin, cos = np.sin(theta), np.cos(theta)
+            value = cos * length - sin * (z - s)
+            slope = -sin * length - cos * (z - s) + sin * d_s
+            step = value / np.where(np.abs(slope) < 1e-300, 1.0, slope)
+            theta = theta - np.clip(step, -0.3, 0.3)
+            if np.all(np.abs(step) < 1e-15 * (1 + np.abs(theta))):
+                break
+        s, d_s = self._pupil(theta)
+        sin, cos = np.sin(theta), np.cos(theta)
+        value = cos * length - sin * (z - s)
+        slope = -sin * length - cos * (z - s) + sin * d_s
+        distance = np.maximum(np.hypot(length, z), 1e-300)
+        converged = (np.abs(value) < 1e-12 * (1 + distance)) & (theta >= -1e-12) & (theta < np.pi)
+        # The pupil's shift grows without bound to the side; points nearer to C than it are outside the model.
+        converged &= sin * length + cos * z > np.abs(s) + _MIN_RANGE_M
+        slope = np.where(np.abs(slope) < 1e-300, 1.0, slope)
+        x, d_x, inside = self._radius_of(theta)
+        r0, r1, r2 = self.R
+        k = x * (1 + r0 + x**2 * (r1 + x**2 * r2))
+        d_k = (1 + r0 + x**2 * (3 * r1 + x**2 * 5 * r2)) * d_x  # by theta
+
+        # On the axis the lateral direction is undefined, and so is nothing else: k / |l| has a limit.
+        on_axis = length < 1e-12 * distance
+        unit = lateral / np.where(on_axis, 1.0, length)[:, None]
+        ray = axis + k[:, None] * unit
+        d_theta = -(cos[:, None] * unit - sin[:, None] * axis) / slope[:, None]
+        across = np.eye(3) - np.outer(axis, axis)
+        gain = np.where(on_axis, d_k * -cos / slope, k / np.where(on_axis, 1.0, length))
+        turn = across - unit[:, :, None] * unit[:, None, :]
+        d_ray = unit[:, :, None] * (d_k[:, None] * d_theta)[:, None, :] + gain[:, None, None] * turn
+        depth = ray @ self.A
+        valid = converged & inside & (depth > MIN_DEPTH) & (d_k > 0)
+        depth = np.where(valid, depth, 1.0)
+        uv = np.stack([ray @ self.H, ray @ self.V], axis=1) / depth[:, None]
+        d_uv = (np.stack([self.H, self.V]) - uv[:, :, None] * self.A) / depth[:, None, None]
+        return uv, d_uv @ d_ray, valid
+
+    def unproject_with_jacobian(self, uv_px: FloatArray) -> tuple[Rays, FloatArray, FloatArray]:
+        """Rays and their derivatives; see `Camera.unproject_with_jacobian`."""
+        axis = self._unit_axis
+        linear, d_linear = self._linear_ray(uv_px)
+        z = linear @ axis
+        valid = z > MIN_DEPTH
+        z = np.where(valid, z, 1.0)
+        flat = linear / z[:, None]
+        d_flat = (d_linear - flat[:, :, None] * np.einsum("i,nij->nj", axis, d_linear)[:, None, :]) / z[
+            :, None, None
+        ]
+        lateral = flat - axis
+        k = np.linalg.norm(lateral, axis=1)
+        on_axis = k < 1e-12
+        unit = lateral / np.where(on_axis, 1.0, k)[:, None]
+        r0, r1, r2 = self.R
+        x = k / (1 + r0)
+        for _ in range(NEWTON_STEPS):
+            value = x * (1 + r0 + x**2 * (r1 + x**2 * r2)) - k
+            slope = 1 + r0 + x**2 * (3 * r1 + x**2 * 5 * r2)
+            step = value / np.where(np.abs(slope) < 1e-12, 1.0, slope)
+            x = x - step
+            if np.all(np.abs(step) < 1e-15):
+                break
+        value = x * (1 + r0 + x**2 * (r1 + x**2 * r2)) - k
+        slope = 1 + r0 + x**2 * (3 * r1 + x**2 * 5 * r2)
+        theta, d_theta_x, inside = self._angle_of(x)
+        valid = valid & inside & (np.abs(value) < 1e-10) & (slope > 0) & (theta < np.pi)
+        d_theta = d_theta_x / np.where(np.abs(slope) < 1e-12, 1.0, slope)  # by k
+        s, d_s = self._pupil(theta)
+        sin, cos = np.sin(theta), np.cos(theta)
+        direction = sin[:, None] * unit + cos[:, None] * axis
+        origin = self.C + s[:, None] * axis
+
+        d_k = np.einsum("ni,nij->nj", unit, d_flat)
+        gain = np.where(on_axis, d_theta, sin / np.where(on_axis, 1.0, k))
+        across = d_flat - unit[:, :, None] * d_k[:, None, :]
+        along = cos[:, None] * unit - sin[:, None] * axis
+        d_direction = along[:, :, None] * (d_theta[:, None] * d_k)[:, None, :] + gain[:, None, None] * across
+        d_origin = axis[None, :, None] * ((d_s * d_theta)[:, None] * d_k)[:, None, :]
+        return Rays(origin_m=origin, direction=direction, valid=valid), d_origin, d_direction
+
+    # The pupil moves: directions alone do not describe this camera, and nothing may use these by mistake.
+    def _undistort_direction(self, ray: FloatArray) -> tuple[FloatArray, BoolArray]:
+        raise AssertionError("CAHVORE is not central")
+
+    def _distort_with_jacobian(self, d: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        raise AssertionError("CAHVORE is not central")
+
+
+CAHVORE_LENS = Lens(
+    name="cahvore",
+    camera=CAHVORE,
+    fields=(
+        *CAHVOR_FIELDS,
+        LensField(key="E", attribute="E", kind="vector", length=3),
+        LensField(key="linearity", attribute="linearity"),
+    ),
+    cahv_vectors=lambda camera: own_vectors(camera) | {"linearity": camera.linearity},
+)

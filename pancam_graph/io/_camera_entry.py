@@ -1,0 +1,91 @@
+"""Cameras as entries of files: one pydantic model for each registered lens, made from its fields."""
+
+from typing import Annotated, Any, Literal, Union
+
+from pydantic import Discriminator, Field, GetCoreSchemaHandler, Tag, create_model
+from pydantic_core import CoreSchema
+
+from pancam_graph.cameras import LENSES, Lens, LensField, lens_of
+from pancam_graph.io._entries import Entry, Label, PoseEntry
+from pancam_graph.io._json import prefixed
+from pancam_graph.rigs import Eye
+
+__all__ = ["AnyCamera", "CameraEntry", "camera_entry"]
+
+
+class CameraEntry(Entry):
+    """A camera and how it sits on the head; the other entries are those of its lens (`LENSES`)."""
+
+    name: Label
+    width_px: int
+    height_px: int
+    model: str
+
+    def eye(self, where: str) -> Eye:
+        """The eye. Raises InputError naming `where`."""
+        lens = next(lens for lens in LENSES if lens.name == self.model)
+        values = {field.attribute: getattr(self, field.key) for field in lens.fields if field.kind != "mount"}
+        numbers = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
+        with prefixed(where):
+            camera = lens.camera(width_px=self.width_px, height_px=self.height_px, **numbers)
+            if lens.in_head_frame:
+                return Eye.from_head_model(self.name, camera)
+        mount = next(getattr(self, field.key) for field in lens.fields if field.kind == "mount")
+        return Eye(name=self.name, camera=camera, head_T_camera=mount.pose(f"{where}.head_T_camera"))
+
+
+def _field(field: LensField) -> Any:
+    """Type and default of an entry, as pydantic's `create_model` takes them."""
+    if field.kind == "mount":
+        return (PoseEntry, ...)
+    if field.kind == "vector":
+        return (Annotated[list[float], Field(min_length=field.length, max_length=field.length)], ...)
+    return (float, ... if field.default is None else field.default)
+
+
+def _model_of(lens: Lens[Any]) -> type[CameraEntry]:
+    entries = {field.key: _field(field) for field in lens.fields}
+    model: Any = Literal[lens.name]
+    return create_model(f"{lens.name.upper()}Entry", __base__=CameraEntry, model=(model, ...), **entries)
+
+
+_MODELS = {lens.name: _model_of(lens) for lens in LENSES}
+
+
+def _tag(value: Any) -> str:
+    model = value.get("model") if isinstance(value, dict) else getattr(value, "model", None)
+    return f"<{model}>"
+
+
+class _OfItsModel:
+    """Annotation that makes pydantic validate a camera by the model that its entry `model` names."""
+
+    def __get_pydantic_core_schema__(self, _source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        tagged = tuple(Annotated[model, Tag(f"<{name}>")] for name, model in _MODELS.items())
+        return handler.generate_schema(Annotated[Union[tagged], Discriminator(_tag)])  # noqa: UP007  of a tuple
+
+
+AnyCamera = Annotated[CameraEntry, _OfItsModel()]
+"""A camera of any lens, as the type of an entry; `model` says which."""
+
+
+def camera_entry(eye: Eye) -> CameraEntry:
+    """The entry of an eye; the vectors of a camera of the CAHV family are turned to the head frame.
+
+    Raises InputError for a camera whose class is not registered: written as another model, it would lose what
+    that model does not have.
+    """
+    with prefixed(f"camera {eye.name}"):
+        lens = lens_of(eye.camera)
+    camera = eye.head_model() if lens.in_head_frame else eye.camera
+    values = {
+        field.key: PoseEntry.of(eye.head_T_camera) if field.kind == "mount" else field.of(camera)
+        for field in lens.fields
+    }
+    return _MODELS[lens.name](
+        name=eye.name,
+        width_px=camera.width_px,
+        height_px=camera.height_px,
+        model=lens.name,
+        **values,
+    )

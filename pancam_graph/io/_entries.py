@@ -1,0 +1,64 @@
+"""What all file formats share: strict entries, names, poses.
+
+Keys and units are those of the file contract. Every model is strict: no unknown key, no number in a
+string, nothing that is not finite. References between entries are checked by the data model.
+"""
+
+from typing import Annotated
+
+import gtsam
+from pydantic import BaseModel, ConfigDict, Field
+
+from pancam_graph.base.errors import GeometryError, InputError
+from pancam_graph.base.geometry import pose_from_wxyz, wxyz_from_rotation
+
+__all__ = [
+    "MOSAIC_FORMAT",
+    "SOLUTION_FORMAT",
+    "TRAVERSE_FORMAT",
+    "VERSION",
+    "Entry",
+    "Label",
+    "PoseEntry",
+    "Text",
+]
+
+TRAVERSE_FORMAT = "pancam-graph/traverse"
+SOLUTION_FORMAT = "pancam-graph/solution"
+MOSAIC_FORMAT = "pancam-graph/mosaics"
+VERSION = 1
+
+Text = Annotated[str, Field(min_length=0)]
+"""Any string that can be written in UTF-8: a constraint makes pydantic look for halves of characters."""
+Label = Annotated[str, Field(pattern=r"^[^\p{Cc}\p{Zl}\p{Zp}]+$")]
+"""An id, a name or a path: not empty, and without control characters, which would break lines and tables."""
+
+
+class Entry(BaseModel):
+    """Base of all entries."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, frozen=True)
+
+
+class PoseEntry(Entry):
+    """A pose: quaternion (w, x, y, z), of any length but 0, and translation in metres."""
+
+    rotation_wxyz: Annotated[list[float], Field(min_length=4, max_length=4)]
+    translation_m: Annotated[list[float], Field(min_length=3, max_length=3)]
+
+    @staticmethod
+    def of(pose: gtsam.Pose3) -> "PoseEntry":
+        """The entry of a pose."""
+        return PoseEntry(
+            rotation_wxyz=wxyz_from_rotation(pose.rotation().matrix()).tolist(),
+            translation_m=pose.translation().tolist(),
+        )
+
+    def pose(self, where: str) -> gtsam.Pose3:
+        """The pose. Raises InputError naming `where` for a quaternion of norm 0."""
+        try:
+            return pose_from_wxyz(self.rotation_wxyz, self.translation_m)
+        except GeometryError as error:
+            raise InputError(
+                f"{where}.rotation_wxyz: expected numbers of finite norm above 0, found {self.rotation_wxyz}"
+            ) from error
