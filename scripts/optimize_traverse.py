@@ -12,6 +12,7 @@ Exit status: 0 solved, 1 not converged (results are written), 2 bad input (nothi
 
 import time
 from dataclasses import replace
+from typing import Any
 
 from pancam_graph import SolveOptions, cross_validate, find_observations, read_input, solve
 from pancam_graph.cli._program import Parser, Progress, print_summary, resumable, run, show_log
@@ -35,7 +36,8 @@ def main() -> int:
     choices = {name: getattr(arguments, name) for name in ("model", "landmarks", "method", "loss")}
     sharing = parse_sharing(arguments.sharing)
     # Covariances of terrain points take at most a twentieth of the solve: points.ply always has them.
-    options = SolveOptions(**choices, sharing=sharing, landmark_covariances=True, **criteria(arguments.stop))
+    stopping: dict[str, Any] = criteria(arguments.stop)
+    options = SolveOptions(**choices, sharing=sharing, landmark_covariances=True, **stopping)
     progress = Progress()
 
     begin = time.perf_counter()

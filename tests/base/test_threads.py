@@ -11,6 +11,11 @@ from pancam_graph.base.errors import InputError
 from pancam_graph.base.threads import each, in_order, in_parallel, n_workers
 
 
+def wait_at(barrier: threading.Barrier) -> None:
+    """Return when the other threads are there too."""
+    barrier.wait()
+
+
 def ranges_of(n: int, grain: int) -> list[tuple[int, int]]:
     seen = []
     in_parallel(lambda begin, end: seen.append((begin, end)), n, grain=grain)
@@ -19,7 +24,9 @@ def ranges_of(n: int, grain: int) -> list[tuple[int, int]]:
 
 @pytest.mark.parametrize("threads", ["1", "2", "3"])
 @pytest.mark.parametrize(("n", "grain"), [(0, 10), (1, 10), (9, 10), (14, 10), (16, 10), (1000, 7), (3, 1)])
-def test_ranges_follow_each_other_and_do_not_depend_on_the_threads(monkeypatch, threads, n, grain) -> None:
+def test_ranges_follow_each_other_and_do_not_depend_on_the_threads(
+    monkeypatch: pytest.MonkeyPatch, threads: str, n: int, grain: int
+) -> None:
     monkeypatch.setenv("PANCAM_GRAPH_THREADS", "1")
     alone = ranges_of(n, grain)
     monkeypatch.setenv("PANCAM_GRAPH_THREADS", threads)
@@ -30,13 +37,13 @@ def test_ranges_follow_each_other_and_do_not_depend_on_the_threads(monkeypatch, 
     assert len(lengths) <= 1 or 0.6 * grain < np.mean(lengths) < 1.5 * grain
 
 
-def test_two_threads_work_at_once(monkeypatch) -> None:
+def test_two_threads_work_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PANCAM_GRAPH_THREADS", "2")
     both = threading.Barrier(2, timeout=10)
-    in_parallel(lambda begin, end: both.wait() and None, 2, grain=1)
+    in_parallel(lambda begin, end: wait_at(both), 2, grain=1)
 
 
-def test_one_range_runs_in_the_thread_of_the_caller(monkeypatch) -> None:
+def test_one_range_runs_in_the_thread_of_the_caller(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PANCAM_GRAPH_THREADS", "2")
     names = []
     in_parallel(lambda begin, end: names.append(threading.current_thread()), 5, grain=10)
@@ -44,7 +51,7 @@ def test_one_range_runs_in_the_thread_of_the_caller(monkeypatch) -> None:
 
 
 @pytest.mark.parametrize("threads", ["1", "2"])
-def test_the_first_error_comes_through(monkeypatch, threads) -> None:
+def test_the_first_error_comes_through(monkeypatch: pytest.MonkeyPatch, threads: str) -> None:
     monkeypatch.setenv("PANCAM_GRAPH_THREADS", threads)
 
     def fails(begin: int, end: int) -> None:
@@ -56,7 +63,7 @@ def test_the_first_error_comes_through(monkeypatch, threads) -> None:
 
 
 @pytest.mark.parametrize("text", ["0", "-1", "two", "1.5", "²"])
-def test_a_number_of_threads_that_is_none_is_named(monkeypatch, text) -> None:
+def test_a_number_of_threads_that_is_none_is_named(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
     monkeypatch.setenv("PANCAM_GRAPH_THREADS", text)
     with pytest.raises(InputError, match=r"PANCAM_GRAPH_THREADS: expected .* found"):
         n_workers()
@@ -64,7 +71,7 @@ def test_a_number_of_threads_that_is_none_is_named(monkeypatch, text) -> None:
 
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork on this system")
 @pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
-def test_a_forked_process_starts_threads_of_its_own(monkeypatch) -> None:
+def test_a_forked_process_starts_threads_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PANCAM_GRAPH_THREADS", "2")
     assert len(ranges_of(10, 1)) == 10
     child = multiprocessing.get_context("fork").Process(target=ranges_of, args=(10, 1))
@@ -77,7 +84,9 @@ def test_a_forked_process_starts_threads_of_its_own(monkeypatch) -> None:
 
 
 @pytest.mark.parametrize("threads", ["1", "2"])
-def test_ranges_within_ranges_run_in_the_thread_of_the_outer_one(monkeypatch, threads) -> None:
+def test_ranges_within_ranges_run_in_the_thread_of_the_outer_one(
+    monkeypatch: pytest.MonkeyPatch, threads: str
+) -> None:
     monkeypatch.setenv("PANCAM_GRAPH_THREADS", threads)
     ran = []
 
@@ -90,17 +99,17 @@ def test_ranges_within_ranges_run_in_the_thread_of_the_outer_one(monkeypatch, th
     # And when all is done, ranges are for all threads again.
     if threads == "2":
         both = threading.Barrier(2, timeout=10)
-        in_parallel(lambda begin, end: both.wait() and None, 2, grain=1)
+        in_parallel(lambda begin, end: wait_at(both), 2, grain=1)
 
 
-def test_each_keeps_the_order(monkeypatch) -> None:
+def test_each_keeps_the_order(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PANCAM_GRAPH_THREADS", "2")
     assert each(lambda x: 10 * x, [3, 1, 2]) == [30, 10, 20]
     assert each(lambda x: x, []) == []
 
 
 @pytest.mark.parametrize("threads", ["1", "2", "3"])
-def test_results_are_in_the_order_of_the_items(monkeypatch, threads) -> None:
+def test_results_are_in_the_order_of_the_items(monkeypatch: pytest.MonkeyPatch, threads: str) -> None:
     monkeypatch.setenv("PANCAM_GRAPH_THREADS", threads)
     told = []
 
@@ -114,7 +123,9 @@ def test_results_are_in_the_order_of_the_items(monkeypatch, threads) -> None:
 
 
 @pytest.mark.parametrize("threads", ["1", "2"])
-def test_a_task_may_share_its_ranges_out_and_an_error_ends_the_rest(monkeypatch, threads) -> None:
+def test_a_task_may_share_its_ranges_out_and_an_error_ends_the_rest(
+    monkeypatch: pytest.MonkeyPatch, threads: str
+) -> None:
     monkeypatch.setenv("PANCAM_GRAPH_THREADS", threads)
     begun = []
 
@@ -130,13 +141,13 @@ def test_a_task_may_share_its_ranges_out_and_an_error_ends_the_rest(monkeypatch,
     assert in_order(task, range(3)) == [10, 10, 10]
 
 
-def test_two_tasks_run_at_once(monkeypatch) -> None:
+def test_two_tasks_run_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PANCAM_GRAPH_THREADS", "2")
     both = threading.Barrier(2, timeout=10)
     assert in_order(lambda _: both.wait() >= 0, range(2)) == [True, True]
 
 
-def test_after_an_interrupt_ranges_are_for_all_threads_again(monkeypatch) -> None:
+def test_after_an_interrupt_ranges_are_for_all_threads_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PANCAM_GRAPH_THREADS", "2")
     caller, began = threading.current_thread(), threading.Event()
 
@@ -149,4 +160,4 @@ def test_after_an_interrupt_ranges_are_for_all_threads_again(monkeypatch) -> Non
     with pytest.raises(KeyboardInterrupt):
         in_parallel(interrupted, 1000, grain=1)
     both = threading.Barrier(2, timeout=10)
-    in_parallel(lambda begin, end: both.wait() and None, 2, grain=1)
+    in_parallel(lambda begin, end: wait_at(both), 2, grain=1)

@@ -60,7 +60,7 @@ IDS = [
 def pixel(camera: Camera, point: tuple[float, float, float]) -> FloatArray:
     uv, valid = camera.project(np.array([point]))
     assert valid.all()
-    return uv[0]
+    return np.asarray(uv[0])
 
 
 def test_published_pixels() -> None:

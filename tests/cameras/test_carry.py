@@ -12,7 +12,7 @@ from support.lenses import ALL, BROWN, CAHVORE_CAMERA, CENTRAL, FAR, PINHOLE, pi
 
 @pytest.mark.parametrize("camera", ALL.values(), ids=ALL)
 @pytest.mark.parametrize("range_m", [2.0, 30.0, FAR])
-def test_a_carried_pixel_is_where_the_pinhole_sees_the_same_point(camera, range_m) -> None:
+def test_a_carried_pixel_is_where_the_pinhole_sees_the_same_point(camera: Camera, range_m: float) -> None:
     """The range counts from the camera's centre, also where the ray starts at a pupil beside it."""
     uv = pixels()
     rays = camera.unproject(uv)
@@ -25,7 +25,7 @@ def test_a_carried_pixel_is_where_the_pinhole_sees_the_same_point(camera, range_
 
 
 @pytest.mark.parametrize("camera", CENTRAL.values(), ids=CENTRAL)
-def test_a_carried_pixel_lies_on_the_same_line_of_sight(camera) -> None:
+def test_a_carried_pixel_lies_on_the_same_line_of_sight(camera: Camera) -> None:
     """At any range: a central camera's carried pixels do not depend on it."""
     uv = pixels()
     near, _, _ = carry_to_pinhole(camera, uv, np.full(len(uv), 1.0))
@@ -49,7 +49,7 @@ def displaced(camera: Camera, range_m: float, step_m: float) -> tuple[FloatArray
 
 
 @pytest.mark.parametrize("camera", CENTRAL.values(), ids=CENTRAL)
-def test_residuals_turn_back_to_raw_pixels_to_first_order(camera) -> None:
+def test_residuals_turn_back_to_raw_pixels_to_first_order(camera: Camera) -> None:
     """Halving the displacement quarters what is left, which is small against the residual."""
     left = []
     for step_m in (0.02, 0.01):
@@ -67,7 +67,9 @@ def test_distortion_makes_turning_back_matter() -> None:
 
 
 @pytest.mark.parametrize(("range_m", "share"), [(2.0, 1e-2), (10.0, 2e-3), (100.0, 2e-4)])
-def test_residuals_of_a_moving_pupil_turn_back_but_for_its_shift_by_the_range(range_m, share) -> None:
+def test_residuals_of_a_moving_pupil_turn_back_but_for_its_shift_by_the_range(
+    range_m: float, share: float
+) -> None:
     """The lines of sight of CAHVORE and its pinhole differ by the pupil's shift over the range."""
     turned, raw = displaced(CAHVORE_CAMERA, range_m, 1e-6 * range_m)
     assert np.linalg.norm(turned - raw) < share * np.linalg.norm(raw)

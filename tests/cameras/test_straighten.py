@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from pancam_graph.base.errors import CameraError
-from pancam_graph.cameras import CAHVOR, Brown, straight_pixels, straightened, straightening_map
+from pancam_graph.cameras import (
+    CAHVOR,
+    CAHVORE,
+    Brown,
+    Camera,
+    straight_pixels,
+    straightened,
+    straightening_map,
+)
 from support.lenses import ALL, BROWN, CAHVORE_CAMERA, PINHOLE, pixels
 
 RANGE_M = 6.0
@@ -14,7 +22,7 @@ DISTORTED = {name: camera for name, camera in ALL.items() if name != "pinhole"}
 
 
 @pytest.mark.parametrize("camera", DISTORTED.values(), ids=DISTORTED)
-def test_all_pixels_of_the_image_are_within_and_the_frame_is_tight(camera) -> None:
+def test_all_pixels_of_the_image_are_within_and_the_frame_is_tight(camera: Camera) -> None:
     straight = straightened(camera, RANGE_M)
     assert straight.skew_px == 0
     assert (straight.fx_px, straight.fy_px) == (camera.pinhole.fx_px, camera.pinhole.fy_px)
@@ -30,7 +38,7 @@ def test_all_pixels_of_the_image_are_within_and_the_frame_is_tight(camera) -> No
 
 
 @pytest.mark.parametrize("camera", DISTORTED.values(), ids=DISTORTED)
-def test_the_map_leads_back_to_the_pixel(camera) -> None:
+def test_the_map_leads_back_to_the_pixel(camera: Camera) -> None:
     """Cubic between every eighth pixel; the way forth is the carry, the way back the projection."""
     straight = straightened(camera, RANGE_M)
     lookup = straightening_map(camera, straight, RANGE_M)
@@ -46,7 +54,7 @@ def test_the_map_leads_back_to_the_pixel(camera) -> None:
 
 
 @pytest.mark.parametrize("camera", ALL.values(), ids=ALL)
-def test_small_residuals_are_enlarged_as_the_image_is(camera) -> None:
+def test_small_residuals_are_enlarged_as_the_image_is(camera: Camera) -> None:
     straight, uv, step = straightened(camera, RANGE_M), pixels(), 1e-4
     far = np.full(len(uv), 1e5)
     at, enlargement, _ = straight_pixels(camera, straight, uv, far)
@@ -79,7 +87,8 @@ def test_a_linear_camera_of_the_family_is_not_resampled_for_rounding() -> None:
 
 def test_a_very_wide_lens_is_cropped_and_has_no_pixel_beyond_its_domain() -> None:
     """Pincushion of a fish-eye: the pinhole would have to be many times as large."""
-    wide = replace(CAHVORE_CAMERA, linearity=0.0, H=CAHVORE_CAMERA.H / 2.2, V=CAHVORE_CAMERA.V / 2.2)
+    assert isinstance(CAHVORE_CAMERA, CAHVORE)
+    wide: Camera = replace(CAHVORE_CAMERA, linearity=0.0, H=CAHVORE_CAMERA.H / 2.2, V=CAHVORE_CAMERA.V / 2.2)
     wide = wide.with_calibration(np.array([[200.0, 0, 320], [0, 200.0, 240], [0, 0, 1]]))
     straight = straightened(wide, RANGE_M)
     assert straight.width_px <= 2 * 640

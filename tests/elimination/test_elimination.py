@@ -1,6 +1,7 @@
 """Elimination against dense linear algebra: order, square root, covariances; chains with calibrations."""
 
 from itertools import combinations, combinations_with_replacement, pairwise
+from typing import Any
 
 import gtsam
 import numba
@@ -298,7 +299,10 @@ class Rigged:
         self.landmarks = unit(points, rng.normal(0, 1, (len(points), 3)))
         # Three images in one group, two in another; what all share in a last one.
         groups = [0, 0, 0, 1, 1]
-        keys, dim, group, variable = [], [], [], []
+        keys: list[int] = []
+        dim: list[int] = []
+        group: list[int] = []
+        variable: list[list[int]] = []
         for g in (0, 1):
             for i in np.flatnonzero(np.array(groups) == g):
                 variable.append([len(keys)])
@@ -431,11 +435,11 @@ def test_the_innermost_loop_in_vectors_is_the_plain_one(pairs: tuple[int, ...]) 
     plain, arms_of = tiles.copy(), arms.reshape(-1, 3, 2)
     S = tiles.reshape(n_pairs, n_pairs, 2, 2).copy()
 
-    @numba.njit
-    def in_vectors(tiles: FloatArray, arms: FloatArray, pair: IntArray, n_pairs: int) -> None:
+    def loop(tiles: FloatArray, arms: FloatArray, pair: IntArray, n_pairs: int) -> None:
         for p in range(len(pair)):
             kernel.subtract_row(tiles, pair[p] * n_pairs, arms, p, len(pair), pair)
 
+    in_vectors: Any = numba.njit(loop)  # the decorator's types know only functions of nothing
     in_vectors(tiles, arms, pair, n_pairs)
     for p in range(len(pair)):
         kernel.subtract_row_plainly(plain, pair[p] * n_pairs, arms, p, len(pair), pair)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from pancam_graph.base.errors import ImageError, InputError
+from pancam_graph.base.geometry import FloatArray
 from pancam_graph.io import read_input, read_traverse, write_traverse
 from pancam_graph.results import read_solution_json
 from support import io_samples
@@ -263,14 +264,19 @@ N = 60
 
 
 def covariance(
-    arrays: Arrays, change: Callable[[Any], Any] = lambda c: c, at: list[list[float]] | None = None
+    arrays: Arrays,
+    change: Callable[[Any], Any] = lambda c: c,
+    at: list[list[float]] | None = None,
+    sigma_px: FloatArray | None = None,
 ) -> None:
-    """Put covariances in place of sigmas; changed, or with another at row 5."""
+    """Put covariances in place of sigmas; changed, with another at row 5, or beside sigmas."""
     good = np.tile([[0.1, 0.05], [0.05, 0.7 / 3]], (N, 1, 1))
     if at is not None:
         good[5] = at
     del arrays["sigma_px"]
     arrays["covariance_px2"] = change(good)
+    if sigma_px is not None:
+        arrays["sigma_px"] = sigma_px
 
 
 COLUMNS: dict[str, tuple[Callable[[Arrays], object], str, str]] = {
@@ -361,7 +367,7 @@ COLUMNS: dict[str, tuple[Callable[[Arrays], object], str, str]] = {
         "[[-0.1, 0.0], [0.0, -0.1]]",
     ),
     "sigma against covariance": (
-        lambda a: covariance(a) or a.update(sigma_px=np.full(N, 0.3)),
+        lambda a: covariance(a, sigma_px=np.full(N, 0.3)),
         "sigma_px, row 0: expected 0.408248, the root of the mean variance in covariance_px2",
         "found 0.3",
     ),

@@ -148,9 +148,9 @@ def test_too_few_tracks_to_cross_validate_are_bad_input(run: Run, tmp_path: Path
     assert not (tmp_path / "out").exists()
 
 
-BAD: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
+BAD: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
     "truncated json": (
-        lambda t: (t / "traverse.json").write_text((t / "traverse.json").read_text()[:200]) and None,
+        lambda t: shorten(t / "traverse.json"),
         ("traverse.json", "expected JSON"),
     ),
     "unknown template": (
@@ -162,8 +162,12 @@ BAD: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
         ("observations.npz", "expected a file"),
     ),
     "path that leaves": (lambda t: edit(t, observations="../x.npz"), ("observations", "inside", "../x.npz")),
-    "no such folder": (lambda t: t.rename(t.with_name("elsewhere")) and None, ("traverse", "expected")),
+    "no such folder": (lambda t: t.rename(t.with_name("elsewhere")), ("traverse", "expected")),
 }
+
+
+def shorten(file: Path) -> None:
+    file.write_text(file.read_text()[:200])
 
 
 def edit(folder: Path, **entries: object) -> None:

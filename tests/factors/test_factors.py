@@ -1,6 +1,7 @@
 """Custom factors: values against independent formulas, Jacobians against differences."""
 
 from collections.abc import Callable
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -219,7 +220,8 @@ def test_one_factor_of_several_images_is_the_factors_of_each(free: tuple[int, ..
     unit = gtsam.noiseModel.Unit.Create
     mast = mast_factor(unit(24), *map(list, zip(*slots, strict=True)))
     circle_slots = [(*s[:2], Fixed(0.15), s[2]) for s in slots]
-    circle = circle_factor(unit(12), *map(list, zip(*circle_slots, strict=True)), offset)
+    circle_arguments: list[Any] = [*map(list, zip(*circle_slots, strict=True)), offset]
+    circle = circle_factor(unit(12), *circle_arguments)
     for together, apart in (
         (mast, [mast_factor(UNIT6, *s) for s in slots]),
         (

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -87,7 +88,8 @@ def simulated() -> tuple[Terrain, tuple[gtsam.Pose3, ...]]:
     assert traverse.observations is not None
     order = np.lexsort((traverse.observations.image, traverse.observations.track))
     ordered = traverse.with_observations(traverse.observations.select(order))
-    return terrain_from(ordered, **terrain_arrays(solve(ordered))), simulation.truth.world_T_mast
+    arrays: dict[str, Any] = terrain_arrays(solve(ordered))
+    return terrain_from(ordered, **arrays), simulation.truth.world_T_mast
 
 
 def seen_rows(terrain: Terrain, mast: gtsam.Pose3) -> Ties:

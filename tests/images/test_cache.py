@@ -19,6 +19,7 @@ from pancam_graph.images._cache_folder import begin_cache
 from pancam_graph.images._steps import Steps
 from pancam_graph.results import check_out
 from support.image_scenes import QUICK, SIZE_PX, as_bytes, found_in, make_traverse
+from support.pictures import read_picture
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +72,7 @@ def test_only_what_an_image_touches_is_made_anew(
     path = scene.folder / str(scene.images[0].file)
     before = path.read_bytes()
     try:
-        grey = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        grey = read_picture(path)
         grey[100, 100] ^= 1
         cv2.imwrite(str(path), grey)
         changed = run(scene, tmp_path)

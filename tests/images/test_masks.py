@@ -13,12 +13,14 @@ from scipy import ndimage
 from pancam_graph import RenderOptions, Traverse, read_traverse, render, write_traverse
 from pancam_graph.base.errors import ImageError, InputError
 from pancam_graph.base.geometry import rz
+from pancam_graph.cameras import Pinhole
 from pancam_graph.images import FrontEndOptions, ImageMask, Reason, find_masks, find_observations
 from pancam_graph.images._masks import elevation_rad, saturated
 from pancam_graph.images._sky import find_sky
 from pancam_graph.io import mask_file, read_image, read_pds
 from pancam_graph.rigs import mer_navcam
 from support.image_scenes import QUICK, SIZE_PX, Scene, as_bytes, found_in, make_traverse
+from support.pictures import read_picture
 
 ROWS = np.arange(SIZE_PX)[:, None]
 SECOND = gtsam.Pose3(gtsam.Rot3(rz(0.15)), np.array([0.3, 0.5, 0.0]))
@@ -53,7 +55,7 @@ def test_nothing_is_observed_where_a_mask_is_black_nor_moved_by_what_it_covers(t
     assert lowest_u_px(found)["s0-f0-left"] > SIZE_PX // 2 + 3
     # Whatever is behind the mask: the same pixels, refined ones too.
     file = tmp_path / str(truth.images[0].file)
-    grey = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    grey = read_picture(file)
     obs = found_in(found)
     near = obs.uv_px[obs.image == 0, 0] < SIZE_PX // 2 + 8
     refined = obs.sigma_px[obs.image == 0] == QUICK.refined_sigma_px
@@ -267,8 +269,7 @@ def test_rendered_deck_is_masked(tmp_path: Path) -> None:
     eyes = tuple(
         replace(
             e,
-            camera=replace(
-                e.camera,
+            camera=Pinhole(
                 width_px=size,
                 height_px=size,
                 fx_px=e.camera.pinhole.fx_px * size / 1024,

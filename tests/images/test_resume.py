@@ -11,12 +11,14 @@ import time
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from pancam_graph import write_traverse
 from pancam_graph.images import _steps
+from pancam_graph.images._match_pair import PairMatches, match_pair
 from support.image_scenes import make_traverse
 
 Run = Callable[..., tuple[int, str, str]]
@@ -53,13 +55,12 @@ def test_an_interrupt_is_one_line_and_the_same_command_goes_on(
 ) -> None:
     calls: list[int] = []
     monkeypatch.setenv("PANCAM_GRAPH_THREADS", "1")  # which pairs are done by then is counted
-    match_pair = _steps.match_pair
 
-    def interrupted(*arguments: object) -> object:
+    def interrupted(*arguments: Any) -> PairMatches:
         calls.append(1)
         if len(calls) == 3:
             raise KeyboardInterrupt
-        return match_pair(*arguments)  # type: ignore[arg-type]  # handed on
+        return match_pair(*arguments)
 
     monkeypatch.setattr(_steps, "match_pair", interrupted)
     status, out, err = run(*ARGUMENTS)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import lru_cache
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -25,7 +26,7 @@ def bent(rig: Rig) -> Rig:
 
 
 @lru_cache
-def cluster(rig: Rig, seed: int = 0, *, tilts: bool = True) -> tuple[FloatArray, ...]:
+def cluster(rig: Rig, seed: int = 0, *, tilts: bool = True) -> tuple[Any, ...]:
     """Matrices of all eyes at nine pans, each times a factor; mast, angles, eyes, K."""
     rng = np.random.default_rng(seed)
     mast = gtsam.Pose3(gtsam.Rot3.Expmap(rng.normal(0, 0.3, 3)), rng.normal(0, 20, 3))
@@ -173,7 +174,7 @@ def spoilt(**entries: object) -> FloatArray:
             given[2, 1] = given[2, 0]
         else:
             given[2, 0, 1] = what
-    return given
+    return np.asarray(given)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import lru_cache
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -28,13 +29,13 @@ TILTED = Rotation.from_rotvec([0.3, -0.4, 0.2]).as_matrix()
 def circle(phi: FloatArray, radius_m: float = 0.15) -> FloatArray:
     """Points of a circle in general position, anticlockwise about TILTED's z."""
     flat = radius_m * np.column_stack([np.cos(phi), np.sin(phi), np.zeros_like(phi)])
-    return flat @ TILTED.T + CENTRE
+    return np.asarray(flat @ TILTED.T + CENTRE)
 
 
 def rebuilt(fit: CircleFit) -> FloatArray:
     """Thesis eq. 4.8 with what the fit found."""
     outward = np.column_stack([np.cos(fit.angle_rad), np.sin(fit.angle_rad), np.zeros_like(fit.angle_rad)])
-    return fit.radius_m * outward @ fit.rotation.T + fit.centre_m
+    return np.asarray(fit.radius_m * outward @ fit.rotation.T + fit.centre_m)
 
 
 # --- circle ---
@@ -51,7 +52,7 @@ def rebuilt(fit: CircleFit) -> FloatArray:
     ],
     ids=["three", "ring", "short", "one twice", "closed"],
 )
-def test_an_exact_circle_is_found(phi) -> None:
+def test_an_exact_circle_is_found(phi: FloatArray) -> None:
     points = circle(phi)
     fit = fit_circle(points)
     assert fit.centre_m == pytest.approx(CENTRE, abs=1e-10)
@@ -90,7 +91,7 @@ def test_residuals_are_radial_and_along_the_normal() -> None:
 
 
 @pytest.mark.parametrize("arc_rad", [2 * np.pi * 11 / 12, 1.2])
-def test_sigma_of_the_centre_against_monte_carlo(arc_rad) -> None:
+def test_sigma_of_the_centre_against_monte_carlo(arc_rad: float) -> None:
     """The spread of the centre in the plane, in its worst direction, over 400 fits."""
     rng = np.random.default_rng(0)
     clean = circle(np.linspace(0, arc_rad, 12))
@@ -117,7 +118,7 @@ def test_three_centres_leave_nothing_to_judge_by() -> None:
         ([170, 180, 190, 200], 30, True),
     ],
 )
-def test_a_short_arc_is_flagged_wherever_it_lies(phi, arc_deg, short) -> None:
+def test_a_short_arc_is_flagged_wherever_it_lies(phi: list[float], arc_deg: float, short: bool) -> None:
     fit = fit_circle(circle(np.deg2rad(np.array(phi, dtype=float))))
     assert np.rad2deg(fit.arc_rad) == pytest.approx(arc_deg)
     assert fit.short_arc is short
@@ -135,7 +136,7 @@ def test_a_short_arc_is_flagged_wherever_it_lies(phi, arc_deg, short) -> None:
     ],
     ids=["none", "two", "coincident", "collinear", "two places", "nan"],
 )
-def test_what_determines_no_circle_is_refused(points, message) -> None:
+def test_what_determines_no_circle_is_refused(points: FloatArray, message: str) -> None:
     with pytest.raises(GeometryError, match=message):
         fit_circle(points)
 
@@ -187,7 +188,7 @@ RIGS = [("mer-navcam", False), ("mer-pancam", False), ("exomars-pancam", False),
 
 
 @pytest.mark.parametrize(("name", "askew"), RIGS, ids=["navcam", "pancam", "exomars", "askew"])
-def test_masts_and_angles_are_recovered_from_true_cameras(name, askew) -> None:
+def test_masts_and_angles_are_recovered_from_true_cameras(name: str, askew: bool) -> None:
     sim = simulation(name, askew=askew, prior="truth")
     start = start_from_cameras(sim.traverse, true_cameras(sim)[0])
     assert start.warnings == ()
@@ -197,7 +198,7 @@ def test_masts_and_angles_are_recovered_from_true_cameras(name, askew) -> None:
 
 
 @pytest.mark.parametrize(("name", "askew"), RIGS, ids=["navcam", "pancam", "exomars", "askew"])
-def test_errors_of_telemetry_do_not_reach_the_cameras(name, askew) -> None:
+def test_errors_of_telemetry_do_not_reach_the_cameras(name: str, askew: bool) -> None:
     """Only the zero of the pan is telemetry's: mast and angles turn against each other, cameras stay true."""
     sim = simulation(name, askew=askew, sigma_stop_m=2.0, sigma_stop_rad=0.05)
     projections, rotation, centre = true_cameras(sim)
@@ -233,7 +234,9 @@ def test_a_lone_frame_of_another_tilt_first_hides_no_circle() -> None:
     ],
     ids=["short arc", "two frames"],
 )
-def test_a_stop_without_a_circle_is_placed_by_its_rotations_with_a_warning(options, reason) -> None:
+def test_a_stop_without_a_circle_is_placed_by_its_rotations_with_a_warning(
+    options: dict[str, Any], reason: str
+) -> None:
     sim = simulation("mer-navcam", prior="truth", **options)
     projections, rotation, centre = true_cameras(sim)
     start = start_from_cameras(sim.traverse, projections)

@@ -26,6 +26,7 @@ def solution_without(*cameras: str) -> Solution:
     eyes = tuple(e for e in t.rig.eyes if e.name not in cameras)
     images = tuple(i for i in t.images if i.camera not in cameras)
     kept = np.array([i.camera not in cameras for i in t.images])
+    assert t.observations is not None
     observations = t.observations.select(kept[t.observations.image])
     observations = replace(observations, image=(np.cumsum(kept) - 1)[observations.image])
     rows = kept[t.observations.image]
@@ -61,7 +62,7 @@ def test_a_model_reads_back_bit_for_bit(tmp_path: Path, name: str, linearity: fl
     assert (again.width_px, again.height_px) == (model.width_px, model.height_px)
     for letter in type(model).__name__:
         assert getattr(again, letter).tolist() == getattr(model, letter).tolist()
-    if isinstance(model, CAHVORE):
+    if isinstance(again, CAHVORE):
         assert again.linearity == linearity
 
 

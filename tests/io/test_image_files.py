@@ -93,7 +93,8 @@ def test_a_detached_label_may_not_point_out_of_its_folder(tmp_path: Path) -> Non
 def test_opportunity_image(opportunity_folder: Path) -> None:
     # The label states minimum, maximum and mean of its pixels.
     image = read_image(opportunity_folder / "1N491020376ILFCNY9P0706L0M1.IMG")
-    assert (image.shape, image.dtype) == ((1024, 1024), np.uint16)
+    assert image.shape == (1024, 1024)
+    assert image.dtype == np.uint16
     assert (image.min(), image.max()) == (517, 4029)
     assert image.mean() == pytest.approx(1421.71, abs=5e-3)
 

@@ -11,6 +11,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -91,11 +92,12 @@ MARS2020_NAVCAM = replace(MODEL_C, width_px=8, height_px=6)
 
 def turned(model: CAHV, rotation: FloatArray, shift: FloatArray) -> CAHV:
     """The model with its vectors turned and its centre moved."""
-    names = {"A": model.A, "H": model.H, "V": model.V}
+    moved = {"C": rotation @ model.C + shift}
+    moved |= {name: rotation @ getattr(model, name) for name in "AHV"}
     if isinstance(model, CAHVOR):
-        names["O"] = model.O
-    moved: CAHV = replace(model, C=rotation @ model.C + shift, **{k: rotation @ v for k, v in names.items()})
-    return moved
+        moved["O"] = rotation @ model.O
+    vectors: dict[str, Any] = moved
+    return replace(model, **vectors)
 
 
 def navcam_b_head() -> CAHV:

@@ -3,6 +3,7 @@
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import gtsam
@@ -72,7 +73,7 @@ def test_a_camera_that_is_not_registered_is_not_written(tmp_path: Path) -> None:
         pass
 
     sample = io_samples.traverse()
-    numbers = {"fx_px": 70.0, "fy_px": 71.5, "cx_px": 31.5, "cy_px": 23.25}
+    numbers: dict[str, Any] = {"fx_px": 70.0, "fy_px": 71.5, "cx_px": 31.5, "cy_px": 23.25}
     eye = replace(sample.rig.eyes[0], camera=OwnLens(**io_samples.SIZE, **numbers))
     made = replace(sample, rig=replace(sample.rig, eyes=(eye, *sample.rig.eyes[1:])))
     with pytest.raises(InputError) as caught:
@@ -229,6 +230,7 @@ def test_covariances_return(tmp_path: Path) -> None:
     expected, obs = with_covariances()
     write_traverse(expected, tmp_path)
     assert_same(read_traverse(tmp_path), expected)
+    assert obs.covariance_px2 is not None
     np.savez(  # without sigma_px, which follows from them
         tmp_path / "observations.npz",
         image=obs.image,
@@ -279,8 +281,8 @@ def test_other_integers_and_floats_are_taken(tmp_path: Path) -> None:
     )
     found = read_traverse(tmp_path).observations
     assert found is not None
-    assert (found.image.dtype, found.track.dtype) == (np.int64, np.int64)
-    assert (found.uv_px.dtype, found.sigma_px.dtype) == (np.float64, np.float64)
+    assert {found.image.dtype, found.track.dtype} == {np.dtype(np.int64)}
+    assert {found.uv_px.dtype, found.sigma_px.dtype} == {np.dtype(np.float64)}
     np.testing.assert_array_equal(found.uv_px, np.round(obs.uv_px))
 
 

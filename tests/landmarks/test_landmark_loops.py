@@ -2,12 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pancam_graph.base.geometry import FloatArray
+from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.landmarks import (
     CameraViews,
     Landmarks,
@@ -41,7 +42,7 @@ def eigen(a: FloatArray) -> tuple[FloatArray, FloatArray]:
 def with_values(rng: np.random.Generator, values: list[float]) -> FloatArray:
     turn, _ = np.linalg.qr(rng.normal(size=(len(values), len(values))))
     a = turn * values @ turn.T
-    return (a + a.T) / 2
+    return np.asarray((a + a.T) / 2)
 
 
 @pytest.mark.parametrize(
@@ -63,7 +64,7 @@ def with_values(rng: np.random.Generator, values: list[float]) -> FloatArray:
     ],
     ids=str,
 )
-def test_eigenvalues_are_lapacks_and_vectors_orthonormal(values) -> None:
+def test_eigenvalues_are_lapacks_and_vectors_orthonormal(values: list[float]) -> None:
     rng = np.random.default_rng(0)
     for _ in range(50):
         a = with_values(rng, values)
@@ -75,7 +76,7 @@ def test_eigenvalues_are_lapacks_and_vectors_orthonormal(values) -> None:
 
 
 @pytest.mark.parametrize("m", [2, 3, 4])
-def test_small_eigenvalues_of_graded_matrices_keep_their_digits(m) -> None:
+def test_small_eigenvalues_of_graded_matrices_keep_their_digits(m: int) -> None:
     """D A D, D over ten decades: the least is one over the largest of the inverse, where LAPACK is exact."""
     rng = np.random.default_rng(1)
     for _ in range(50):
@@ -86,7 +87,7 @@ def test_small_eigenvalues_of_graded_matrices_keep_their_digits(m) -> None:
 
 
 @pytest.mark.parametrize("m", [2, 3, 4])
-def test_eigenvalues_of_nothing_and_of_what_is_no_number(m) -> None:
+def test_eigenvalues_of_nothing_and_of_what_is_no_number(m: int) -> None:
     assert eigen(np.zeros((m, m)))[0].tolist() == [0.0] * m
     assert eigen(np.zeros((m, m)))[1] == pytest.approx(np.eye(m))
     eigen(np.full((m, m), np.nan))
@@ -113,7 +114,9 @@ def near_the_first_axis(rng: np.random.Generator) -> FloatArray:
     return points
 
 
-STATES: dict[str, Callable[[np.random.Generator], FloatArray]] = {
+PointsOf = Callable[[np.random.Generator], FloatArray]
+
+STATES: dict[str, PointsOf] = {
     "random": lambda rng: random_points(rng, 40),
     "near identity": near_the_first_axis,
     "far": lambda rng: random_points(rng, 40, 1e4, 1e7),
@@ -123,12 +126,12 @@ STATES: dict[str, Callable[[np.random.Generator], FloatArray]] = {
 states = pytest.mark.parametrize("points_of", STATES.values(), ids=STATES)
 
 
-def each(m: Measurements, views: CameraViews) -> list[tuple[FloatArray, reference.Track]]:
+def each(m: Measurements, views: CameraViews) -> list[tuple[IntArray, reference.Track]]:
     return [(np.flatnonzero(m.landmark == k), t) for k, t in enumerate(reference.tracks(m, views))]
 
 
 @states
-def test_triangulation_is_the_references(points_of) -> None:
+def test_triangulation_is_the_references(points_of: PointsOf) -> None:
     rng = np.random.default_rng(2)
     views, m = scene(rng, points_of(rng), sigma_px=0.03)
     weight = rng.uniform(0.1, 2, len(m.row)) * (rng.random(len(m.row)) < 0.8)
@@ -144,7 +147,7 @@ def test_triangulation_is_the_references(points_of) -> None:
 
 
 @states
-def test_values_derivatives_and_cofactors_are_the_references(points_of) -> None:
+def test_values_derivatives_and_cofactors_are_the_references(points_of: PointsOf) -> None:
     rng = np.random.default_rng(3)
     points = points_of(rng)
     views, m = scene(rng, points)
@@ -171,7 +174,7 @@ def test_values_derivatives_and_cofactors_are_the_references(points_of) -> None:
 
 @pytest.mark.parametrize("name", ["none", "huber", "cauchy"])
 @states
-def test_refinement_is_the_references(points_of, name: LossName) -> None:
+def test_refinement_is_the_references(points_of: PointsOf, name: LossName) -> None:
     """The same steps to the same end, from triangulation and from far off it."""
     rng = np.random.default_rng(4)
     views, m = scene(rng, points_of(rng))
@@ -217,7 +220,7 @@ def test_point_sigmas_are_those_of_the_normal_matrix() -> None:
 
 
 @pytest.mark.parametrize("seed", [6, 7, 8])
-def test_screening_is_the_references_that_does_all_anew_in_every_sweep(seed) -> None:
+def test_screening_is_the_references_that_does_all_anew_in_every_sweep(seed: int) -> None:
     rng = np.random.default_rng(seed)
     points = np.concatenate([random_points(rng, 60), random_points(rng, 20, 1e3, 1e6)])
     views, m = scene(rng, points, n_views=6)
@@ -271,7 +274,7 @@ def everything(views: CameraViews, m: Measurements, loss: Loss) -> list[FloatArr
     ]
 
 
-def test_results_do_not_depend_on_the_number_of_threads(monkeypatch) -> None:
+def test_results_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     """To the last bit, for as many landmarks as make several ranges."""
     rng = np.random.default_rng(10)
     points = random_points(rng, 5000, 4, 1e5)
@@ -298,7 +301,7 @@ def at_parallax(parallax_rad: float, range_m: float = 30.0) -> CameraViews:
 
 
 @pytest.mark.parametrize("noise_px", [0.0, 0.3])
-def test_two_rays_a_tenth_of_a_milliradian_apart(noise_px) -> None:
+def test_two_rays_a_tenth_of_a_milliradian_apart(noise_px: float) -> None:
     """A parallax of a tenth of a pixel: exact without noise; with it in front, within the noise."""
     rng = np.random.default_rng(11)
     views = at_parallax(1e-4)
@@ -318,7 +321,7 @@ def test_two_rays_a_tenth_of_a_milliradian_apart(noise_px) -> None:
 
 
 @pytest.mark.parametrize("parallax_rad", [1e-2, 1e-4, 1e-6])
-def test_refinement_finds_the_range_at_any_parallax_that_pixels_hold(parallax_rad) -> None:
+def test_refinement_finds_the_range_at_any_parallax_that_pixels_hold(parallax_rad: float) -> None:
     """From a fifth too near: at a microradian one part in 1e10 of the normal matrix tells the range."""
     rng = np.random.default_rng(17)
     views = at_parallax(parallax_rad)
@@ -331,7 +334,7 @@ def test_refinement_finds_the_range_at_any_parallax_that_pixels_hold(parallax_ra
 
 
 @pytest.mark.parametrize("w", [0.0, -1e-6, -0.01, -1.0])
-def test_at_and_beyond_infinity_nothing_leaves_the_front(w) -> None:
+def test_at_and_beyond_infinity_nothing_leaves_the_front(w: float) -> None:
     rng = np.random.default_rng(12)
     views = views_at([[0, -1, 0], [0, 1, 0], [0, 0, 0.7]])
     points = random_points(rng, 100, 20, 200) * [1, 1, 1, w]
@@ -409,7 +412,7 @@ def test_loops_are_compiled_once_whatever_arrays_come() -> None:
     second = everything(read_only, strange, loss_of("huber", 1e9))
     for one, two in zip(first, second, strict=True):
         assert np.array_equal(one, two)
-    compiled = [
+    compiled: list[Any] = [  # Numba's functions are typed as what they were made from
         kernel.triangulate,
         kernel.evaluate,
         kernel.refine,
@@ -437,7 +440,7 @@ def test_arguments_are_not_written_to() -> None:
 
 
 @pytest.mark.parametrize("wrong", ["weight", "vector", "image"])
-def test_what_would_be_read_out_of_bounds_is_refused(wrong) -> None:
+def test_what_would_be_read_out_of_bounds_is_refused(wrong: str) -> None:
     rng = np.random.default_rng(16)
     points = random_points(rng, 5)
     views, m = scene(rng, points)

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from pancam_graph.base.geometry import FloatArray
+from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.landmarks import (
     SQUARED,
     CameraViews,
     Landmarks,
     Loss,
+    LossName,
     Measurements,
     loss_of,
     point_sigma_m,
@@ -44,7 +45,7 @@ def ones(m: Measurements) -> FloatArray:
 
 
 @pytest.mark.parametrize("n_views", [2, 3, 6])
-def test_triangulation_is_exact_without_noise(n_views) -> None:
+def test_triangulation_is_exact_without_noise(n_views: int) -> None:
     rng = np.random.default_rng(n_views)
     views, points = random_views(rng, n_views), random_points(rng, 50, 5, 1e4)
     found = triangulated(views, measure(views, points))
@@ -87,7 +88,7 @@ def test_a_point_behind_is_not_in_front() -> None:
 
 
 @pytest.mark.parametrize("baseline_m", [1.0, 1e-2, 1e-4, 1e-6])
-def test_nearly_parallel_rays_triangulate_in_front_whatever_the_baseline(baseline_m) -> None:
+def test_nearly_parallel_rays_triangulate_in_front_whatever_the_baseline(baseline_m: float) -> None:
     """At a parallax far below the noise the nearest point to all lines is between the cameras: not there."""
     rng = np.random.default_rng(2)
     views = views_at([[0, 0, 0], [0, baseline_m, 0]])
@@ -161,7 +162,7 @@ STATES = {
 
 
 @pytest.mark.parametrize("points", STATES.values(), ids=STATES)
-def test_derivatives_against_differences_of_moving_on_the_sphere(points) -> None:
+def test_derivatives_against_differences_of_moving_on_the_sphere(points: FloatArray) -> None:
     """By all four numbers of the vector; the tangent basis is the module's own, and must be orthonormal."""
     rng = np.random.default_rng(6)
     views = random_views(rng, 3)
@@ -184,7 +185,7 @@ def test_derivatives_against_differences_of_moving_on_the_sphere(points) -> None
 
 
 @pytest.mark.parametrize("points", STATES.values(), ids=STATES)
-def test_a_step_of_gauss_newton_along_the_tangents_returns(points) -> None:
+def test_a_step_of_gauss_newton_along_the_tangents_returns(points: FloatArray) -> None:
     """Ties the derivative to the basis that `refine` moves along: a disturbed landmark is back at once."""
     rng = np.random.default_rng(7)
     views = random_views(rng, 4)
@@ -218,7 +219,7 @@ def reference_cost(
 
 @pytest.mark.parametrize("name", ["none", "huber", "cauchy"])
 @pytest.mark.parametrize("n_views", [2, 5])
-def test_refinement_finds_scipys_optimum(name, n_views) -> None:
+def test_refinement_finds_scipys_optimum(name: LossName, n_views: int) -> None:
     """From linear triangulation of pixels with noise, and an outlier where the loss can bear one."""
     rng = np.random.default_rng(n_views)
     views, points = random_views(rng, n_views), random_points(rng, 12, 5, 200)
@@ -282,8 +283,9 @@ def test_diverging_rays_end_at_infinity_unless_beyond_is_allowed() -> None:
         # Of all directions at infinity it is the best, found by SciPy over two angles.
         rows = np.flatnonzero(m.landmark == k)
 
-        def residual(yz: FloatArray, rows=rows) -> FloatArray:
-            return ((pixels_of(views, m.image[rows], np.array([1, *yz, 0])) - m.uv_px[rows]) / 0.3).ravel()
+        def residual(yz: FloatArray, rows: IntArray = rows) -> FloatArray:
+            offset = pixels_of(views, m.image[rows], np.array([1, *yz, 0])) - m.uv_px[rows]
+            return np.ravel(offset / 0.3)
 
         best = least_squares(residual, bound.vector[k, 1:3] / bound.vector[k, 0], xtol=1e-15, ftol=1e-15)
         found = evaluate(bound, m, views)[0][rows]

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from pancam_graph.base.errors import InputError
-from pancam_graph.landmarks import SQUARED, Loss, loss_of
+from pancam_graph.landmarks import SQUARED, Loss, LossName, loss_of
 
-NAMES = ["none", "huber", "cauchy"]
+NAMES: list[LossName] = ["none", "huber", "cauchy"]
 LENGTHS = [0.0, 1e-9, 0.3, 1.3449, 1.3451, 2.5, 10.0, 1e6]
 SIGMA = 0.5
 
@@ -21,7 +21,7 @@ IDS = [f"{loss.name}-{loss.width:.3g}" for loss in losses()]
 
 @pytest.mark.parametrize("loss", losses(), ids=IDS)
 @pytest.mark.parametrize("length", LENGTHS)
-def test_cost_and_weight_are_those_of_the_noise_model(loss, length) -> None:
+def test_cost_and_weight_are_those_of_the_noise_model(loss: Loss, length: float) -> None:
     """A prior on a 2-vector, off by a whitened residual of the given length."""
     whitened = length * np.array([0.6, -0.8])
     factor = gtsam.PriorFactorVector(
@@ -37,7 +37,7 @@ def test_cost_and_weight_are_those_of_the_noise_model(loss, length) -> None:
 
 
 @pytest.mark.parametrize("loss", losses(), ids=IDS)
-def test_weight_makes_the_gradient_of_the_cost(loss) -> None:
+def test_weight_makes_the_gradient_of_the_cost(loss: Loss) -> None:
     rng = np.random.default_rng(0)
     residual = rng.normal(0, 4, (50, 2))
     h = 1e-6
@@ -48,7 +48,7 @@ def test_weight_makes_the_gradient_of_the_cost(loss) -> None:
 
 
 @pytest.mark.parametrize("loss", losses(), ids=IDS)
-def test_a_loss_is_half_the_square_near_zero(loss) -> None:
+def test_a_loss_is_half_the_square_near_zero(loss: Loss) -> None:
     residual = np.array([[1e-3, 2e-3]])
     assert loss.cost(residual)[0] == pytest.approx(0.5 * 5e-6, rel=1e-5)
     assert loss.weight(residual)[0] == pytest.approx(1, rel=1e-5)
@@ -56,7 +56,7 @@ def test_a_loss_is_half_the_square_near_zero(loss) -> None:
 
 
 @pytest.mark.parametrize(("name", "width"), [("huber", 1.345), ("cauchy", 2.3849)])
-def test_ninety_five_percent_efficiency_for_gaussian_noise(name, width) -> None:
+def test_ninety_five_percent_efficiency_for_gaussian_noise(name: LossName, width: float) -> None:
     """Asymptotic variance of a location estimate, E[psi^2] / E[psi']^2, integrated on a grid."""
     loss = loss_of(name)
     assert loss.width == width

@@ -30,6 +30,7 @@ from pancam_graph.mosaic._surface import directions
 from pancam_graph.mosaic._warp import largest_gap
 from pancam_graph.results import check_out, write_results
 from support.mosaic_scenes import MARK_M, PLACE_M, PX_PER_RAD, Scene, brightness, solved, without_file
+from support.pictures import read_picture
 
 NEAR = MosaicOptions(ground_radius_m=4.0, ground_m_per_px=0.02)
 
@@ -149,7 +150,7 @@ def expected_shift(solution: Solution, row: int, overlap: Overlap) -> FloatArray
     moved_azimuth = azimuth - np.arctan2(shown[:, 1], shown[:, 0])
     moved_elevation = elevation - np.arctan2(shown[:, 2], np.hypot(shown[:, 0], shown[:, 1]))
     right = -np.arctan2(np.sin(moved_azimuth), np.cos(moved_azimuth)) * np.cos(elevation)
-    return PX_PER_RAD * np.column_stack([right, -moved_elevation])
+    return np.asarray(PX_PER_RAD * np.column_stack([right, -moved_elevation]))
 
 
 @pytest.mark.parametrize("error", [(4e-3, 0.0), (0.0, -3e-3), (-2e-3, 5e-3)])
@@ -185,7 +186,7 @@ def test_a_known_point_is_at_the_pixel_that_the_index_says(truth: Solution, tmp_
         else:
             column = (MARK_M[0] - entry["left_x_m"]) / entry["m_per_px"]
             row = (entry["top_y_m"] - MARK_M[1]) / entry["m_per_px"]
-        picture = cv2.imread(str(tmp_path / entry["files"]["refined"]), cv2.IMREAD_UNCHANGED)
+        picture = read_picture(tmp_path / entry["files"]["refined"])
         assert picture.shape == (entry["height_px"], entry["width_px"])
         dark = (picture > 0) & (picture < 20)
         near = np.zeros_like(dark)
@@ -269,8 +270,8 @@ def test_samples_of_16_bits_are_those_of_the_scene(tmp_path: Path) -> None:
     assert np.median(np.abs(ratio / np.median(ratio) - 1)) < 0.02
     write_mosaics(solution, tmp_path, NEAR)
     for entry in json.loads((tmp_path / "mosaics.json").read_text())["mosaics"]:
-        deep = cv2.imread(str(tmp_path / entry["files"]["refined_16bit"]), cv2.IMREAD_UNCHANGED)
-        plain = cv2.imread(str(tmp_path / entry["files"]["refined"]), cv2.IMREAD_UNCHANGED)
+        deep = read_picture(tmp_path / entry["files"]["refined_16bit"])
+        plain = read_picture(tmp_path / entry["files"]["refined"])
         assert deep.dtype == np.uint16
         assert np.array_equal(deep == 0, plain == 0)
         between = (plain > 1) & (plain < 255)

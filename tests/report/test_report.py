@@ -428,7 +428,7 @@ def test_observation_table_counts_by_reason(solution: Solution) -> None:
     assert [row[0] for row in cells] == ["one stop", "several stops", "all"]
     numbers = np.array([[int(c) for c in (*row[1:4], *row[5:9])] for row in cells])
     assert (numbers[0] + numbers[1] == numbers[2]).all()
-    assert (numbers[:2] > 0).all(axis=0)[:3].all()
+    assert (numbers[:2, :3] > 0).all()
     kinds = ("outlier", "single", "behind", "outside")
     expected = [len(observations), solution.used.sum(), *(solution.reason.count(kind) for kind in kinds)]
     assert numbers[2, 1:].tolist() == expected
@@ -444,7 +444,14 @@ def matched(solution: Solution) -> Solution:
         PairMatching(a=1, b=2, candidates=9, rover=0, off_line=0, kept=0, refusal=Refusal.FEW_ALIKE),
         PairMatching(a=1, b=3, candidates=90, rover=0, off_line=0, kept=0, refusal=Refusal.CHANCE),
     )
-    counts = {"sought": 300, "unlike": 40, "ambiguous": 30, "unstable": 20, "masked": 5, "off_pose": 10}
+    counts: dict[str, Any] = {
+        "sought": 300,
+        "unlike": 40,
+        "ambiguous": 30,
+        "unstable": 20,
+        "masked": 5,
+        "off_pose": 10,
+    }
     nothing = dict.fromkeys(counts, 0)
     stops = (
         StopMatching(a=0, b=1, **counts, kept=195, noise_px=0.1234),
@@ -490,7 +497,9 @@ def test_program_prints_what_was_thrown_away_and_why(
     assert len(capsys.readouterr().out.splitlines()) == 1
     print_summary(matched(solution), "out")
     lines = capsys.readouterr().out.splitlines()
-    assert lines[1:4] == list(matched(solution).traverse.matching.summary())
+    matching = matched(solution).traverse.matching
+    assert matching is not None
+    assert lines[1:4] == list(matching.summary())
     left_out = int(np.sum(~solution.used))
     assert lines[4].startswith(f"in the solve: {left_out} of {len(solution.used)} observations left out")
     assert lines[4].endswith("3 of those used came back after they had been set aside")

@@ -29,6 +29,7 @@ from pancam_graph.data._sharing import parse_sharing
 from pancam_graph.io import read_traverse
 from pancam_graph.results import check_out, write_results
 from pancam_graph.rigs import Rig, rig_template
+from support.pictures import read_picture
 
 SMALL = SimulationOptions(stops=2, pans=2, sweep_rad=0.8, points_per_image=30, outliers=0.02)
 RIGS = ("stereo-pan-tilt", "msl-navcam", "mars2020-navcam")
@@ -252,7 +253,7 @@ def grid(width_px: int, height_px: int) -> FloatArray:
 def photographed(camera: Camera, world_R_camera: FloatArray, dtype: type) -> np.ndarray[Any, Any]:
     """A picture of scenery at infinity."""
     seen = scenery(camera.unproject(grid(camera.width_px, camera.height_px)).direction @ world_R_camera.T)
-    largest = {np.uint8: 255, np.uint16: 4000}[dtype]
+    largest = 255 if dtype is np.uint8 else 4000
     return np.rint(seen * largest).astype(dtype).reshape(camera.height_px, camera.width_px)
 
 
@@ -290,7 +291,7 @@ def test_an_undistorted_image_shows_what_its_pinhole_sees(
         i = entry["image_id"] - 1
         head = next(w for w in table(tmp_path / "colmap" / "sparse" / "images.txt") if w[-1] == entry["name"])
         _, _, width, height, fx, fy, cx, cy = words[head[8]]
-        image = cv2.imread(str(tmp_path / "colmap" / "images" / entry["name"]), cv2.IMREAD_UNCHANGED)
+        image = read_picture(tmp_path / "colmap" / "images" / entry["name"])
         assert image.shape == (int(height), int(width))
         assert image.dtype == np.uint8
         uv = grid(int(width), int(height)) + 0.5  # as COLMAP counts
@@ -310,7 +311,7 @@ def test_a_pinhole_image_is_written_as_it_is_and_points_have_its_grey(
     write_colmap(solution, tmp_path / "colmap")
     entry = about(tmp_path / "colmap")["images"][0]
     one, other = (
-        cv2.imread(str(p), cv2.IMREAD_UNCHANGED)
+        read_picture(p)
         for p in (tmp_path / "colmap" / "images" / entry["name"], tmp_path / "pictures" / "0.png")
     )
     assert np.array_equal(one, other)

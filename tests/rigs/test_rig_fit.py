@@ -1,6 +1,6 @@
 """Fit of a rig: exact without noise, honest with it, and clear about what cameras cannot tell."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -586,9 +586,9 @@ def test_what_cannot_be_fitted_is_said_in_one_sentence(arguments: dict[str, obje
     ("make", "sentence"),
     [
         (
-            lambda: RigFitOptions(angles="about right"),
+            lambda: RigFitOptions(angles="about right"),  # type: ignore[arg-type]  # the mistake under test
             "angles: expected exact, offsets or free; found 'about",
-        ),  # type: ignore[arg-type]  # the mistake under test
+        ),
         (lambda: RigFitOptions(centre_sigma_m=0.0), "centre_sigma_m: expected a number above 0, found 0.0"),
         (lambda: RigFitOptions(angle_sigma_rad=float("nan")), "angle_sigma_rad: expected a number above 0"),
         (
@@ -597,7 +597,7 @@ def test_what_cannot_be_fitted_is_said_in_one_sentence(arguments: dict[str, obje
         ),
     ],
 )
-def test_options_of_nonsense_are_refused(make, sentence: str) -> None:
+def test_options_of_nonsense_are_refused(make: Callable[[], RigFitOptions], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         make()
 

@@ -25,6 +25,7 @@ from pancam_graph.rigs import (
     MSL_MAST,
     TEMPLATES,
     Eye,
+    MastKinematics,
     PointingSigma,
     Rig,
     exomars_pancam,
@@ -174,7 +175,7 @@ def test_a_zoom_that_is_not_published_is_refused() -> None:
 
 
 @pytest.mark.parametrize("mast", [MSL_MAST, MARS2020_MAST], ids=lambda m: m.name)
-def test_the_documented_head_is_parallel_to_the_rover_at_home(mast) -> None:
+def test_the_documented_head_is_parallel_to_the_rover_at_home(mast: MastKinematics) -> None:
     at_home = mast.rover_T_head(mast.home_azimuth_rad, mast.home_elevation_rad) * mast.head_T_document()
     assert at_home.rotation().matrix() == pytest.approx(FLIP, abs=1e-12)
     # Azimuth turns clockwise, elevation up.
@@ -214,7 +215,9 @@ LADYBUG3_UNIT = (
 
 
 @pytest.mark.parametrize(("make", "unit"), [(ladybug5, LADYBUG5_UNIT), (ladybug3, LADYBUG3_UNIT)])
-def test_ladybugs_are_rings_like_published_units(make: Callable[[], Rig], unit) -> None:
+def test_ladybugs_are_rings_like_published_units(
+    make: Callable[[], Rig], unit: tuple[tuple[float, float, float], ...]
+) -> None:
     rig = make()
     assert not rig.turns
     centres = np.array([e.head_T_camera.translation() for e in rig.eyes])

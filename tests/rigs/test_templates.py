@@ -93,7 +93,7 @@ def state_of(t: Traverse, seed: int = 1) -> State:
 
 
 def free(quantity: Quantity, scope: Scope, *entries: str) -> Sharing:
-    return Sharing(**{quantity: Freedom(scope=scope, free=entries or None)})  # type: ignore[arg-type]  # by name
+    return Sharing(**{quantity: Freedom(scope=scope, free=entries or None)})
 
 
 ALL = Sharing(calibration=Freedom(scope="eye"), mounts=Freedom(scope="eye"), pan_T_tilt=Freedom(scope="all"))
@@ -130,7 +130,7 @@ def off(t: Traverse, state: State, seed: int = 2) -> State:
 def templates(t: Traverse, sharing: Sharing | None = None) -> dict[str, FactorTemplate]:
     given = sharing or Sharing()
     soft = {
-        m: SoftTemplate(t, m, DEFAULT_FLEX[m], given.for_model(m) if m == "mast" else None)  # type: ignore[arg-type,index]  # literals
+        m: SoftTemplate(t, m, DEFAULT_FLEX[m], given.for_model(m) if m == "mast" else None)
         for m in ("mast", "circle", "free")
     }
     projective = ProjectiveTemplate(t, DEFAULT_FLEX["projective"])
@@ -343,7 +343,7 @@ def test_sigmas_are_handed_to_their_own_frames_and_stops(name: str) -> None:
     t = TRAVERSES[name]()
     template = HardTemplate(t)
     link, state = template.linkage, state_of(t)
-    covariance = Known(link.group_dim)
+    covariance = Known(np.array(link.group_dim, dtype=np.float64))
     stops, angles = template.stop_covariance(covariance), template.angle_sigma_rad(covariance, state)
     for i in range(len(t.stops)):
         key = gtsam.symbol("M", i)

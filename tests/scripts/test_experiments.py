@@ -294,7 +294,7 @@ def test_results_are_complete(tmp_path: Path) -> None:
             for noise in (0.1, 0.5)
             for seed in range(2)
         ]
-        + [ValidationTask(noise_px=0.5, seed=0)],  # type: ignore[list-item]  # both are tasks
+        + [ValidationTask(noise_px=0.5, seed=0)],
         processes=1,
     )
     samples.append(replace(samples[0], metrics={}, failure="it did not want to", seed=9))

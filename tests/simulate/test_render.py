@@ -5,6 +5,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import gtsam
@@ -211,7 +212,7 @@ def test_a_folder_with_files_is_left_alone(tiny: Rendering, tmp_path: Path) -> N
         ({"sun_elevation_rad": 0.1}, "sun_elevation_rad: expected"),
     ],
 )
-def test_options_that_make_no_sense_are_named(change: dict[str, float], message: str) -> None:
+def test_options_that_make_no_sense_are_named(change: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         RenderOptions(**change)
 

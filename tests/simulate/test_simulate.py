@@ -6,6 +6,7 @@ import sys
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -247,7 +248,7 @@ def test_a_wrong_rig_is_claimed_and_the_true_one_makes_the_images() -> None:
     base = simulate(rig, SMALL)
     assert base.truth.rig is rig
     assert base.traverse.rig.eyes == rig.eyes
-    errors = {"focal_error": 0.01, "mount_error_rad": 0.01, "mount_error_m": 0.02}
+    errors: dict[str, Any] = {"focal_error": 0.01, "mount_error_rad": 0.01, "mount_error_m": 0.02}
     wrong = simulate(rig, replace(SMALL, **errors))
     np.testing.assert_array_equal(observed(base).uv_px, observed(wrong).uv_px)
     np.testing.assert_array_equal(base.traverse.pan_tilt_rad, wrong.traverse.pan_tilt_rad)

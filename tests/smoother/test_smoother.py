@@ -152,7 +152,9 @@ def test_without_screening_all_that_is_seen_is_used() -> None:
 
 
 @pytest.mark.parametrize("threads", ["1", "3"])
-def test_the_number_of_threads_changes_no_bit(small: Simulation, monkeypatch, threads: str) -> None:
+def test_the_number_of_threads_changes_no_bit(
+    small: Simulation, monkeypatch: pytest.MonkeyPatch, threads: str
+) -> None:
     def found_with(number: str) -> tuple[list[float], FloatArray]:
         monkeypatch.setenv("PANCAM_GRAPH_THREADS", number)
         smoother = TraverseSmoother(small.traverse.rig)

@@ -96,9 +96,9 @@ def test_both_ways_lead_to_one_optimum_the_joint_one_sooner(name: str) -> None:
     assert np.abs(turns.final.pan_tilt_rad - joint.final.pan_tilt_rad).max() < 1e-6
     for a, b in zip(turns.final.world_T_mast, joint.final.world_T_mast, strict=True):
         assert np.abs(a.localCoordinates(b)).max() < 1e-4
-    for a, b in zip(turns.refined, joint.refined, strict=True):
-        assert a.change == pytest.approx(b.change, abs=0.01 * b.sigma)
-        assert a.sigma == pytest.approx(b.sigma, rel=1e-3)
+    for c, d in zip(turns.refined, joint.refined, strict=True):
+        assert c.change == pytest.approx(d.change, abs=0.01 * d.sigma)
+        assert c.sigma == pytest.approx(d.sigma, rel=1e-3)
     assert turns.stop_covariance == pytest.approx(joint.stop_covariance, rel=1e-2, abs=1e-9)
 
 

@@ -87,7 +87,7 @@ class Linear:
         )
 
     def sigma(self, covariance: FloatArray) -> FloatArray:
-        return np.sqrt(np.einsum("qi,ij,qj->q", self.rows, covariance, self.rows))
+        return np.asarray(np.sqrt(np.einsum("qi,ij,qj->q", self.rows, covariance, self.rows)))
 
     def spread(self, steps: FloatArray) -> Spread:
         variance = np.stack([self.sigma(c) ** 2 for c in self.halves])
@@ -580,9 +580,10 @@ def test_report_escapes_what_users_wrote(found: CrossValidation, traverse: Trave
 
 
 def enlarged(rig: Rig, factor: float) -> Rig:
-    """A rig with other focal lengths."""
+    """A rig of pinholes with other focal lengths."""
+    scale = np.array([[factor, 1, 1], [1, factor, 1], [1, 1, 1]])
     eyes = tuple(
-        replace(e, camera=replace(e.camera, fx_px=factor * e.camera.fx_px, fy_px=factor * e.camera.fy_px))  # type: ignore[call-arg]  # pinholes
+        replace(e, camera=e.camera.with_calibration(e.camera.pinhole.calibration_matrix * scale))
         for e in rig.eyes
     )
     return replace(rig, eyes=eyes)
@@ -599,9 +600,7 @@ def test_ratios_are_1_where_noise_is_all_there_is(rig: type) -> None:
         found = cross_validate(simulate(rig(), options, seed=seed).traverse, PLAIN, seed=seed)
         kinds = (found.pointing, found.relative_pointing, found.stops)
         squares.append([s.overall**2 for k in kinds for s in (k.random, k.upper_lower)])
-        scores.append(
-            [np.divide(*found.score_px(splitting)) ** 2 for splitting in ("random", "upper_lower")]  # type: ignore[arg-type]  # literals
-        )
+        scores.append([np.divide(*found.score_px(splitting)) ** 2 for splitting in ("random", "upper_lower")])
     for numbers in (np.array(squares), np.array(scores)):
         interval = 2.64 * numbers.std(axis=0, ddof=1) / np.sqrt(seeds)
         assert (np.abs(numbers.mean(axis=0) - 1) < interval).all()

@@ -105,7 +105,7 @@ def test_a_single_stop_needs_no_connection() -> None:
 
 
 @pytest.mark.parametrize("n", [6, 7, 9])
-def test_long_lists_are_cut_short_and_counted(n) -> None:
+def test_long_lists_are_cut_short_and_counted(n: int) -> None:
     t = traverse([["aL", "aR"]], frames=n + 1)
     (found,) = warnings(t)
     assert found.startswith(

@@ -267,7 +267,7 @@ class Cameras:
         while len(found) < n:
             b, uv = int(rng.choice(second)), rng.uniform(0, 1023, 2)
             point = self.t[b] - rng.uniform(0.5, 3.0) * self.ray(b, uv)
-            seen = [(int(i), self.pixel(i, point)[0]) for i in first if self.pixel(i, point)[1]]
+            seen = [(i, self.pixel(i, point)[0]) for i in first.tolist() if self.pixel(i, point)[1]]
             if len(seen) >= 2:
                 found.append([*seen, (b, uv)])
         return found

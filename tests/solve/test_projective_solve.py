@@ -160,13 +160,16 @@ def test_conditioned_or_not_the_optimum_is_the_same() -> None:
     assert raw.angle_sigma_rad == pytest.approx(ours.angle_sigma_rad, rel=1e-4)
 
 
+def disturbed(simulation: Simulation) -> FreeCameras:
+    return cameras_of(simulation, turn_rad=2e-3, shift_m=0.01, focal=3e-3)
+
+
 def test_the_worlds_origin_matters_only_to_matrices_that_are_not_conditioned() -> None:
     """A kilometre away the column of P that places the camera drowns the others in rounding."""
     here, away = small(), elsewhere(small(), np.array([1000.0, -1000.0, 100.0]))
     options = SolveOptions(model="projective", loss="none", max_iterations=30)
-    start = {"turn_rad": 2e-3, "shift_m": 0.01, "focal": 3e-3}
     found = [
-        solve(s.traverse, replace(options, normalise=n), start=telemetry(s, cameras_of(s, **start)))
+        solve(s.traverse, replace(options, normalise=n), start=telemetry(s, disturbed(s)))
         for s, n in ((here, True), (away, True), (away, False))
     ]
     assert [s.converged for s in found] == [True, True, False]

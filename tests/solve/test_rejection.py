@@ -44,7 +44,7 @@ def test_rays_pass_through_what_their_pixels_see() -> None:
 
 
 @pytest.mark.parametrize("cutoff", [2.0, 3.0])
-def test_without_outliers_as_many_go_as_a_gaussian_puts_beyond_the_cutoff(cutoff) -> None:
+def test_without_outliers_as_many_go_as_a_gaussian_puts_beyond_the_cutoff(cutoff: float) -> None:
     """A little fewer: of two that exceed it in one track the worse goes, and the other may then fit."""
     rng = np.random.default_rng(1)
     views = random_views(rng, 8)
@@ -60,7 +60,9 @@ def test_without_outliers_as_many_go_as_a_gaussian_puts_beyond_the_cutoff(cutoff
 @pytest.mark.parametrize(
     ("factor", "min_scale", "scale"), [(3.0, 1.0, 3.0), (0.2, 1.0, 1.0), (0.2, 0.05, 0.2)]
 )
-def test_the_scale_is_that_of_the_noise_or_the_least_allowed(factor, min_scale, scale) -> None:
+def test_the_scale_is_that_of_the_noise_or_the_least_allowed(
+    factor: float, min_scale: float, scale: float
+) -> None:
     """Sigmas that are wrong by a factor neither cost observations nor hide outliers beyond the least."""
     rng = np.random.default_rng(2)
     views = random_views(rng, 5)
@@ -71,7 +73,7 @@ def test_the_scale_is_that_of_the_noise_or_the_least_allowed(factor, min_scale, 
 
 
 @pytest.mark.parametrize("spread_m", [0.2, 2.0], ids=["one mast", "several stops"])
-def test_one_gross_outlier_in_four_views_goes_alone(spread_m) -> None:
+def test_one_gross_outlier_in_four_views_goes_alone(spread_m: float) -> None:
     """In every fifth track one observation is a random pixel, or beside the true one by ten sigmas."""
     rng = np.random.default_rng(3)
     views = random_views(rng, 4, spread_m)
@@ -147,7 +149,7 @@ def test_a_track_that_had_lost_all_is_judged_anew() -> None:
 @pytest.mark.parametrize(
     ("disparity_sigma", "kept"), [(-3.0, True), (0.0, True), (3.0, True), (-15.0, False), (15.0, True)]
 )
-def test_rays_may_diverge_by_noise_and_no_more(disparity_sigma, kept) -> None:
+def test_rays_may_diverge_by_noise_and_no_more(disparity_sigma: float, kept: bool) -> None:
     """Two level views of a horizon, and of twenty points that tell the noise; positive: a point in front."""
     rng = np.random.default_rng(9)
     views = views_at([[0, 0, 0], [0, 0.3, 0]])
@@ -169,7 +171,7 @@ def test_rays_may_diverge_by_noise_and_no_more(disparity_sigma, kept) -> None:
     ],
     ids=["three", "one far", "two and two"],
 )
-def test_a_ridge_loses_nothing_to_half_of_it_starting_beyond_infinity(centres) -> None:
+def test_a_ridge_loses_nothing_to_half_of_it_starting_beyond_infinity(centres: list[list[float]]) -> None:
     """A landmark held at infinity does not follow its farthest view, whose residual is then all noise."""
     rng = np.random.default_rng(10)
     views = views_at(centres)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import gtsam
@@ -27,7 +27,7 @@ from pancam_graph.base.errors import InputError
 from pancam_graph.cameras import CAHVOR, Brown
 from pancam_graph.data import ENTRIES, Quantity, default_sigma
 from pancam_graph.data._sharing import Scope, parse_sharing
-from pancam_graph.graph import ExplicitLandmarks, Flex, SoftTemplate
+from pancam_graph.graph import ExplicitLandmarks, Flex, Model, SoftTemplate, Tie
 from pancam_graph.initialise import Start
 from pancam_graph.rigs import Eye, Rig, exomars_pancam, mer_navcam
 from pancam_graph.simulate import Simulation
@@ -51,6 +51,23 @@ def start_of(simulation: Simulation) -> Start:
 
 
 # --- choices ---
+
+
+WITHOUT: list[tuple[Quantity, Model]] = [
+    ("radius", "mast"),
+    ("radius", "free"),
+    ("mounts", "free"),
+    ("mounts", "circle"),
+    ("pan_T_tilt", "free"),
+    ("pan_T_tilt", "circle"),
+]
+"""Quantities that a model does not have."""
+
+
+def shared_by_stop(quantity: Quantity, model: Model) -> SolveOptions:
+    sharing: dict[str, Any] = {quantity: Freedom(scope="stop")}
+    return SolveOptions(model=model, sharing=Sharing(**sharing))
+
 
 REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "scope": (lambda: Sharing(calibration=Freedom(scope="each")), r"calibration: scope: .*found 'each'"),  # type: ignore[arg-type]  # the mistake under test
@@ -93,19 +110,10 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "sigma not a number": (lambda: Sharing(mounts=Freedom(scope="eye", sigma={"y_m": np.nan})), r"found nan"),
     **{
         f"{quantity} with {model}": (
-            lambda quantity=quantity, model=model: SolveOptions(
-                model=model, sharing=Sharing(**{quantity: Freedom(scope="stop")})
-            ),
+            partial(shared_by_stop, quantity, model),
             rf"sharing: {quantity}: expected fixed with the model {model}, whose .*; found stop",
         )
-        for quantity, model in [
-            ("radius", "mast"),
-            ("radius", "free"),
-            ("mounts", "free"),
-            ("mounts", "circle"),
-            ("pan_T_tilt", "free"),
-            ("pan_T_tilt", "circle"),
-        ]
+        for quantity, model in WITHOUT
     },
     "word": (lambda: parse_sharing(["calibration"]), r"expected QUANTITY=SCOPE .*found 'calibration'"),
     "unknown quantity": (
@@ -203,7 +211,7 @@ def simulated(seed: int = 2, **changes: Any) -> Simulation:
     return simulate(mer_navcam(), replace(TWO_TILTS, **changes), seed=seed)
 
 
-EXACT: dict[str, tuple[str, dict[str, float], Sharing]] = {
+EXACT: dict[str, tuple[Model, dict[str, float], Sharing]] = {
     **{
         f"calibration and mounts per {scope}": (
             "mast",
@@ -254,7 +262,7 @@ def assert_rigs_agree(found: Rig, true: Rig, tolerance: float) -> None:
     ("name", "tie"),
     [(name, tie) for name in EXACT for tie in ("soft", "hard")[: 1 + (EXACT[name][0] == "mast")]],
 )
-def test_without_noise_the_true_rig_comes_back(name: str, tie: str) -> None:
+def test_without_noise_the_true_rig_comes_back(name: str, tie: Tie) -> None:
     """From a wrong rig and telemetry. Priors of telemetry are centred on the truth; the rig has none."""
     model, wrong, sharing = EXACT[name]
     tilts = (-0.3,) if "radius" in name else TWO_TILTS.tilts_rad  # an error of radius is one at one tilt
@@ -264,7 +272,7 @@ def test_without_noise_the_true_rig_comes_back(name: str, tie: str) -> None:
         model=model,
         tie=tie,
         sharing=sharing,
-        relative_decrease=1e-12,  # type: ignore[arg-type]  # parametrised
+        relative_decrease=1e-12,
     )
     solution = solve(simulation.traverse, options, start=start_of(simulation))
     assert solution.converged
@@ -283,12 +291,12 @@ def test_without_noise_the_true_rig_comes_back(name: str, tie: str) -> None:
     elif "per" not in name or "per eye" in name:
         assert_rigs_agree(solution.rig, simulation.truth.rig, 1e-7)
     else:
-        rig = solution.final.rig
-        assert rig is not None
-        true = [p.fx_px for p in simulation.truth.rig.pinholes]
+        correction = solution.final.rig
+        assert correction is not None
+        focal_px = [p.fx_px for p in simulation.truth.rig.pinholes]
         claimed = [p.fx_px for p in simulation.traverse.rig.pinholes]
-        change = np.subtract(true, claimed)[simulation.traverse.image_eye]
-        assert rig.calibration_px[:, 0] == pytest.approx(change, abs=1e-4)
+        change = np.subtract(focal_px, claimed)[simulation.traverse.image_eye]
+        assert correction.calibration_px[:, 0] == pytest.approx(change, abs=1e-4)
 
 
 def equal_bits(a: Solution, b: Solution) -> bool:
@@ -468,7 +476,7 @@ def test_a_hard_tie_has_the_explicit_optimum_too() -> None:
         calibration=Freedom(scope="eye"), mounts=Freedom(scope="eye"), pan_T_tilt=Freedom(scope="all")
     )
     ours, theirs = (
-        solve(near(), SolveOptions(loss="none", landmarks=way, sharing=sharing, relative_decrease=1e-12))  # type: ignore[arg-type]  # literals
+        solve(near(), SolveOptions(loss="none", landmarks=way, sharing=sharing, relative_decrease=1e-12))
         for way in ("eliminated", "explicit")
     )
     assert ours.cost_final == pytest.approx(theirs.cost_final, rel=1e-6)
@@ -674,10 +682,7 @@ def test_a_free_focal_length_of_opportunity(request: pytest.FixtureRequest) -> N
     t = matched.with_observations(kept)
     sharing = Sharing(calibration=Freedom(scope="eye", free=FOCAL))
     for model in ("mast", "circle", "free"):
-        fixed, free = (
-            solve(t, SolveOptions(model=model, loss="none", sharing=s))
-            for s in (None, sharing)  # type: ignore[arg-type]  # literals
-        )
+        fixed, free = (solve(t, SolveOptions(model=model, loss="none", sharing=s)) for s in (None, sharing))
         assert free.converged
         assert free.cost_final < fixed.cost_final
         focal = free.refined[0]

@@ -62,7 +62,7 @@ def test_exact_without_noise(name: str, model: str) -> None:
 
 def test_robust_solve_of_clean_data_is_the_plain_one() -> None:
     simulation = simulate(mer_navcam(), SMALL, seed=5)
-    robust, plain = (solve(simulation.traverse, SolveOptions(loss=loss)) for loss in ("cauchy", "none"))  # type: ignore[arg-type]  # literals
+    robust, plain = (solve(simulation.traverse, SolveOptions(loss=loss)) for loss in ("cauchy", "none"))
     assert robust.used.mean() > 0.998
     moved = np.abs(robust.final.pan_tilt_rad - plain.final.pan_tilt_rad) / plain.angle_sigma_rad
     assert moved.max() < 1.0  # one near point is missed in one observation

@@ -68,7 +68,7 @@ def near(simulation: Simulation) -> Traverse:
 
 def random_covariances(rng: np.random.Generator, n: int) -> FloatArray:
     root = rng.normal(0, 1, (n, 2, 2)) * np.exp(rng.uniform(-3, 3, (n, 1, 1)))
-    return root @ root.transpose(0, 2, 1) + 1e-6 * np.eye(2)
+    return np.asarray(root @ root.transpose(0, 2, 1) + 1e-6 * np.eye(2))
 
 
 def masts_apart(a: Solution, b: Solution) -> float:
@@ -115,7 +115,7 @@ def test_noise_scaled_widened_selected(kind: str) -> None:
     def square(n: PixelNoise) -> FloatArray:
         root = n.to_pixels(identity[: len(n.sigma_px)])
         assert n.sigma_px == pytest.approx(mean_sigma_px(root @ root.transpose(0, 2, 1)))
-        return root @ root.transpose(0, 2, 1)
+        return np.asarray(root @ root.transpose(0, 2, 1))
 
     assert square(noise.scaled(3.0)) == pytest.approx(9 * covariance)
     wider = covariance + added[:, None, None] ** 2 * np.eye(2)
@@ -208,8 +208,7 @@ def test_eliminated_and_explicit_landmarks_weigh_alike(rig: str, model: str) -> 
     """GTSAM takes a lower triangular square root for a diagonal one, if it may; then correlation is lost."""
     traverse = near(simulated(rig))
     ours, theirs = (
-        solve(traverse, replace(MODELS[model], landmarks=way))  # type: ignore[arg-type]  # literals
-        for way in ("eliminated", "explicit")
+        solve(traverse, replace(MODELS[model], landmarks=way)) for way in ("eliminated", "explicit")
     )
     assert ours.cost_final == pytest.approx(theirs.cost_final, rel=1e-10)
     assert masts_apart(ours, theirs) < 1e-8

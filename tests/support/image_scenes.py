@@ -90,7 +90,8 @@ class Scene:
             grey = np.where(on_deck, ndimage.map_coordinates(self.deck, at, order=1, mode="wrap"), grey)
         noise = np.random.default_rng(row).normal(scale=0.02, size=grey.shape)
         scaled = np.clip(0.5 + 0.1 * (grey + noise), 0, 1) * (2**bits - 1)
-        return np.rint(scaled).astype(np.uint8 if bits == 8 else np.uint16).reshape(SIZE_PX, SIZE_PX)
+        samples: FloatArray = np.rint(scaled).reshape(SIZE_PX, SIZE_PX)
+        return samples.astype(np.uint8) if bits == 8 else samples.astype(np.uint16)
 
 
 def make_traverse(
@@ -168,7 +169,7 @@ def errors_px(truth: Traverse, scene: Scene, obs: Observations) -> FloatArray:
                 points, _ = scene.points_m(truth, origin, obs.uv_px[first[k]])
                 pixel, _ = camera.project((points - centre[row]) @ R[row])
                 error[k] = np.linalg.norm(pixel - obs.uv_px[k], axis=1)
-    return error[first != np.arange(len(obs))]
+    return np.asarray(error[first != np.arange(len(obs))])
 
 
 def as_bytes(obs: Observations) -> bytes:

@@ -12,7 +12,7 @@ from pancam_graph.cameras import CAHV, CAHVOR, CAHVORE, Brown, Pinhole
 from pancam_graph.data import Solution, State
 from pancam_graph.rigs import Eye, Rig
 
-SIZE = {"width_px": 64, "height_px": 48}
+SIZE: dict[str, Any] = {"width_px": 64, "height_px": 48}
 MOUNT = gtsam.Pose3(gtsam.Rot3(rz(0.1) @ HEAD_R_FORWARD_CAMERA), np.array([0.1, 0.2, -0.03]))
 
 
@@ -30,11 +30,11 @@ def cahv_vectors() -> dict[str, Any]:
 
 def all_eyes() -> tuple[Eye, ...]:
     """An eye of each camera model."""
-    numbers = {"fx_px": 70.0, "fy_px": 71.5, "cx_px": 31.5, "cy_px": 23.25}
+    numbers: dict[str, Any] = {"fx_px": 70.0, "fy_px": 71.5, "cx_px": 31.5, "cy_px": 23.25}
     distortion = (-0.1, 0.02, 1e-3, -2e-3, 0.005)
     vectors = cahv_vectors()
-    optical = {"O": vectors["A"], "R": np.array([1e-4, -0.02, 0.01])}
-    pupil = {"E": np.array([-0.003, 0.01, -0.02]), "linearity": 0.37}
+    optical: dict[str, Any] = {"O": vectors["A"], "R": np.array([1e-4, -0.02, 0.01])}
+    pupil: dict[str, Any] = {"E": np.array([-0.003, 0.01, -0.02]), "linearity": 0.37}
     return (
         Eye(name="pinhole", camera=Pinhole(**SIZE, **numbers, skew_px=0.3), head_T_camera=MOUNT),
         Eye(name="brown", camera=Brown(**SIZE, **numbers, distortion=distortion), head_T_camera=MOUNT),

@@ -34,7 +34,7 @@ def tracks(m: Measurements, views: CameraViews) -> list[Track]:
 def tangents(vector: FloatArray) -> FloatArray:
     """(4, 3) the images of the last three axes in the reflection I - 2 a a' / a'a, a = vector + sign e0."""
     a = vector + (1.0 if vector[0] >= 0 else -1.0) * np.eye(4)[0]
-    return (np.eye(4) - 2 * np.outer(a, a) / (a @ a))[:, 1:]
+    return np.asarray((np.eye(4) - 2 * np.outer(a, a) / (a @ a))[:, 1:])
 
 
 def seen(track: Track, vector: FloatArray, origin: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
@@ -129,9 +129,11 @@ def refined(
             along = tangents(v)[3]
             b = b - (b @ along)[:, :, None] * along
         squared = (residual**2).sum(1)
-        cost = weight @ (loss_cost(name, width, squared) + np.where(front, 0.0, 1e12))
-        own = weight * loss_weight(name, width, squared)
-        return cost, np.einsum("n,nip,niq->pq", own, b, b), np.einsum("n,nip,ni->p", own, b, residual)
+        cost = float(weight @ (loss_cost(name, width, squared) + np.where(front, 0.0, 1e12)))
+        share = weight * loss_weight(name, width, squared)
+        curvature: FloatArray = np.einsum("n,nip,niq->pq", share, b, b)
+        gradient: FloatArray = np.einsum("n,nip,ni->p", share, b, residual)
+        return cost, curvature, gradient
 
     if len(weight) == 0:
         return vector
@@ -141,7 +143,7 @@ def refined(
         values, turn = np.linalg.eigh(V)
         known = values > 1e-13 * values[-1] + 1e-300
         step = -turn[:, known] @ ((turn.T @ g)[known] / values[known]) / (1 + damping)
-        step *= min(1.0, 0.5 / max(np.linalg.norm(step), 1e-300))
+        step *= min(1.0, 0.5 / max(float(np.linalg.norm(step)), 1e-300))
         trial = vector + tangents(vector) @ step
         if held:
             trial[3] = 0.0
@@ -162,7 +164,7 @@ def cofactor(b: FloatArray, weight: FloatArray) -> FloatArray:
     values, turn = np.linalg.eigh(np.einsum("n,nip,niq->pq", weight, b, b))
     half = b @ (turn / np.sqrt(np.maximum(values, 1e-14 * values[-1] + 1e-100)))
     sign = np.where(weight > 0, weight, -1.0)[:, None, None]
-    return np.eye(2) - sign * (half @ half.transpose(0, 2, 1))
+    return np.asarray(np.eye(2) - sign * (half @ half.transpose(0, 2, 1)))
 
 
 def screened(
@@ -176,7 +178,7 @@ def screened(
     """Vectors, what is accepted and the noise scale; every landmark anew in every sweep."""
     rows = [np.flatnonzero(m.landmark == k) for k in range(m.landmark[-1] + 1)]
     vector, origin, accepted = start.vector.copy(), start.origin_m.copy(), accepted.copy()
-    limit = np.array([np.inf, *chi2.isf(2 * norm.sf(cutoff_sigma), [1, 2])])
+    limit = np.append(np.inf, chi2.isf(2 * norm.sf(cutoff_sigma), [1, 2]))
     anew = []
     for k, r in enumerate(rows):
         if accepted[r].sum() < 2:

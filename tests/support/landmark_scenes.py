@@ -5,13 +5,15 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pancam_graph.base.geometry import HEAD_R_FORWARD_CAMERA, FloatArray
+from pancam_graph.base.geometry import HEAD_R_FORWARD_CAMERA, FloatArray, IntArray
 from pancam_graph.landmarks import CameraViews, Landmarks, Measurements
 
 FOCAL_PX = 1000.0
 
 
-def views_at(centres_m: FloatArray, rotvec: FloatArray | None = None) -> CameraViews:
+def views_at(
+    centres_m: FloatArray | Sequence[Sequence[float]], rotvec: FloatArray | None = None
+) -> CameraViews:
     """Cameras that look along the world's x axis, turned by rotation vectors (n, 3) in the world."""
     centres = np.asarray(centres_m, dtype=float)
     turn = np.zeros_like(centres) if rotvec is None else rotvec
@@ -34,20 +36,20 @@ def random_points(rng: np.random.Generator, n: int, near_m: float = 8.0, far_m: 
     return np.column_stack([x, *(x * rng.uniform(-0.3, 0.3, (2, n))), np.ones(n)])
 
 
-def pixels_of(views: CameraViews, image: Sequence[int], points: FloatArray) -> FloatArray:
+def pixels_of(views: CameraViews, image: Sequence[int] | IntArray, points: FloatArray) -> FloatArray:
     """Pixels (n, 2) of homogeneous points (n, 4) or (4,) in images (n,), row by row."""
     index = np.asarray(image)
     points = np.broadcast_to(points, (len(index), 4))
     ray = points[:, :3] - points[:, 3:] * views.world_t_camera[index]
     to_pixel = views.calibration[index] @ views.world_R_camera[index].transpose(0, 2, 1)
     p = np.einsum("nij,nj->ni", to_pixel, ray)
-    return p[:, :2] / p[:, 2:]
+    return np.asarray(p[:, :2] / p[:, 2:])
 
 
 def measure(
     views: CameraViews,
     points: FloatArray,
-    images: Sequence[Sequence[int]] | None = None,
+    images: Sequence[Sequence[int] | IntArray] | None = None,
     *,
     sigma_px: float = 0.3,
     noise: np.random.Generator | None = None,
@@ -79,4 +81,4 @@ def homogeneous(landmarks: Landmarks) -> FloatArray:
     """Unit homogeneous world points (n, 4); inverse of `unit`."""
     x, w = landmarks.vector[:, :3], landmarks.vector[:, 3:]
     points = np.column_stack([x + w * landmarks.origin_m, w])
-    return points / np.linalg.norm(points, axis=1, keepdims=True)
+    return np.asarray(points / np.linalg.norm(points, axis=1, keepdims=True))

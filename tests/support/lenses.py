@@ -1,19 +1,21 @@
 """One camera of every model, distorted as real ones are, and pixels all over its image."""
 
+from typing import Any
+
 import numpy as np
 
 from pancam_graph.base.geometry import FloatArray
 from pancam_graph.cameras import CAHV, CAHVOR, CAHVORE, Brown, Pinhole
 
-NUMBERS = {"fx_px": 500.0, "fy_px": 510.0, "cx_px": 321.0, "cy_px": 237.0, "skew_px": 2.0}
-SIZE = {"width_px": 640, "height_px": 480}
-AXES = {
+NUMBERS: dict[str, Any] = {"fx_px": 500.0, "fy_px": 510.0, "cx_px": 321.0, "cy_px": 237.0, "skew_px": 2.0}
+SIZE: dict[str, Any] = {"width_px": 640, "height_px": 480}
+AXES: dict[str, Any] = {
     "C": np.zeros(3),
     "A": np.array([0.0, 0.0, 1.0]),
     "H": np.array([500.0, 0.0, 321.0]),
     "V": np.array([3.0, 510.0, 237.0]),
 }
-OPTICAL = {
+OPTICAL: dict[str, Any] = {
     "O": np.array([0.01, -0.02, 1.0]) / np.linalg.norm([0.01, -0.02, 1.0]),
     "R": np.array([1e-4, -0.1, 0.08]),
 }
