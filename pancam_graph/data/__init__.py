@@ -9,6 +9,7 @@ from pancam_graph.data._matching import Matching as Matching
 from pancam_graph.data._matching import PairMatching as PairMatching
 from pancam_graph.data._matching import Refusal as Refusal
 from pancam_graph.data._matching import StopMatching as StopMatching
+from pancam_graph.data._noise import PixelNoise as PixelNoise
 from pancam_graph.data._noise import mean_sigma_px as mean_sigma_px
 from pancam_graph.data._sharing import ENTRIES as ENTRIES
 from pancam_graph.data._sharing import FIXED as FIXED

@@ -13,7 +13,7 @@ from pancam_graph.base.threads import blas_on_one_thread
 from pancam_graph.data import Frame, Image, Incremental, Observations, Seconds, Solution, Stop, Traverse
 from pancam_graph.smoother._options import SmootherOptions, Update
 from pancam_graph.smoother._smoother import TraverseSmoother
-from pancam_graph.solve import Adjustment, SolveOptions
+from pancam_graph.solve import SolveOptions, fitted_elsewhere, judge, prepare, screened_elsewhere, solution_of
 
 __all__ = ["solve_incrementally", "stops_of"]
 
@@ -86,9 +86,9 @@ def _as_solution(
     used[_rows_as_added(traverse)] = smoother.used
     costs = tuple(u.cost for u in updates)
     with blas_on_one_thread():
-        adjustment = Adjustment(traverse, options, None, None)
-        adjustment.take_over(smoother.values(), used, costs, f"{len(updates)} stops added one by one")
-        solution = adjustment.solution()
+        screened = screened_elsewhere(prepare(traverse, options), smoother.values(), used)
+        fitted = fitted_elsewhere(screened, costs, f"{len(updates)} stops added one by one")
+        solution = solution_of(judge(fitted))
     warnings = (w for u in updates for w in u.warnings)
     return replace(
         solution,

@@ -19,7 +19,7 @@ from pancam_graph.landmarks import (
 from pancam_graph.smoother._ledger import Fate, Ledger
 from pancam_graph.smoother._sets import distinct
 from pancam_graph.smoother._station import Patch
-from pancam_graph.solve import screen
+from pancam_graph.solve import snoop
 
 __all__ = ["Placed", "Seen", "believed", "combined", "gathered", "placed_anew"]
 
@@ -165,7 +165,7 @@ def placed_anew(seen: Seen, views: CameraViews) -> Seen:
 
 
 def believed(seen: Seen, views: CameraViews, cutoff_sigma: float | None) -> Seen:
-    """Touched landmarks without the observations that contradict the others; see `_rejection.screen`.
+    """Touched landmarks without the observations that contradict the others; see `snoop`.
 
     Only those that may hide an outlier are looked at. Observations of landmarks behind their camera go;
     with no cutoff nothing else does.
@@ -201,7 +201,7 @@ def believed(seen: Seen, views: CameraViews, cutoff_sigma: float | None) -> Seen
     scale = float(np.sqrt(np.median(total[judged] / (2 * count[judged] - 3)))) if judged.any() else 1.0
     rows = np.flatnonzero(suspect[m.landmark])
     part = m.part(rows)
-    screening = screen(
+    snooping = snoop(
         Landmarks(vector=placed.landmarks.vector[suspect], origin_m=placed.landmarks.origin_m[suspect]),
         part,
         views,
@@ -215,8 +215,8 @@ def believed(seen: Seen, views: CameraViews, cutoff_sigma: float | None) -> Seen
         placed.landmarks.vector.copy(),
         placed.landmarks.origin_m.copy(),
     )
-    accepted[rows] = screening.accepted
-    vector[suspect], origin[suspect] = screening.landmarks.vector, screening.landmarks.origin_m
+    accepted[rows] = snooping.accepted
+    vector[suspect], origin[suspect] = snooping.landmarks.vector, snooping.landmarks.origin_m
     landmarks = refine(
         Landmarks(vector=vector, origin_m=origin),
         m,

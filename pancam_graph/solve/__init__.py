@@ -1,15 +1,27 @@
 """The adjustment of a traverse: prepare, screen, fit, judge."""
 
-from pancam_graph.solve._adjustment import Adjustment as Adjustment
 from pancam_graph.solve._diagnose import listed as listed
 from pancam_graph.solve._eliminated import EliminatedSolver as EliminatedSolver
+from pancam_graph.solve._fit import Fitted as Fitted
+from pancam_graph.solve._fit import fit as fit
+from pancam_graph.solve._fit import fitted_elsewhere as fitted_elsewhere
+from pancam_graph.solve._judge import Judged as Judged
+from pancam_graph.solve._judge import judge as judge
+from pancam_graph.solve._judge import reduced_of as reduced_of
+from pancam_graph.solve._judge import regular_problem as regular_problem
 from pancam_graph.solve._optimise import InOrder as InOrder
 from pancam_graph.solve._optimise import Iteration as Iteration
 from pancam_graph.solve._optimise import OnGraph as OnGraph
 from pancam_graph.solve._optimise import optimise as optimise
 from pancam_graph.solve._optimise import parameters_of as parameters_of
+from pancam_graph.solve._prepare import Prepared as Prepared
+from pancam_graph.solve._prepare import prepare as prepare
 from pancam_graph.solve._problem import Problem as Problem
-from pancam_graph.solve._rejection import screen as screen
+from pancam_graph.solve._rejection import snoop as snoop
+from pancam_graph.solve._screen import Screened as Screened
+from pancam_graph.solve._screen import screen as screen
+from pancam_graph.solve._screen import screened_elsewhere as screened_elsewhere
+from pancam_graph.solve._solution_of import solution_of as solution_of
 from pancam_graph.solve._solve import SolveOptions as SolveOptions
 from pancam_graph.solve._solve import solve as solve
 from pancam_graph.solve._stopping import StopRule as StopRule

@@ -16,7 +16,7 @@ from pancam_graph.solve._problem import Problem, Solver, system_of
 from pancam_graph.solve._reduced import ReducedSystem, joint_root
 from pancam_graph.solve._stopping import StopRule
 
-__all__ = ["EliminatedSolver"]
+__all__ = ["EliminatedSolver", "Ended"]
 
 
 _FOLLOWING = 1e-4
@@ -30,7 +30,7 @@ class EliminatedSolver(Solver):
         """`is_near`: cameras start where they were given, and no rigid mast is fitted first."""
         super().__init__(on_iteration)
         self._is_near = is_near
-        self._last: _Fit | None = None
+        self._last: Ended | None = None
 
     def approach(self, problem: Problem, rule: StopRule, loss: Loss, stage: str) -> Problem:
         """The same as `adjust`, but for the loss: unit 4-vectors do not go astray from afar."""
@@ -133,25 +133,21 @@ class EliminatedSolver(Solver):
         rows: IntArray,
         joint: Root | None = None,
     ) -> Problem:
-        """The problem where a fit ended; what it left is kept for `reduced`."""
+        """The problem where a fit ended; where it ended is kept as `last`."""
         vector = problem.landmarks.vector.copy()
         vector[rows] = system.landmarks().vector
         found = problem.at(outcome.values, replace(problem.landmarks, vector=vector))
-        self._last = _Fit(problem=found, system=system, rows=rows, joint=joint)
+        self._last = Ended(problem=found, system=system, rows=rows, joint=joint)
         return found
 
-    def reduced(self, problem: Problem) -> ReducedSystem | None:
-        """The problem with landmarks eliminated, from the last fit; None if this did not end there."""
-        last = self._last
-        if last is None or last.problem is not problem:
-            return None
-        if last.joint is None:
-            return ReducedSystem.of(problem, (last.system, last.rows))
-        return ReducedSystem(system=last.system, rows=last.rows, root=last.joint)
+    @property
+    def last(self) -> "Ended | None":
+        """Where the last fit ended; None before the first."""
+        return self._last
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Fit:
+class Ended:
     """Where a fit ended."""
 
     problem: Problem
@@ -161,6 +157,15 @@ class _Fit:
     joint: Root | None
     """Of the whole system at the problem's values, where the iterations ended by it; the system is
     linearised there then."""
+
+    def reduced(self) -> ReducedSystem:
+        """The problem with landmarks eliminated, linearised where the fit ended.
+
+        Raises SolveError where a direction is held by nothing.
+        """
+        if self.joint is None:
+            return ReducedSystem.of(self.problem, (self.system, self.rows))
+        return ReducedSystem(system=self.system, rows=self.rows, root=self.joint)
 
 
 def _gain_ahead(system: LandmarkSystem, root: Callable[[], Root]) -> float | None:

@@ -24,14 +24,14 @@ from pancam_graph.landmarks import (
     seen_by,
 )
 
-__all__ = ["Screening", "screen"]
+__all__ = ["Snooping", "snoop"]
 
 _SWEEPS = 12
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Screening:
-    """Outcome of one screening."""
+class Snooping:
+    """Outcome of data snooping: which observations to believe."""
 
     landmarks: Landmarks
     accepted: BoolArray
@@ -42,7 +42,7 @@ class Screening:
     """(n,) whether the landmark is behind the camera."""
 
 
-def screen(
+def snoop(
     landmarks: Landmarks,
     measurements: Measurements,
     views: CameraViews,
@@ -51,7 +51,7 @@ def screen(
     cutoff_sigma: float,
     min_scale: float,
     scale: float | None = None,
-) -> Screening:
+) -> Snooping:
     """Reject and re-admit observations with all cameras held.
 
     `accepted` (n,) is where to start. An observation goes when its test exceeds the chi-square quantile
@@ -113,7 +113,7 @@ def screen(
         if len(which) == 0:
             break
         fresh = which[lost[which] & (np.add.reduceat(weight, starts)[which] > 0)]
-    return Screening(
+    return Snooping(
         landmarks=Landmarks(vector=vector, origin_m=origin),
         accepted=weight > 0,
         scale=scale,

@@ -4,15 +4,18 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
 
 from pancam_graph.base.threads import blas_on_one_thread
 from pancam_graph.data import Seconds, Solution, Traverse
 from pancam_graph.initialise import Start
 from pancam_graph.landmarks import kernel
-from pancam_graph.solve._adjustment import Adjustment
+from pancam_graph.solve._fit import fit
+from pancam_graph.solve._judge import judge
 from pancam_graph.solve._optimise import Iteration
 from pancam_graph.solve._options import SolveOptions
+from pancam_graph.solve._prepare import prepare
+from pancam_graph.solve._screen import screen
+from pancam_graph.solve._solution_of import solution_of
 
 __all__ = ["COMPILING", "SolveOptions", "solve"]
 
@@ -39,13 +42,27 @@ def solve(
     """
     if kernel.must_compile():
         _LOG.info(COMPILING)
-    times = [time.perf_counter()]
+    clock = _Clock()
     with blas_on_one_thread():
-        adjustment = Adjustment(traverse, options or SolveOptions(), start, on_iteration)
-        times.append(time.perf_counter())
-        adjustment.solve()
-        times.append(time.perf_counter())
-        solution = adjustment.solution()
-    times.append(time.perf_counter())
-    initialise, solving, report = (after - before for before, after in pairwise(times))
-    return replace(solution, seconds=Seconds(initialise=initialise, solve=solving, report=report))
+        prepared = prepare(traverse, options or SolveOptions(), start, on_iteration)
+        clock.ended("initialise")
+        screened = screen(prepared)
+        fitted = fit(screened)
+        judged = judge(fitted)
+        clock.ended("solve")
+        solution = solution_of(judged)
+        clock.ended("report")
+    return replace(solution, seconds=Seconds(**clock.seconds))
+
+
+class _Clock:
+    """Wall-clock seconds of one part after the other."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._since = time.perf_counter()
+
+    def ended(self, part: str) -> None:
+        """Note what a part took, which began when the one before it ended."""
+        now = time.perf_counter()
+        self.seconds[part], self._since = now - self._since, now

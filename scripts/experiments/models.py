@@ -12,7 +12,7 @@ from pancam_graph.base.threads import blas_on_one_thread
 from pancam_graph.data import Freedom, Sharing
 from pancam_graph.graph import Flex, Model
 from pancam_graph.simulate import Simulation
-from pancam_graph.solve import Adjustment
+from pancam_graph.solve import fit, judge, prepare, screen, solution_of
 
 __all__ = ["FREE_FLEX", "KNOWN_RIG", "RIG_OFF", "ClusterTask", "Variant", "variant"]
 
@@ -98,12 +98,11 @@ class ClusterTask:
 
 
 def _measured(simulation: Simulation, options: SolveOptions, seed: int) -> dict[str, float]:
-    adjustment = Adjustment(simulation.traverse, options, None, None)
     with blas_on_one_thread():  # as `solve`, of which this is the inside: its covariance is wanted whole
-        adjustment.solve()
-        solution = adjustment.solution()
+        judged = judge(fit(screen(prepare(simulation.traverse, options))))
+        solution = solution_of(judged)
         _require_whole(solution)
-        return errors_of(solution, simulation) | predicted_errors(adjustment, seed)
+        return errors_of(solution, simulation) | predicted_errors(judged, seed)
 
 
 def _require_whole(solution: Solution) -> None:

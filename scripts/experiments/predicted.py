@@ -9,7 +9,7 @@ import numpy as np
 
 from experiments.errors import aligned_centres, distances_percent
 from pancam_graph.base.geometry import FloatArray
-from pancam_graph.solve import Adjustment
+from pancam_graph.solve import Judged, reduced_of, regular_problem
 from pancam_graph.solve._joint import retracted
 
 __all__ = ["DRAWS", "predicted_errors"]
@@ -18,15 +18,15 @@ DRAWS = 25
 """Of each solution; over 50 seeds that is a median of 1250."""
 
 
-def predicted_errors(adjustment: Adjustment, seed: int) -> dict[str, float]:
+def predicted_errors(judged: Judged, seed: int) -> dict[str, float]:
     """Medians over draws of the errors of centres and distances that a finished solve predicts for itself.
 
     Nothing where it has no covariance.
     """
-    if not np.isfinite(adjustment.uncertainty.stop_covariance).all():
+    if not np.isfinite(judged.uncertainty.stop_covariance).all():
         return {}
-    t, problem = adjustment.traverse, adjustment.regular
-    root = adjustment.reduced(problem).root
+    t, problem = judged.fitted.screened.prepared.traverse, regular_problem(judged.fitted)
+    root = reduced_of(judged.fitted, problem).root
     rng = np.random.default_rng(seed)
     place = problem.views.world_t_camera
     centre_mm, distance_percent = [], []

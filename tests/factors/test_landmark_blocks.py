@@ -15,7 +15,7 @@ from pancam_graph.graph import Flex, read_variable
 from pancam_graph.landmarks import SQUARED, CameraViews, Loss, LossName, loss_of
 from pancam_graph.rigs import exomars_pancam
 from pancam_graph.simulate import Simulation
-from pancam_graph.solve import Adjustment, EliminatedSolver, Problem, StopRule
+from pancam_graph.solve import EliminatedSolver, Problem, StopRule, prepare
 from pancam_graph.solve._problem import system_of
 from pancam_graph.solve._reduced import joint_root
 from support.elimination_reference import Dense, assert_systems_agree, dense_of, true_cost, whole
@@ -41,7 +41,7 @@ def tiny(noise_px: float = 0.3) -> Simulation:
 
 def problem_of(model: str, *, off: float = 0.0, noise_px: float = 0.3, seed: int = 0) -> Problem:
     """Cameras at the truth and landmarks where they fit, both moved by random numbers of the size `off`."""
-    problem = Adjustment(tiny(noise_px).traverse, MODELS[model], None, None).problem
+    problem = prepare(tiny(noise_px).traverse, MODELS[model]).problem
     rng = np.random.default_rng(seed)
     values = problem.values.retract(random_step(problem, rng, off))
     vector = problem.landmarks.vector + off * rng.normal(0, 0.3, problem.landmarks.vector.shape)

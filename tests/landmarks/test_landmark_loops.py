@@ -23,8 +23,8 @@ from pancam_graph.landmarks import (
     triangulate,
 )
 from pancam_graph.landmarks._landmarks import evaluate, free_derivatives, residual_cofactor
-from pancam_graph.solve import screen
-from pancam_graph.solve._rejection import Screening
+from pancam_graph.solve import snoop
+from pancam_graph.solve._rejection import Snooping
 from support import landmark_reference as reference
 from support.landmark_scenes import measure, random_points, random_views, unit, views_at
 
@@ -230,7 +230,7 @@ def test_screening_is_the_references_that_does_all_anew_in_every_sweep(seed: int
     m = replace(m, uv_px=uv)
     before = rng.random(len(uv)) < 0.9
     start = triangulate(*rays_of(m, views), m.landmark, before.astype(float))
-    found = screen(start, m, views, before, cutoff_sigma=3.0, min_scale=0.5)
+    found = snoop(start, m, views, before, cutoff_sigma=3.0, min_scale=0.5)
     vector, accepted, scale = reference.screened(start, m, views, before, 3.0, 0.5)
     assert found.accepted.tolist() == accepted.tolist()
     assert 0 < np.sum(~accepted) < len(accepted) / 2
@@ -266,7 +266,7 @@ def everything(views: CameraViews, m: Measurements, loss: Loss) -> list[FloatArr
     residual, b, in_front = evaluate(refined, m, views)
     free = free_derivatives(b, refined, m)
     points = refined.points_m(np.full(m.n_landmarks, 1e6))
-    s: Screening = screen(start, m, views, ones > 0, cutoff_sigma=3.0, min_scale=1.0)
+    s: Snooping = snoop(start, m, views, ones > 0, cutoff_sigma=3.0, min_scale=1.0)
     return [
         *(centre, direction, start.vector, start.origin_m, refined.vector, residual, b, in_front, free),
         *(residual_cofactor(free, m, ones), point_sigma_m(points, m, views, ones > 0), loss.cost(residual)),
@@ -371,7 +371,7 @@ def test_rays_along_one_line_leave_the_range_alone() -> None:
     assert np.isfinite(residual_cofactor(free_derivatives(b, found, m), m, ones)).all()
     # On the axis the range is not seen at all; nearly all of its sigma is rounding.
     assert point_sigma_m(points[:, :3], m, views, ones > 0)[0] > 1e5
-    result = screen(start, m, views, ones > 0, cutoff_sigma=4.0, min_scale=1.0)
+    result = snoop(start, m, views, ones > 0, cutoff_sigma=4.0, min_scale=1.0)
     assert result.accepted.all()
     assert np.isfinite(result.landmarks.vector).all()
 
@@ -433,7 +433,7 @@ def test_arguments_are_not_written_to() -> None:
     given = [start.vector, start.origin_m, ones, accepted, b, m.uv_px]
     before = [a.copy() for a in given]
     refine(start, m, views, ones)
-    screen(start, m, views, accepted, cutoff_sigma=2.0, min_scale=1.0)
+    snoop(start, m, views, accepted, cutoff_sigma=2.0, min_scale=1.0)
     free_derivatives(b, replace(start, vector=start.vector * [1, 1, 1, 0]), m)
     for a, old in zip(given, before, strict=True):
         assert np.array_equal(a, old)

@@ -28,9 +28,10 @@ from pancam_graph.graph import Flex
 from pancam_graph.initialise import Start
 from pancam_graph.landmarks import SQUARED
 from pancam_graph.rigs import mer_navcam
-from pancam_graph.solve import Adjustment
+from pancam_graph.solve import Fitted
 from pancam_graph.solve import _alternation as alternation
 from support.elimination_reference import whole
+from support.solving import fitted
 
 SMALL = SimulationOptions(stops=2, pans=3, sweep_rad=1.5, points_per_image=15)
 LOOSE = Flex(rotation_rad=0.02, translation_m=5e-3)
@@ -136,8 +137,7 @@ def test_gains_shrink_as_fast_as_theory_says() -> None:
         loss="none",
         method="alternation",
     )
-    adjustment = Adjustment(traverse(), replace(options, max_iterations=40), None, None)
-    adjustment.solve()
+    adjustment = fitted(traverse(), replace(options, max_iterations=40))
     point = alternation._Point(adjustment.problem, SQUARED)
     panels = point.panels()
     S = whole(panels)[0]
@@ -253,10 +253,8 @@ CRITERIA: dict[str, tuple[dict[str, float], str]] = {
 
 
 @cache
-def ended(options: SolveOptions) -> Adjustment:
-    adjustment = Adjustment(traverse(), options, None, None)
-    adjustment.solve()
-    return adjustment
+def ended(options: SolveOptions) -> Fitted:
+    return fitted(traverse(), options)
 
 
 @pytest.mark.parametrize("name", CRITERIA)

@@ -15,7 +15,8 @@ from pancam_graph.initialise import Start
 from pancam_graph.landmarks import LossName
 from pancam_graph.rigs import Eye, Rig, mer_navcam
 from pancam_graph.simulate import Simulation
-from pancam_graph.solve import Adjustment, Problem
+from pancam_graph.solve import Problem, fit, prepare, screen
+from support.solving import fitted, solution_from
 
 SMALL = SimulationOptions(stops=2, pans=3, sweep_rad=1.5, points_per_image=15)
 NEAR_M = 20.0
@@ -91,15 +92,14 @@ def test_without_noise_the_truth_comes_back(model: str) -> None:
 @cache
 def solved(model: str) -> tuple[Problem, Solution, gtsam.Marginals]:
     """A solution with eliminated landmarks, and GTSAM's marginals of the explicit graph at it."""
-    adjustment = Adjustment(near(small(2)), to_the_end(model, landmark_covariances=True), None, None)
-    adjustment.solve()
+    adjustment = fitted(near(small(2)), to_the_end(model, landmark_covariances=True))
     problem = adjustment.problem
     assert isinstance(problem.template, SoftTemplate)
     explicit = ExplicitLandmarks(problem.template, problem.measurements)
     graph = gtsam.NonlinearFactorGraph(problem.factors)
     graph.push_back(explicit.factors(problem.kept))
     values = explicit.with_landmarks(problem.values, problem.points_m(), problem.present)
-    return problem, adjustment.solution(), gtsam.Marginals(graph, values)
+    return problem, solution_from(adjustment), gtsam.Marginals(graph, values)
 
 
 @pytest.mark.parametrize("model", ["mast", "circle", "free"])
@@ -353,10 +353,10 @@ def test_what_starts_beyond_infinity_comes_back(loss: LossName) -> None:
     """Telemetry three times as wrong as it says turns the rays of far landmarks apart."""
     options = replace(SMALL, noise_px=0.0, prior="truth", pointing_scale=3.0, reach_m=400.0)
     simulation = simulate(mer_navcam(), options, seed=3)
-    adjustment = Adjustment(simulation.traverse, SolveOptions(loss=loss), start_of(simulation), None)
-    assert (adjustment.problem.landmarks.vector[:, 3] < 0).sum() > 3
-    adjustment.solve()
-    solution = adjustment.solution()
+    prepared = prepare(simulation.traverse, SolveOptions(loss=loss), start_of(simulation))
+    assert (prepared.problem.landmarks.vector[:, 3] < 0).sum() > 3
+    adjustment = fit(screen(prepared))
+    solution = solution_from(adjustment)
     assert (adjustment.problem.landmarks.vector[:, 3] > 0).all()
     assert solution.used.all()
     assert solution.final.pan_tilt_rad == pytest.approx(simulation.truth.pan_tilt_rad, abs=1e-9)

@@ -12,9 +12,10 @@ from pancam_graph.data import Freedom, Sharing
 from pancam_graph.elimination import Panels
 from pancam_graph.graph import Flex, Model
 from pancam_graph.rigs import mer_navcam
-from pancam_graph.solve import Adjustment, Problem
+from pancam_graph.solve import Problem, prepare
 from pancam_graph.solve._joint import JointSystem, OnLastGroup
 from pancam_graph.solve._problem import system_of
+from support.solving import fitted
 
 OPTIONS = SimulationOptions(stops=3, spacing_m=4.0, pans=3, sweep_rad=0.9, points_per_image=15)
 RULE = StopRule(relative_decrease=1e-12)
@@ -25,7 +26,7 @@ def problem_of(model: Model, *, shared: bool = False) -> Problem:
     flex = None if model == "circle" else Flex(rotation_rad=0.02, translation_m=0.3)
     sharing = Sharing(calibration=Freedom(scope="eye", free=("focal",))) if shared else None
     options = SolveOptions(model=model, loss="none", flex=flex, sharing=sharing)
-    return Adjustment(simulate(mer_navcam(), OPTIONS, seed=3).traverse, options, None, None).problem
+    return prepare(simulate(mer_navcam(), OPTIONS, seed=3).traverse, options).problem
 
 
 def joint_of(problem: Problem) -> JointSystem:
@@ -95,13 +96,10 @@ def test_its_cost_is_the_true_one_wherever_it_stands(model: Model) -> None:
 
 def test_what_no_damping_lets_lower_the_cost_stays_where_it_is() -> None:
     """At an optimum; each bit of it."""
-    adjustment = Adjustment(
+    adjustment = fitted(
         simulate(mer_navcam(), OPTIONS, seed=3).traverse,
         SolveOptions(model="free", loss="none", relative_decrease=1e-14, max_iterations=100),
-        None,
-        None,
     )
-    adjustment.solve()
     problem = adjustment.problem
     joint = joint_of(problem)
     optimiser = OnLastGroup(joint, RULE)

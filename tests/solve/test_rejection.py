@@ -9,8 +9,8 @@ from scipy.stats import norm
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.landmarks import CameraViews, Measurements, rays_of, triangulate
 from pancam_graph.landmarks._landmarks import evaluate
-from pancam_graph.solve import screen
-from pancam_graph.solve._rejection import Screening
+from pancam_graph.solve import snoop
+from pancam_graph.solve._rejection import Snooping
 from support.landmark_scenes import measure, random_points, random_views, unit, views_at
 
 
@@ -21,11 +21,11 @@ def screened(
     *,
     cutoff_sigma: float = 4.0,
     min_scale: float = 1.0,
-) -> Screening:
+) -> Snooping:
     """Screening from linear triangulation of what is accepted, by default everything."""
     accepted = np.ones(len(m.row), dtype=bool) if accepted is None else accepted
     start = triangulate(*rays_of(m, views), m.landmark, accepted.astype(float))
-    return screen(start, m, views, accepted, cutoff_sigma=cutoff_sigma, min_scale=min_scale)
+    return snoop(start, m, views, accepted, cutoff_sigma=cutoff_sigma, min_scale=min_scale)
 
 
 def shifted(m: Measurements, rows: IntArray | list[int], by_px: FloatArray | list[float]) -> Measurements:
@@ -142,7 +142,7 @@ def test_a_track_that_had_lost_all_is_judged_anew() -> None:
         vector=np.where(lost[:, None], far_off.vector, start.vector),
         origin_m=np.where(lost[:, None], 0.0, start.origin_m),
     )
-    result = screen(start, m, views, before, cutoff_sigma=4.0, min_scale=1.0)
+    result = snoop(start, m, views, before, cutoff_sigma=4.0, min_scale=1.0)
     assert result.accepted.all()
 
 

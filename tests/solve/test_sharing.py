@@ -31,7 +31,7 @@ from pancam_graph.graph import ExplicitLandmarks, Flex, Model, SoftTemplate, Tie
 from pancam_graph.initialise import Start
 from pancam_graph.rigs import Eye, Rig, exomars_pancam, mer_navcam
 from pancam_graph.simulate import Simulation
-from pancam_graph.solve import Adjustment
+from support.solving import fitted, solution_from
 
 FOCAL = ("focal",)
 WRONG = {"focal_error": 3e-3, "mount_error_rad": 2e-3, "mount_error_m": 2e-3}
@@ -487,9 +487,8 @@ def test_a_hard_tie_has_the_explicit_optimum_too() -> None:
 
 @pytest.mark.parametrize("name", ["mounts per stop and axis", "calibration, circle", "calibration, free"])
 def test_sigmas_are_gtsams(name: str) -> None:
-    adjustment = Adjustment(near(), options_of(name), None, None)
-    adjustment.solve()
-    problem, solution = adjustment.problem, adjustment.solution()
+    adjustment = fitted(near(), options_of(name))
+    problem, solution = adjustment.problem, solution_from(adjustment)
     assert isinstance(problem.template, SoftTemplate)
     explicit = ExplicitLandmarks(problem.template, problem.measurements)
     graph = explicit.calibrations.in_place(problem.factors)

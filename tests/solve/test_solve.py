@@ -24,7 +24,7 @@ from pancam_graph.graph import ExplicitLandmarks, Flex, SoftTemplate
 from pancam_graph.initialise import Start
 from pancam_graph.rigs import TEMPLATES, Eye, Rig, mer_navcam
 from pancam_graph.simulate import Simulation
-from pancam_graph.solve import Adjustment
+from support.solving import fitted, solution_from
 
 SMALL = SimulationOptions(stops=2, pans=3, sweep_rad=1.5, points_per_image=15)
 
@@ -134,9 +134,8 @@ def test_covariances_agree_with_gtsam_marginals() -> None:
     near = t.with_observations(t.observations.select((distance < 20.0)[t.observations.track]))
     flex = Flex(rotation_rad=1e-7, translation_m=1e-6)
     options = SolveOptions(loss="none", landmarks="explicit", tie="soft", flex=flex)
-    adjustment = Adjustment(near, options, None, None)
-    adjustment.solve()
-    solution = adjustment.solution()
+    adjustment = fitted(near, options)
+    solution = solution_from(adjustment)
     problem = adjustment.problem
     assert isinstance(problem.template, SoftTemplate)
     explicit = ExplicitLandmarks(problem.template, problem.measurements)

@@ -15,9 +15,10 @@ from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.graph import ExplicitLandmarks, Flex, SoftTemplate, read_variable
 from pancam_graph.initialise import Start
 from pancam_graph.rigs import mer_navcam
-from pancam_graph.solve import Adjustment, OnGraph, Problem
+from pancam_graph.solve import Fitted, OnGraph, Problem, judge
 from pancam_graph.solve._optimise import Optimiser, _is_settled
 from pancam_graph.solve._stopping import criteria
+from support.solving import fitted, solution_from
 
 SMALL = SimulationOptions(stops=2, pans=2, sweep_rad=0.8, points_per_image=12)
 BARE = SolveOptions(loss="none", relative_decrease=0.0, residual_sigmas=0.0)
@@ -42,21 +43,19 @@ def traverse() -> Traverse:
 
 
 @cache
-def ended(options: SolveOptions) -> Adjustment:
-    adjustment = Adjustment(traverse(), options, None, None)
-    adjustment.solve()
-    return adjustment
+def ended(options: SolveOptions) -> Fitted:
+    return fitted(traverse(), options)
 
 
-def shortened(options: SolveOptions) -> Adjustment:
+def shortened(options: SolveOptions) -> Fitted:
     """The same solve, of which the last iteration is left out."""
     limit = last_run(ended(options)) - 1
     return ended(replace(options, max_iterations=limit))
 
 
-def last_run(adjustment: Adjustment) -> int:
+def last_run(adjustment: Fitted) -> int:
     """Iterations of the final least squares alone, told by how many it needs at least."""
-    options, full = adjustment.options, adjustment.outcome
+    options, full = adjustment.screened.prepared.options, adjustment.outcome
     for limit in range(1, 200):
         outcome = ended(replace(options, max_iterations=limit)).outcome
         if outcome.converged:
@@ -102,8 +101,7 @@ def test_without_any_criterion_only_the_lack_of_a_better_step_ends_it(solver: st
 
 def test_what_is_left_at_its_default_ends_nothing_early() -> None:
     """Of the five only the limit and the relative decrease end a solve that has noise."""
-    default = Adjustment(traverse(), SolveOptions(loss="none"), None, None)
-    default.solve()
+    default = fitted(traverse(), SolveOptions(loss="none"))
     assert default.outcome.reason == "relative decrease below 1e-07"
     assert default.outcome.costs == ended(replace(BARE, relative_decrease=1e-7)).outcome.costs
 
@@ -152,8 +150,7 @@ def test_the_gradient_of_explicit_landmarks_is_that_of_gtsams_error() -> None:
     t = traverse()
     assert t.observations is not None
     few = t.with_observations(t.observations.select(t.observations.track % 6 == 0))
-    adjustment = Adjustment(few, replace(SOLVERS["explicit"], max_iterations=1), None, None)
-    adjustment.solve()
+    adjustment = fitted(few, replace(SOLVERS["explicit"], max_iterations=1))
     problem = adjustment.problem
     assert isinstance(problem.template, SoftTemplate)
     explicit = ExplicitLandmarks(problem.template, problem.measurements)
@@ -195,23 +192,22 @@ def test_residuals_are_those_per_observation() -> None:
 
 
 def test_at_the_optimum_the_gradient_ends_it_before_the_first_step() -> None:
-    found = ended(BARE)
-    start = Start(world_T_mast=found.final.world_T_mast, pan_tilt_rad=found.final.pan_tilt_rad)
-    again = Adjustment(traverse(), replace(BARE, max_gradient=1.0), start, None)
-    again.solve()
+    optimum = ended(BARE)
+    state = judge(optimum).state
+    start = Start(world_T_mast=state.world_T_mast, pan_tilt_rad=state.pan_tilt_rad)
+    again = fitted(traverse(), replace(BARE, max_gradient=1.0), start)
     assert len(again.outcome.costs) == 1
-    assert again.solution().converged
-    assert again.solution().cost_final == pytest.approx(found.outcome.costs[-1], rel=1e-12)
+    assert solution_from(again).converged
+    assert solution_from(again).cost_final == pytest.approx(optimum.outcome.costs[-1], rel=1e-12)
 
 
 def test_vanishing_residuals_end_it() -> None:
     exact = simulate(mer_navcam(), replace(SMALL, noise_px=0.0, prior="truth"), seed=3)
     telemetry = exact.telemetry_start
     start = Start(world_T_mast=telemetry.world_T_mast, pan_tilt_rad=telemetry.pan_tilt_rad)
-    adjustment = Adjustment(exact.traverse, replace(BARE, residual_sigmas=1e-6), start, None)
-    adjustment.solve()
+    adjustment = fitted(exact.traverse, replace(BARE, residual_sigmas=1e-6), start)
     assert adjustment.outcome.reason == "residuals below 1e-06 sigma"
-    n = len(adjustment.observations)
+    n = len(adjustment.screened.prepared.observations)
     assert adjustment.outcome.costs[-1] <= n * 1e-12 / 2 < adjustment.outcome.costs[-2]
 
 

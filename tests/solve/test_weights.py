@@ -20,7 +20,8 @@ from pancam_graph.initialise import Start
 from pancam_graph.results._residuals_csv import residuals_csv
 from pancam_graph.rigs import Eye, Rig, mer_navcam
 from pancam_graph.simulate import Simulation
-from pancam_graph.solve import Adjustment
+from pancam_graph.solve import prepare
+from pancam_graph.solve._screen import ScreeningRounds
 
 SMALL = SimulationOptions(stops=2, pans=3, sweep_rad=1.5, points_per_image=15, noise_stretch=5.0)
 NEAR_M = 20.0
@@ -264,9 +265,9 @@ def test_without_noise_the_truth_comes_back(rig: str) -> None:
 def test_the_narrow_axis_of_an_ellipse_bears_the_errors_of_telemetry_at_the_start() -> None:
     """Widened as the mean sigma is, it would not: a share of good observations would go at once."""
     simulation = simulate(mer_navcam(), replace(SMALL, noise_stretch=20.0, pointing_scale=3.0), seed=1)
-    adjustment = Adjustment(simulation.traverse, SolveOptions(), None, None)
-    adjustment._screen_at_start()
-    assert adjustment.problem.accepted.mean() > 0.999
+    rounds = ScreeningRounds(prepare(simulation.traverse, SolveOptions()))
+    rounds.from_telemetry()
+    assert rounds.problem.accepted.mean() > 0.999
 
 
 @pytest.mark.parametrize("stretch", [5.0, 20.0])

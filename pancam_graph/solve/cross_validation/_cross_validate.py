@@ -24,12 +24,15 @@ from pancam_graph.data import (
 )
 from pancam_graph.elimination import Covariance
 from pancam_graph.initialise import Start
-from pancam_graph.solve._adjustment import Adjustment
 from pancam_graph.solve._covariance import covariance_of
 from pancam_graph.solve._diagnose import listed
+from pancam_graph.solve._fit import fit, refitted
+from pancam_graph.solve._judge import regular_problem, state_of
 from pancam_graph.solve._options import SolveOptions
+from pancam_graph.solve._prepare import prepare
 from pancam_graph.solve._problem import Problem, system_of
 from pancam_graph.solve._reduced import ReducedSystem
+from pancam_graph.solve._screen import screen
 from pancam_graph.solve._solve import solve
 from pancam_graph.solve.cross_validation._halves import Groups, neighbours, random_half, upper_half
 
@@ -149,28 +152,24 @@ class _Whole:
         if solution.covariance_px2 is not None:
             kept = kept.with_covariance(solution.covariance_px2[used])
         self.traverse = solution.traverse.with_observations(kept)
-        self.adjustment = Adjustment(
-            self.traverse,
-            replace(
-                options,
-                loss="none",
-                rescale_noise=False,
-                landmark_covariances=False,
-                relative_decrease=min(options.relative_decrease, _RELATIVE_DECREASE),
-            ),
-            Start(world_T_mast=final.world_T_mast, pan_tilt_rad=final.pan_tilt_rad),
-            None,
+        options = replace(
+            options,
+            loss="none",
+            rescale_noise=False,
+            landmark_covariances=False,
+            relative_decrease=min(options.relative_decrease, _RELATIVE_DECREASE),
         )
-        self.adjustment.solve()
-        self.problem, self.regular = self.adjustment.problem, self.adjustment.regular
-        self.state = self.adjustment.final
+        start = Start(world_T_mast=final.world_T_mast, pan_tilt_rad=final.pan_tilt_rad)
+        self.fitted = fit(screen(prepare(self.traverse, options, start)))
+        self.problem, self.regular = self.fitted.problem, regular_problem(self.fitted)
+        self.state = state_of(self.problem)
         n_tracks = int(self.problem.present.sum())
         if n_tracks < _FEWEST_TRACKS:
             raise InputError(
                 f"cross-validation: expected {_FEWEST_TRACKS} used tracks or more to halve, found {n_tracks}"
             )
         self.warnings: list[str] = []
-        if not (solution.converged and self.adjustment.outcome.converged):
+        if not (solution.converged and self.fitted.outcome.converged):
             self.warnings.append("the solution has not converged: halves differ for that too")
         self.frames, self.stops = self.groups(self.problem)
         self.pairs, self.pair_tracks = neighbours(self.traverse, self.problem)
@@ -249,7 +248,7 @@ class _Half:
         if not (self.landmarks & whole.problem.present).any():
             return _nothing(whole, "no track is of it")
         try:
-            problem, outcome = whole.adjustment.with_only(self.landmarks)
+            problem, outcome = refitted(whole.fitted, self.landmarks)
         except SolveError as error:
             return _nothing(whole, str(error))
         if not outcome.converged:
@@ -334,7 +333,7 @@ def _score(whole: _Whole, splitting: Splitting, number: int, own: _Half, other: 
         rows = p.kept & which[m.landmark]
         scored, n = int(which.sum()), int(rows.sum())
         if n > 0:
-            noise = whole.adjustment.noise.select(m.row[rows])
+            noise = whole.fitted.noise.select(m.row[rows])
             part = whole.part(which)
             system, _ = system_of(part, cliques=whole.cliques)
             panels = system.linearise(part.template.posture(part.values))

@@ -1,0 +1,122 @@
+"""Stage 3, fit: least squares over the observations that are used."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pancam_graph.base.geometry import BoolArray
+from pancam_graph.data import PixelNoise
+from pancam_graph.solve._carrying import carried_again, is_carried_anew
+from pancam_graph.solve._eliminated import EliminatedSolver, Ended
+from pancam_graph.solve._optimise import Outcome
+from pancam_graph.solve._prepare import solver_for
+from pancam_graph.solve._problem import Problem
+from pancam_graph.solve._screen import Screened
+
+__all__ = ["Fitted", "fit", "fitted_elsewhere", "refitted"]
+
+_ROUNDS = 6
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Fitted:
+    """The least-squares optimum of a screened problem."""
+
+    screened: Screened
+    problem: Problem
+    """At the optimum."""
+    outcome: Outcome
+    """How the iterations ended; costs of all rounds."""
+    noise: PixelNoise
+    """Noise of all observations, rescaled where residuals decide how large it is."""
+    behind: BoolArray
+    """(observations,) whether each was given up because its landmark came to lie behind the camera."""
+    ended: Ended | None
+    """The solver's own record of where it ended; None where landmarks are explicit, or no fit was made."""
+
+
+def fit(screened: Screened) -> Fitted:
+    """Least squares over what is accepted, until neither noise scale nor carried pixels move any more.
+
+    Raises SolveError where the system has a direction that nothing holds however much it is damped.
+    """
+    prepared, problem = screened.prepared, screened.problem
+    solver = solver_for(prepared.options, prepared.on_iteration, is_near=screened.is_near)
+    noise, behind = prepared.noise, np.zeros(len(prepared.observations), dtype=bool)
+    costs: list[float] = []
+    for _ in range(_ROUNDS):
+        before = problem.accepted
+        problem, outcome = solver.adjust(problem, prepared.options)
+        behind[problem.measurements.row[before & ~problem.accepted]] = True
+        costs += outcome.costs[1:] if costs else outcome.costs
+        ended = problem
+        if is_carried_anew(problem):
+            problem = carried_again(problem, prepared.observations, noise)
+        moved = problem is not ended
+        if prepared.rescales_noise:
+            factor = noise_factor(problem)
+            noise = noise.scaled(factor)
+            problem = replace(problem, measurements=problem.measurements.scaled(factor))
+            moved |= abs(factor - 1) > 1e-3
+        if not (moved and outcome.converged):
+            break
+    return Fitted(
+        screened=screened,
+        problem=problem,
+        outcome=replace(outcome, costs=tuple(costs)),
+        noise=noise,
+        behind=behind,
+        ended=solver.last if isinstance(solver, EliminatedSolver) else None,
+    )
+
+
+def fitted_elsewhere(screened: Screened, costs: Sequence[float], reason: str) -> Fitted:
+    """A problem that was fitted elsewhere, over what it accepts: `costs` on the way, and why that ended.
+
+    Where residuals decide how large the noise is, or pixels depend on the range, the rounds of `fit` follow.
+    """
+    prepared, problem = screened.prepared, screened.problem
+    if prepared.rescales_noise or problem.template.rig_variables.pupil_moves:
+        if is_carried_anew(problem):
+            problem = carried_again(problem, prepared.observations, prepared.noise)
+        fitted = fit(replace(screened, problem=problem))
+        outcome = fitted.outcome
+        return replace(
+            fitted,
+            outcome=replace(outcome, reason=f"{reason}; {outcome.reason}", costs=(*costs, *outcome.costs)),
+        )
+    return Fitted(
+        screened=screened,
+        problem=problem,
+        outcome=Outcome(values=problem.values, converged=True, reason=reason, costs=tuple(costs)),
+        noise=prepared.noise,
+        behind=np.zeros(len(prepared.observations), dtype=bool),
+        ended=None,
+    )
+
+
+def refitted(fitted: Fitted, landmarks: BoolArray) -> tuple[Problem, Outcome]:
+    """Least squares over some landmarks (landmarks,), from where a fit ended.
+
+    From there, so that of several optima it is the one near by; anew from afar where that does not converge,
+    since steps with a firm tie are short. Pixels of moving pupils stay carried as they are.
+    """
+    prepared, whole = fitted.screened.prepared, fitted.problem
+    part = replace(whole, accepted=whole.accepted & landmarks[whole.measurements.landmark])
+    for is_near in (True, False):
+        problem, outcome = solver_for(prepared.options, is_near=is_near).adjust(part, prepared.options)
+        if outcome.converged:
+            break
+    return problem, outcome
+
+
+def noise_factor(problem: Problem) -> float:
+    """By how much residuals exceed the noise assumed: the square root of the variance factor."""
+    rows = problem.kept
+    residual, _ = problem.residuals()
+    # Priors add as many equations as they have unknowns, but for what observations say on top of them.
+    freedom = 2 * int(rows.sum()) - 3 * int(problem.present.sum())
+    if freedom < 1:
+        return 1.0
+    return float(np.sqrt(np.sum(residual[rows] ** 2) / freedom).clip(1e-3))

@@ -1,0 +1,147 @@
+"""Stage 4, judge: how sure an optimum is, and what speaks against it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pancam_graph.base.errors import SolveError
+from pancam_graph.base.geometry import BoolArray
+from pancam_graph.data import State
+from pancam_graph.graph import HardTemplate, SoftTemplate
+from pancam_graph.landmarks import refine
+from pancam_graph.solve._covariance import Uncertainty, uncertainty
+from pancam_graph.solve._diagnose import connection_warnings, listed
+from pancam_graph.solve._fit import Fitted
+from pancam_graph.solve._problem import Problem
+from pancam_graph.solve._reduced import ReducedSystem
+
+__all__ = ["Judged", "judge", "reduced_of", "regular_problem", "state_of"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Judged:
+    """A fit with its uncertainties and warnings."""
+
+    fitted: Fitted
+    state: State
+    """At the optimum."""
+    uncertainty: Uncertainty
+    used: BoolArray
+    """(observations,) whether each took part in the fit."""
+    warnings: tuple[str, ...]
+    """Those of all stages."""
+
+
+def judge(fitted: Fitted) -> Judged:
+    """Covariances at the optimum, and warnings of what a user should know before believing it."""
+    prepared, problem = fitted.screened.prepared, fitted.problem
+    state = state_of(problem)
+    covariances, warnings = _uncertainty(fitted, state)
+    used = np.zeros(len(prepared.observations), dtype=bool)
+    used[problem.measurements.row[problem.kept]] = True
+    return Judged(
+        fitted=fitted,
+        state=state,
+        uncertainty=covariances,
+        used=used,
+        warnings=(
+            *prepared.warnings,
+            *warnings,
+            *_fit_warnings(fitted, used),
+            *connection_warnings(prepared.traverse, used),
+        ),
+    )
+
+
+def state_of(problem: Problem) -> State:
+    """The state of a problem; points that take no part are NaN."""
+    points = np.where(problem.present[:, None], problem.points_m(), np.nan)
+    return problem.template.state(problem.values, points, problem.views)
+
+
+def regular_problem(fitted: Fitted) -> Problem:
+    """The problem as covariances are taken from it."""
+    prepared, problem = fitted.screened.prepared, fitted.problem
+    if prepared.options.firm_tie == "hard" and isinstance(problem.template, SoftTemplate):
+        # The inverse of a system with a tie of 1e-8 would have lost half its digits.
+        return problem.on(HardTemplate(prepared.traverse, prepared.sharing))
+    return problem
+
+
+def reduced_of(fitted: Fitted, problem: Problem) -> ReducedSystem:
+    """`regular_problem` with landmarks eliminated; the fit's own system where the problem is the fit's."""
+    if fitted.ended is not None and fitted.ended.problem is problem:
+        return fitted.ended.reduced()
+    return ReducedSystem.of(problem)
+
+
+def _uncertainty(fitted: Fitted, state: State) -> tuple[Uncertainty, list[str]]:
+    """Covariances, NaN where a direction is free; and warnings of what is free or badly known."""
+    prepared, problem = fitted.screened.prepared, regular_problem(fitted)
+    t, wanted = prepared.traverse, prepared.options.landmark_covariances
+    # Radii of circles are free unasked: what holds them is then no news.
+    asked = (prepared.options.sharing or t.sharing) is not None
+    try:
+        covariances = uncertainty(problem, state, reduced_of(fitted, problem), landmarks=wanted, unseen=asked)
+    except SolveError as error:
+        return _unknown(fitted), [f"no uncertainties: {error}"]
+    warnings = []
+    if covariances.unseen:
+        warnings.append(
+            f"images say next to nothing of {listed(covariances.unseen, 'direction')} of the rig: telemetry "
+            "and priors hold them, and their sigmas are as good as these"
+        )
+    tracks = [str(track) for track in prepared.landmark_track[covariances.undetermined]]
+    if tracks:
+        warnings.append(
+            f"{listed(tracks, 'track')}: their rays leave the place of the point open; "
+            "they tell where cameras point, and a weak prior holds the point"
+        )
+    return covariances, warnings
+
+
+def _unknown(fitted: Fitted) -> Uncertainty:
+    """NaN for every covariance."""
+    prepared = fitted.screened.prepared
+    t, n = prepared.traverse, len(prepared.landmark_track)
+    return Uncertainty(
+        stop_covariance=np.full((len(t.stops), 6, 6), np.nan),
+        angle_sigma_rad=np.full((len(t.frames), 2), np.nan),
+        landmark_covariance_m2=np.full((n, 3, 3), np.nan) if prepared.options.landmark_covariances else None,
+        undetermined=np.zeros(n, dtype=bool),
+        rig_sigmas=None,
+    )
+
+
+def _fit_warnings(fitted: Fitted, used: BoolArray) -> list[str]:
+    """Warnings of observations that a fit gave up, or keeps against the odds."""
+    prepared, warnings = fitted.screened.prepared, []
+    n_behind = int(fitted.behind.sum())
+    if n_behind:
+        warnings.append(f"{n_behind} observations of landmarks behind a camera: left out")
+    diverging = [str(track) for track in prepared.landmark_track[_diverging(fitted.problem)]]
+    if diverging:
+        warnings.append(
+            f"{listed(diverging, 'track')}: rays diverge by more than noise, as wrong matches do; "
+            "kept, as points beyond infinity"
+        )
+    share = 1 - used.sum() / len(used)
+    if prepared.options.loss != "none" and share > 0.3:
+        warnings.append(
+            f"{share:.0%} of the observations were rejected; check matches, rig and telemetry sigmas"
+        )
+    return warnings
+
+
+def _diverging(problem: Problem) -> BoolArray:
+    """Landmarks (landmarks,) that would fit worse by 3 sigma if they were no further than infinity."""
+    beyond = problem.present & (problem.landmarks.vector[:, 3] < 0)
+    if beyond.any():
+        m, rows = problem.measurements, np.flatnonzero(beyond)
+        weight = problem.accepted.astype(float)
+        bound = replace(
+            problem, landmarks=refine(problem.landmarks, m, problem.views, weight, only=rows)
+        ).residuals()[0]
+        excess = weight * np.sum(bound**2 - problem.residuals()[0] ** 2, axis=1)
+        beyond &= np.bincount(m.landmark, excess, minlength=m.n_landmarks) > 9.0
+    return beyond

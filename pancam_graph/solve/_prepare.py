@@ -1,0 +1,218 @@
+"""Stage 1, prepare: measurements, the rig as variables and factors, and the values a solve starts from."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from pancam_graph.base.errors import InputError, SolveError
+from pancam_graph.base.geometry import BoolArray, IntArray
+from pancam_graph.data import Observations, PixelNoise, RigCorrection, Sharing, State, Traverse
+from pancam_graph.graph import RIGID, FactorTemplate, HardTemplate, ProjectiveTemplate, SoftTemplate
+from pancam_graph.initialise import FreeCameras, Start, start_from_telemetry
+from pancam_graph.landmarks import Landmarks, Measurements, rays_of, residuals, triangulate
+from pancam_graph.solve._alternation import AlternatingSolver
+from pancam_graph.solve._carrying import carry, first_ranges_m
+from pancam_graph.solve._eliminated import EliminatedSolver
+from pancam_graph.solve._explicit import ExplicitSolver
+from pancam_graph.solve._optimise import Iteration
+from pancam_graph.solve._options import Method, SolveOptions
+from pancam_graph.solve._problem import Problem, Solver, reach_m
+
+__all__ = ["Prepared", "Reasons", "prepare", "solver_for", "triangulated"]
+
+Reasons = NDArray[np.object_]
+"""(observations,) why each was left out, in the words of `Solution.reason`; "" where it was not."""
+
+_SOLVERS: dict[Method, type[EliminatedSolver]] = {
+    "joint": EliminatedSolver,
+    "alternation": AlternatingSolver,
+}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Prepared:
+    """A traverse as a problem to solve: nothing is screened or adjusted yet."""
+
+    traverse: Traverse
+    """The input; it has observations."""
+    options: SolveOptions
+    sharing: Sharing
+    """Which numbers of the rig are free, as the model takes them."""
+    problem: Problem
+    """Cameras at the start, each landmark where it fits them best, every measurement accepted."""
+    landmark_track: IntArray
+    """(landmarks,) track number of each landmark of the problem."""
+    noise: PixelNoise
+    """Noise of all observations, as the traverse states it."""
+    reason: Reasons
+    """Observations that are no measurements of the problem: `outside` a camera's domain, or `single`."""
+    is_near: bool
+    """Whether the cameras of the start were given one by one, so that no rigid mast is fitted first."""
+    warnings: tuple[str, ...]
+    on_iteration: Callable[[Iteration], None] | None
+    """Told of every iteration of the stages to come."""
+
+    @property
+    def observations(self) -> Observations:
+        """The traverse's observations."""
+        assert self.traverse.observations is not None  # `prepare` has looked
+        return self.traverse.observations
+
+    @property
+    def rescales_noise(self) -> bool:
+        """Whether residuals decide how large the noise is, not the sigmas that observations came with."""
+        wanted = self.options.rescale_noise
+        return self.observations.origin == "images" if wanted is None else wanted
+
+
+def prepare(
+    traverse: Traverse,
+    options: SolveOptions,
+    start: Start | None = None,
+    on_iteration: Callable[[Iteration], None] | None = None,
+) -> Prepared:
+    """Observations of tracks that are seen twice or more as measurements, and first values of everything.
+
+    `start` gives the first stops, angles and cameras; default: telemetry's. Raises InputError for a traverse
+    without observations, for given cameras that are not one an image, and for options that the traverse
+    cannot serve; SolveError where no track is seen twice.
+    """
+    if traverse.observations is None:
+        raise InputError(
+            "observations: expected some, found none; find them in the images first (find_observations)"
+        )
+    start = start or start_from_telemetry(traverse)
+    cameras = start.cameras if options.model in {"free", "projective"} else None
+    sharing = (options.sharing or traverse.sharing or Sharing()).for_model(options.model)
+    template = _template(traverse, options, sharing)
+    solver_for(options).require(template)
+    values = template.values(_first_state(traverse, start, cameras))
+    measurements, track, reason = _measure(traverse.observations, template, values)
+    n = measurements.n_landmarks
+    problem = Problem(
+        template=template,
+        factors=template.factors(),
+        measurements=measurements,
+        accepted=np.ones(len(measurements.row), dtype=bool),
+        values=values,
+        landmarks=Landmarks(vector=np.zeros((n, 4)), origin_m=np.zeros((n, 3))),
+    )
+    return Prepared(
+        traverse=traverse,
+        options=options,
+        sharing=sharing,
+        problem=triangulated(problem).placed(),
+        landmark_track=track,
+        noise=traverse.observations.noise,
+        reason=reason,
+        is_near=cameras is not None,
+        warnings=(*traverse.warnings, *start.warnings, *_left_out_warnings(traverse.observations, reason)),
+        on_iteration=on_iteration,
+    )
+
+
+def solver_for(
+    options: SolveOptions,
+    on_iteration: Callable[[Iteration], None] | None = None,
+    *,
+    is_near: bool = False,
+) -> Solver:
+    """A new solver of the kind that the options ask for; `is_near`: its first fit starts near the optimum."""
+    if options.landmarks == "explicit":
+        return ExplicitSolver(on_iteration)
+    return _SOLVERS[options.method](on_iteration, is_near=is_near)
+
+
+def triangulated(problem: Problem) -> Problem:
+    """Landmarks by linear triangulation; one behind a camera starts far off, where its cameras look."""
+    m, views, weight = problem.measurements, problem.views, problem.accepted.astype(float)
+    centre, direction = rays_of(m, views)
+    landmarks = triangulate(centre, direction, m.landmark, weight)
+    _, in_front = residuals(landmarks, m, views)
+    behind = np.bincount(m.landmark, ~in_front & (weight > 0), minlength=m.n_landmarks) > 0
+    problem = replace(problem, landmarks=landmarks)
+    if not behind.any():
+        return problem
+    mean = np.add.reduceat(weight[:, None] * direction, m.starts)
+    ahead = landmarks.moved_to(landmarks.origin_m + reach_m(problem)[:, None] * mean)
+    vector = np.where(behind[:, None], ahead.vector, landmarks.vector)
+    return replace(problem, landmarks=replace(landmarks, vector=vector))
+
+
+def _template(traverse: Traverse, options: SolveOptions, sharing: Sharing) -> FactorTemplate:
+    """The rig as variables and factors, as the options have it."""
+    if options.model == "projective":
+        return ProjectiveTemplate(traverse, options.firm_flex, normalise=options.normalise)
+    if options.firm_tie == "soft":
+        return SoftTemplate(traverse, options.model, options.firm_flex, sharing)
+    if options.landmarks == "eliminated":
+        return HardTemplate(traverse, sharing)
+    # GTSAM's projections want camera poses: a tie far below what images can tell makes them rigid.
+    return SoftTemplate(traverse, options.model, RIGID, sharing)
+
+
+def _first_state(traverse: Traverse, start: Start, cameras: FreeCameras | None) -> State:
+    """The state at the start: cameras where they are given, or else where masts and angles put them."""
+    rotations, centres = traverse.camera_poses(start.world_T_mast, start.pan_tilt_rad)
+    rig = None
+    if cameras is not None:
+        if len(cameras.centre_m) != len(traverse.images):
+            raise InputError(
+                f"start: cameras: expected {len(traverse.images)}, one for each image, "
+                f"found {len(cameras.centre_m)}"
+            )
+        rotations, centres = cameras.world_R_camera, cameras.centre_m
+        rig = RigCorrection.to_calibrations(traverse, cameras.calibration)
+    return State(
+        world_T_mast=start.world_T_mast,
+        pan_tilt_rad=start.pan_tilt_rad,
+        world_R_camera=rotations,
+        world_t_camera=centres,
+        landmarks_m=np.zeros((0, 3)),
+        rig=rig,
+    )
+
+
+def _measure(
+    observations: Observations, template: FactorTemplate, values: gtsam.Values
+) -> tuple[Measurements, IntArray, Reasons]:
+    """Observations of tracks seen twice or more as pinhole pixels, the track of each landmark, and reasons.
+
+    Raises SolveError where no track is seen twice.
+    """
+    uv_px, turn, valid = carry(observations, first_ranges_m(observations), template.rig_variables, values)
+    _, track = np.unique(observations.track, return_inverse=True)
+    single = valid & (np.bincount(track, valid)[track] < 2)
+    reason = np.full(len(observations), "", dtype=object)
+    reason[~valid], reason[single] = "outside", "single"
+    rows = np.flatnonzero(valid & ~single)
+    if len(rows) == 0:
+        raise SolveError("observations: expected tracks seen in two or more images, found none")
+    rows = rows[np.lexsort((observations.image[rows], observations.track[rows]))]
+    landmark_track, landmark = np.unique(observations.track[rows], return_inverse=True)
+    measurements = Measurements(
+        row=rows,
+        image=observations.image[rows],
+        landmark=landmark.astype(np.int64),
+        uv_px=uv_px[rows],
+        whitening=observations.noise.select(rows).whiten(turn[rows]),
+    )
+    return measurements, landmark_track, reason
+
+
+def _left_out_warnings(observations: Observations, reason: Reasons) -> list[str]:
+    """Warnings of observations that are no measurements."""
+    warnings = []
+    single: BoolArray = reason == "single"
+    n_single = int(single.sum())
+    if n_single:
+        warnings.append(
+            f"{n_single} track{'s' if n_single != 1 else ''} seen once: left out, one ray places nothing"
+        )
+    n_outside = int((reason == "outside").sum())
+    if n_outside:
+        warnings.append(f"{n_outside} observations outside the domain of their camera model: left out")
+    return warnings

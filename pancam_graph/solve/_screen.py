@@ -1,0 +1,158 @@
+"""Stage 2, screen: which observations are used, and which are outliers."""
+
+import logging
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from pancam_graph.base.geometry import BoolArray, FloatArray
+from pancam_graph.landmarks import loss_of, refine
+from pancam_graph.solve._prepare import Prepared, solver_for, triangulated
+from pancam_graph.solve._problem import Problem, Solver
+from pancam_graph.solve._rejection import Snooping, snoop
+from pancam_graph.solve._stopping import StopRule
+
+__all__ = ["Screened", "ScreeningRounds", "screen", "screened_elsewhere"]
+
+_LOG = logging.getLogger(__name__)
+
+_ROUNDS = 12
+_ABOUT = 0.002
+"""The first pass ends when no more than this share of the observations changes."""
+_GROSS = 3.0
+"""The second pass begins with what is within this many times the cutoff."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Screened:
+    """A prepared problem with its outliers set aside."""
+
+    prepared: Prepared
+    problem: Problem
+    """Cameras about where they fit; the measurements to use are accepted."""
+    set_aside: BoolArray
+    """(observations,) whether each was an outlier in any round, also if it was accepted again later."""
+    is_near: bool
+    """Whether the cameras were adjusted already, so that no rigid mast is fitted first."""
+
+
+def screen(prepared: Prepared) -> Screened:
+    """Outliers set aside by robust adjustment and data snooping in turn; with the loss "none", nothing is.
+
+    Two passes: what is kept should depend on the images, not on the way from the start. So the first only
+    brings the cameras near; the second begins there with all observations but the grossest outliers.
+    """
+    if prepared.options.loss == "none":
+        n = len(prepared.observations)
+        return Screened(
+            prepared=prepared,
+            problem=prepared.problem,
+            set_aside=np.zeros(n, dtype=bool),
+            is_near=prepared.is_near,
+        )
+    rounds = ScreeningRounds(prepared)
+    rounds.from_telemetry()
+    rounds.to_the_end()
+    return Screened(prepared=prepared, problem=rounds.problem, set_aside=rounds.set_aside, is_near=True)
+
+
+def screened_elsewhere(prepared: Prepared, values: gtsam.Values, used: BoolArray) -> Screened:
+    """The prepared problem at values that were estimated elsewhere, with the observations (n,) used there."""
+    accepted = used[prepared.problem.measurements.row]
+    problem = triangulated(replace(prepared.problem, accepted=accepted, values=values)).placed()
+    return Screened(
+        prepared=prepared, problem=problem, set_aside=np.zeros(len(used), dtype=bool), is_near=True
+    )
+
+
+class ScreeningRounds:
+    """Rounds of robust adjustment and data snooping: the problem as it stands, and what was set aside."""
+
+    def __init__(self, prepared: Prepared) -> None:
+        self._prepared = prepared
+        self._solver: Solver = solver_for(prepared.options, prepared.on_iteration, is_near=prepared.is_near)
+        self.problem = prepared.problem
+        self.set_aside = np.zeros(len(prepared.observations), dtype=bool)
+
+    def from_telemetry(self) -> None:
+        """Set gross outliers aside at the start, where errors of telemetry add to the noise."""
+        problem, widened = self.problem, self._prepared.noise.select(self.problem.measurements.row)
+        m = problem.measurements
+        whitening = widened.widened(_telemetry_px(problem)).whiten(widened.to_pixels(m.whitening))
+        self._adopt(
+            snoop(
+                problem.landmarks,
+                replace(m, whitening=whitening),
+                problem.views,
+                problem.accepted,
+                cutoff_sigma=self._prepared.options.outlier_sigma,
+                min_scale=1.0,  # telemetry errors are common to a frame: a small median must exclude none
+            )
+        )
+
+    def to_the_end(self) -> None:
+        """Robust adjustment and data snooping in turn, in two passes, until the same observations stay."""
+        cutoff, scale = self._prepared.options.outlier_sigma, 1.0
+        for _ in range(_ROUNDS):
+            scale, n_changed = self._round(scale, cutoff, relative_decrease=1e-3)
+            if n_changed <= _ABOUT * len(self.problem.accepted):
+                break
+        self.problem = replace(self.problem, accepted=np.ones_like(self.problem.accepted))
+        self._snoop(_GROSS * cutoff)
+        for _ in range(_ROUNDS):
+            before = scale
+            scale, n_changed = self._round(scale, cutoff, relative_decrease=1e-6)
+            if n_changed == 0 and abs(scale - before) < 1e-3 * scale:
+                break
+
+    def _round(self, scale: float, cutoff_sigma: float, *, relative_decrease: float) -> tuple[float, int]:
+        """One robust adjustment and snooping: the noise scale, and how many observations came or went."""
+        rule = StopRule(max_iterations=20, relative_decrease=relative_decrease)
+        loss = loss_of(self._prepared.options.loss, scale)
+        self.problem = self._solver.approach(self.problem, rule, loss, "screening")
+        before = self.problem.accepted
+        scale = self._snoop(cutoff_sigma)
+        accepted = self.problem.accepted
+        n_changed = int(np.sum(before != accepted))
+        _LOG.info(
+            "screening: %d of %d observations kept, %d changed, noise %.2f sigma",
+            int(accepted.sum()),
+            len(accepted),
+            n_changed,
+            scale,
+        )
+        return scale, n_changed
+
+    def _snoop(self, cutoff_sigma: float) -> float:
+        """Snoop with the cameras as they are; returns the noise scale."""
+        problem = self.problem
+        snooping = snoop(
+            problem.landmarks,
+            problem.measurements,
+            problem.views,
+            problem.accepted,
+            cutoff_sigma=cutoff_sigma,
+            min_scale=1.0 if self._prepared.observations.origin == "given" else 0.05,
+        )
+        self._adopt(snooping)
+        return snooping.scale
+
+    def _adopt(self, snooping: Snooping) -> None:
+        self.problem = replace(self.problem, landmarks=snooping.landmarks, accepted=snooping.accepted)
+        self.set_aside[self.problem.measurements.row[~snooping.accepted]] = True
+
+
+def _telemetry_px(problem: Problem) -> FloatArray:
+    """By how much (n,) errors of telemetry and of the rig may move measurements, one sigma, pixels."""
+    m, views, t = problem.measurements, problem.views, problem.template.traverse
+    frame = np.array([max(f.sigma_pan_rad, f.sigma_tilt_rad) for f in t.frames])[t.image_frame[m.image]]
+    stop_rad = np.array([s.sigma_rotation_rad for s in t.stops])[t.image_stop[m.image]]
+    stop_m = np.array([s.sigma_translation_m for s in t.stops])[t.image_stop[m.image]]
+    refined = problem.at(problem.values, refine(problem.landmarks, m, views, problem.accepted.astype(float)))
+    distance = np.linalg.norm(refined.points_m()[m.landmark] - views.world_t_camera[m.image], axis=1)
+    focal = views.calibration[m.image, 0, 0]
+    telemetry_px = focal * np.sqrt(frame**2 + stop_rad**2 + (stop_m / distance.clip(1.0)) ** 2)
+    rig_px, rig_m = problem.template.rig_variables.start_error()
+    shift_px = focal * rig_m[m.image] / distance.clip(1.0)
+    return np.asarray(np.hypot(telemetry_px, np.hypot(rig_px[m.image], shift_px)))

@@ -1,0 +1,85 @@
+"""Stage 5, solution: an optimum beside what was there before, as data that users read."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from pancam_graph.base.geometry import BoolArray, FloatArray
+from pancam_graph.data import PixelNoise, Solution
+from pancam_graph.solve._carrying import carried_again
+from pancam_graph.solve._fit import Fitted
+from pancam_graph.solve._judge import Judged, state_of
+from pancam_graph.solve._prepare import triangulated
+from pancam_graph.solve._problem import Problem
+
+__all__ = ["solution_of"]
+
+
+def solution_of(judged: Judged) -> Solution:
+    """The solution, without the seconds that it took."""
+    fitted, outcome, covariances = judged.fitted, judged.fitted.outcome, judged.uncertainty
+    screened, problem = fitted.screened, fitted.problem
+    prepared, first = screened.prepared, _first(fitted)
+    n, present = len(prepared.observations), problem.present
+    return Solution(
+        traverse=prepared.traverse,
+        model=prepared.options.model,
+        landmarks=prepared.options.landmarks,
+        method=prepared.options.method,
+        converged=outcome.converged,
+        stop_reason=outcome.reason,
+        iterations=len(outcome.costs) - 1,
+        cost_history=outcome.costs,
+        cost_initial=first.cost(),
+        cost_final=problem.cost(),
+        initial=state_of(first),
+        final=judged.state,
+        landmark_track=prepared.landmark_track,
+        used=judged.used,
+        reason=_reasons(fitted),
+        residual_initial_px=_raw_residuals(first, present, n, fitted.noise),
+        residual_final_px=_raw_residuals(problem, present, n, fitted.noise),
+        sigma_px=fitted.noise.sigma_px,
+        covariance_px2=fitted.noise.covariance_px2,
+        stop_covariance=covariances.stop_covariance,
+        angle_sigma_rad=covariances.angle_sigma_rad,
+        landmark_covariance_m2=covariances.landmark_covariance_m2,
+        came_back=judged.used & screened.set_aside,
+        refined=problem.template.refined(problem.values, covariances.rig_sigmas),
+        warnings=judged.warnings,
+    )
+
+
+def _first(fitted: Fitted) -> Problem:
+    """The start, with the measurements of the optimum and the landmarks that fit the start best.
+
+    What is gained from there to the optimum is due to the cameras alone.
+    """
+    prepared, problem = fitted.screened.prepared, fitted.problem
+    first, m = prepared.problem, problem.measurements
+    if m is first.measurements and problem.accepted.all():
+        return first
+    first = triangulated(replace(first, measurements=m, accepted=problem.accepted)).placed()
+    if problem.template.rig_variables.distortion_moves:
+        first = carried_again(first, prepared.observations, fitted.noise).placed()
+    return first
+
+
+def _reasons(fitted: Fitted) -> tuple[str, ...]:
+    """Why each observation was left out; "" for those used."""
+    problem, reason = fitted.problem, fitted.screened.prepared.reason.copy()
+    reason[fitted.behind] = "behind"
+    row, kept = problem.measurements.row, problem.kept
+    for rows, word in ((row[problem.accepted & ~kept], "single"), (row[~problem.accepted], "outlier")):
+        reason[rows] = np.where(reason[rows] == "", word, reason[rows])
+    return tuple(reason.tolist())
+
+
+def _raw_residuals(problem: Problem, present: BoolArray, n: int, noise: PixelNoise) -> FloatArray:
+    """Projected minus measured (n, 2) in raw pixels; NaN where there is no landmark in front."""
+    m = problem.measurements
+    whitened, in_front = problem.residuals()
+    residual_px = np.full((n, 2), np.nan)
+    known = present[m.landmark] & in_front
+    residual_px[m.row[known]] = noise.select(m.row[known]).to_pixels(whitened[known])
+    return residual_px
