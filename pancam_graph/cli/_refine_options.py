@@ -70,8 +70,8 @@ def add_main_options(parser: argparse.ArgumentParser) -> None:
         action="append",
         choices=EXPORTS,
         default=[],
-        help="write a folder more into OUT (may be given for each); colmap: undistorted images and a model "
-        "with rigs and frames, for dense reconstruction; cahvor: the refined cameras as text files",
+        help="write a folder more into OUT (may be given for each); "
+        + "; ".join(f"{name}: {says}" for name, says in EXPORTS.items()),
     )
     parser.add_argument(
         "--mosaic",

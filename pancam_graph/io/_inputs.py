@@ -1,24 +1,27 @@
-"""Whatever the user points at, as a traverse."""
+"""The formats of input folders there are. To add one: a module with its reader, and a line in `FORMATS`."""
 
 from pathlib import Path
 
 from pancam_graph.base.errors import InputError
 from pancam_graph.data import Traverse
-from pancam_graph.io._pds import read_pds
-from pancam_graph.io._traverse_json import read_traverse
+from pancam_graph.io._input_format import InputFormat
+from pancam_graph.io._pds import PDS3
+from pancam_graph.io._traverse_json import TRAVERSE_FOLDER
 
-__all__ = ["read_input"]
+__all__ = ["FORMATS", "read_input"]
 
-_PDS_SUFFIXES = {".img", ".lbl"}
+FORMATS: tuple[InputFormat, ...] = (TRAVERSE_FOLDER, PDS3)
+"""All formats; a folder that is of several is read as the first of them."""
 
 
 def read_input(path: Path | str) -> Traverse:
-    """Read a folder: a traverse (with traverse.json), or rover images with PDS labels (*.IMG, *.LBL).
+    """Read a folder of any of the `FORMATS`: a traverse folder, or rover images with PDS labels.
 
-    Raises InputError saying what was expected and what was found, and as `read_traverse` and `read_pds` do.
+    Raises InputError saying what was expected and what was found, and as the format's reader does
+    (`read_traverse`, `read_pds`).
     """
     path = Path(path)
-    expected = f"{path}: expected a folder with traverse.json or with PDS images (*.IMG, *.LBL)"
+    expected = f"{path}: expected a folder {' or '.join(f'with {known.needs}' for known in FORMATS)}"
     try:
         names = sorted(p.name for p in path.iterdir())
     except FileNotFoundError as error:
@@ -27,9 +30,8 @@ def read_input(path: Path | str) -> Traverse:
         raise InputError(f"{expected}, found a file") from error
     except (OSError, ValueError) as error:
         raise InputError(f"{expected}, found a path that cannot be read ({error})") from error
-    if "traverse.json" in names:
-        return read_traverse(path)
-    if any(Path(n).suffix.lower() in _PDS_SUFFIXES for n in names):
-        return read_pds(path)
-    found = f"{names[0]} and {len(names) - 1} more" if len(names) > 1 else "".join(names) or "an empty folder"
-    raise InputError(f"{expected}, found {found}")
+    for known in FORMATS:
+        if known.matches(names):
+            return known.read(path)
+    content = f"{names[0]} and {len(names) - 1} more" if len(names) > 1 else "".join(names)
+    raise InputError(f"{expected}, found {content or 'an empty folder'}")

@@ -29,10 +29,11 @@ from pancam_graph.base.errors import ImageError, InputError
 from pancam_graph.base.geometry import FloatArray, IntArray, wrap_angle
 from pancam_graph.data import Frame, Image, Stop, Traverse
 from pancam_graph.io._image_files import left_out
+from pancam_graph.io._input_format import InputFormat
 from pancam_graph.io._pds_image import PMA_GROUPS, LabelledImage, read_labelled_image
 from pancam_graph.rigs import MER_MAST, MastKinematics, ReferenceSigma, RigFit, RigFitOptions, fit_rig
 
-__all__ = ["LOCALISATION_SIGMA", "SAME_POINTING_RAD", "LocalisationSigma", "read_pds"]
+__all__ = ["LOCALISATION_SIGMA", "PDS3", "SAME_POINTING_RAD", "LocalisationSigma", "read_pds"]
 
 _log = logging.getLogger(__name__)
 
@@ -142,6 +143,13 @@ def read_pds(folder: Path | str) -> Traverse:
         folder=folder,
         warnings=tuple(warnings),
     )
+
+
+PDS3 = InputFormat(
+    needs="PDS images (*.IMG, *.LBL)",
+    matches=lambda names: any(Path(name).suffix.lower() in {".img", ".lbl"} for name in names),
+    read=read_pds,
+)
 
 
 def _add_image(file: Path, images: list[LabelledImage], unusable: dict[str, ImageError]) -> None:

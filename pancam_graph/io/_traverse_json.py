@@ -12,6 +12,7 @@ from pancam_graph.base.whole_files import whole_file
 from pancam_graph.data import Frame, Image, Stop, Traverse
 from pancam_graph.io._entries import TRAVERSE_FORMAT, VERSION, PoseEntry
 from pancam_graph.io._image_files import left_out, read_eye_content
+from pancam_graph.io._input_format import InputFormat
 from pancam_graph.io._json import prefixed, read_json, refused_by_schema, short, validated
 from pancam_graph.io._mask_files import mask_file, read_mask
 from pancam_graph.io._observations import observations_npz, read_observations
@@ -24,7 +25,7 @@ from pancam_graph.io._schema import (
     rig_entry,
 )
 
-__all__ = ["read_traverse", "traverse_entries", "traverse_of", "write_traverse"]
+__all__ = ["TRAVERSE_FOLDER", "read_traverse", "traverse_entries", "traverse_of", "write_traverse"]
 
 _TRAVERSE_JSON = "traverse.json"
 _OBSERVATIONS = "observations.npz"
@@ -170,6 +171,11 @@ def traverse_entries(traverse: Traverse) -> TraverseFile:
         observations=None if traverse.observations is None else _OBSERVATIONS,
         sharing=None if traverse.sharing is None else SharingEntry.of(traverse.sharing),
     )
+
+
+TRAVERSE_FOLDER = InputFormat(
+    needs=_TRAVERSE_JSON, matches=lambda names: _TRAVERSE_JSON in names, read=read_traverse
+)
 
 
 def _inside(folder: Path, name: str, entry: str) -> Path:

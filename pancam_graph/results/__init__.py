@@ -2,8 +2,8 @@
 
 from pancam_graph.results._camera_models import write_cameras as write_cameras
 from pancam_graph.results._colmap import write_colmap as write_colmap
-from pancam_graph.results._exports import EXPORTS as EXPORTS
-from pancam_graph.results._exports import check_exports as check_exports
+from pancam_graph.results._outputs import EXPORTS as EXPORTS
+from pancam_graph.results._outputs import check_exports as check_exports
 from pancam_graph.results._results import check_out as check_out
 from pancam_graph.results._results import write_results as write_results
 from pancam_graph.results._solution_json import SolutionFile as SolutionFile

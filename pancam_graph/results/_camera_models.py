@@ -10,8 +10,9 @@ from pancam_graph.cameras import CAHV, Camera, as_cahv
 from pancam_graph.data import Solution, Traverse
 from pancam_graph.io import cahvor_text
 from pancam_graph.results._exported import file_names, whole_export, write_export_json
+from pancam_graph.results._output import OutputWriter, Written
 
-__all__ = ["fill_cameras", "require_cahv_family", "world_models", "write_cameras"]
+__all__ = ["CAMERAS", "fill_cameras", "require_cahv_family", "world_models", "write_cameras"]
 
 _FRAME = (
     "frame: the world of the traverse, z up, right-handed, metres",
@@ -75,3 +76,11 @@ def _require(name: str, camera: Camera) -> None:
         as_cahv(camera)
     except CameraError as error:
         raise InputError(f"cahvor: camera {name}: {error}") from error
+
+
+def _write(written: Written, folder: Path) -> Written:
+    fill_cameras(written.solution, folder)
+    return written
+
+
+CAMERAS = OutputWriter(write=_write, check=require_cahv_family)

@@ -27,8 +27,9 @@ from pancam_graph.results._colmap_scene import (
     straight_cameras,
 )
 from pancam_graph.results._exported import file_names, whole_export, write_export_json
+from pancam_graph.results._output import OutputWriter, Written
 
-__all__ = ["fill_colmap", "write_colmap"]
+__all__ = ["COLMAP", "fill_colmap", "write_colmap"]
 
 _LOG = logging.getLogger(__name__)
 _FIRST_PIXEL = 0.5
@@ -310,3 +311,11 @@ def _about(
             for i, name in numbers.name.items()
         ],
     }
+
+
+def _write(written: Written, folder: Path) -> Written:
+    fill_colmap(written.solution, folder, written.brightness)
+    return written
+
+
+COLMAP = OutputWriter(write=_write)

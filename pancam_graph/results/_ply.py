@@ -1,12 +1,15 @@
 """Landmarks as a point cloud: PLY, binary little endian."""
 
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.data import Solution
+from pancam_graph.results._output import OutputWriter, Written
 
-__all__ = ["points_ply"]
+__all__ = ["POINTS", "points_ply"]
 
 _COLOURS = ("red", "green", "blue")
 _INT32_MAX = np.iinfo(np.int32).max
@@ -76,3 +79,11 @@ def _per_landmark(solution: Solution) -> tuple[IntArray, FloatArray]:
     total = np.bincount(row[use], weights=squared[use], minlength=n)
     rms = np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)
     return count.astype(np.int64), rms
+
+
+def _write(written: Written, path: Path) -> Written:
+    path.write_bytes(points_ply(written.solution, written.brightness.grey))
+    return written
+
+
+POINTS = OutputWriter(write=_write)

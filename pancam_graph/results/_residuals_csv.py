@@ -3,13 +3,15 @@
 import csv
 import io
 from collections.abc import Iterable
+from pathlib import Path
 
 import numpy as np
 
 from pancam_graph.base.geometry import FloatArray
 from pancam_graph.data import Solution
+from pancam_graph.results._output import OutputWriter, Written
 
-__all__ = ["COLUMNS", "COVARIANCE_COLUMNS", "residuals_csv"]
+__all__ = ["COLUMNS", "COVARIANCE_COLUMNS", "RESIDUALS", "residuals_csv"]
 
 COLUMNS = (
     "image",
@@ -61,3 +63,11 @@ def _cells(column: FloatArray) -> list[str]:
     """Ten significant digits: a micropixel on any image; empty for what is not finite."""
     finite = np.isfinite(column)
     return [f"{x:.10g}" if ok else "" for x, ok in zip(column.tolist(), finite.tolist(), strict=True)]
+
+
+def _write(written: Written, path: Path) -> Written:
+    path.write_bytes(residuals_csv(written.solution))
+    return written
+
+
+RESIDUALS = OutputWriter(write=_write)

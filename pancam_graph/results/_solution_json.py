@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -22,8 +23,9 @@ from pancam_graph.io import (
     validated,
 )
 from pancam_graph.results._cross_validation import CrossValidationEntry
+from pancam_graph.results._output import OutputWriter, Written
 
-__all__ = ["SolutionFile", "read_solution_json", "solution_file", "solution_json"]
+__all__ = ["SOLUTION_WRITER", "SolutionFile", "read_solution_json", "solution_file", "solution_json"]
 
 Vector6 = Annotated[list[float], Field(min_length=6, max_length=6)]
 
@@ -266,3 +268,13 @@ def _pose_of(rotation: FloatArray, translation: FloatArray) -> PoseEntry | None:
 
 def _covariance(covariance: FloatArray) -> list[list[float]] | None:
     return covariance.tolist() if np.isfinite(covariance).all() else None
+
+
+def _write(written: Written, path: Path) -> Written:
+    solution = written.solution
+    timed = solution.with_seconds(report=solution.seconds.report + written.seconds())
+    path.write_bytes(solution_json(timed))
+    return replace(written, solution=timed)
+
+
+SOLUTION_WRITER = OutputWriter(write=_write)

@@ -16,6 +16,9 @@ from pancam_graph import Freedom, Image, Observations, Sharing, Traverse
 from pancam_graph.base.errors import InputError
 from pancam_graph.cameras import CAHV, Camera, Pinhole
 from pancam_graph.io import read_input, read_traverse, write_traverse
+from pancam_graph.io._input_format import InputFormat
+from pancam_graph.io._pds import PDS3
+from pancam_graph.io._traverse_json import TRAVERSE_FOLDER
 from pancam_graph.rigs import TEMPLATES
 from support import io_samples
 
@@ -336,11 +339,24 @@ def test_rover_images_go_to_the_pds_reader(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     expected = io_samples.traverse()
-    monkeypatch.setattr("pancam_graph.io._inputs.read_pds", lambda folder: {tmp_path: expected}[folder])
+    made_up = replace(PDS3, read=lambda folder: {tmp_path: expected}[folder])
+    monkeypatch.setattr("pancam_graph.io._inputs.FORMATS", (TRAVERSE_FOLDER, made_up))
     (tmp_path / name).write_bytes(b"")
     assert read_input(tmp_path) is expected
     write_traverse(expected, tmp_path)  # a traverse beside the images says what to make of them
     assert read_input(tmp_path) is not expected
+
+
+def test_a_format_more_is_read_and_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An error says what every format needs, and a folder goes to the first format that takes it."""
+    expected = io_samples.traverse()
+    made_up = InputFormat(needs="a plan", matches=lambda names: "plan.txt" in names, read=lambda _: expected)
+    monkeypatch.setattr("pancam_graph.io._inputs.FORMATS", (TRAVERSE_FOLDER, made_up))
+    (tmp_path / "notes.txt").write_bytes(b"")
+    with pytest.raises(InputError, match=r"a folder with traverse\.json or with a plan, found notes\.txt$"):
+        read_input(tmp_path)
+    (tmp_path / "plan.txt").write_bytes(b"")
+    assert read_input(tmp_path) is expected
 
 
 def test_names_that_the_format_does_not_take(tmp_path: Path) -> None:

@@ -14,8 +14,10 @@ import pytest
 import pancam_graph.report
 from pancam_graph.base.errors import InputError
 from pancam_graph.data import Refined, RigCorrection, Solution
-from pancam_graph.results import check_out, read_solution_json, write_results
+from pancam_graph.results import EXPORTS, check_exports, check_out, read_solution_json, write_results
 from pancam_graph.results._brightness import brightness_of
+from pancam_graph.results._output import Output, OutputWriter, Written
+from pancam_graph.results._outputs import OUTPUTS
 from support import io_samples
 
 
@@ -258,6 +260,30 @@ def test_an_older_folder_of_results_is_replaced_whole(tmp_path: Path) -> None:
     assert set(contents(out)) == {"solution.json", "points.ply", "residuals.csv"}
     assert read_solution_json(out / "solution.json").model == "circle"
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_an_output_more_is_written_and_recognised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An entry of the registry is enough; without it, the same file is a stranger."""
+
+    def write(written: Written, path: Path) -> Written:
+        path.write_text(written.solution.model)
+        return written
+
+    note = Output(name="note.txt", when="always", writer=lambda: OutputWriter(write=write))
+    with monkeypatch.context() as patch:
+        patch.setattr("pancam_graph.results._results.OUTPUTS", (note, *OUTPUTS))
+        write_results(io_samples.solution(), tmp_path / "out")
+        check_out(tmp_path / "out")
+    assert (tmp_path / "out" / "note.txt").read_text() == "mast"
+    with pytest.raises(InputError, match=r"found other things in it: note\.txt$"):
+        check_out(tmp_path / "out")
+
+
+def test_exports_are_what_the_registry_has() -> None:
+    assert list(EXPORTS) == ["colmap", "cahvor"]
+    assert all(EXPORTS.values())
+    with pytest.raises(InputError, match="export: expected colmap or cahvor, found 'ply'"):
+        check_exports(io_samples.traverse(), ["colmap", "ply"])
 
 
 def test_a_link_keeps_pointing_at_the_results(tmp_path: Path) -> None:

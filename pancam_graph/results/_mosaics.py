@@ -1,0 +1,20 @@
+"""Mosaics as an output of the folder of results."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from pancam_graph.mosaic import write_mosaics
+from pancam_graph.results._output import OutputWriter, Written
+
+__all__ = ["MOSAICS"]
+
+
+def _write(written: Written, folder: Path) -> Written:
+    options, solution = written.mosaic_options, written.solution
+    assert options is not None  # without options nobody asked for mosaics
+    mosaics = write_mosaics(solution, folder, options, progress=written.progress)
+    warned = replace(solution, warnings=(*solution.warnings, *mosaics.warnings))
+    return replace(written, solution=warned, mosaics=mosaics)
+
+
+MOSAICS = OutputWriter(write=_write)

@@ -1,0 +1,63 @@
+"""What the folder of results must know of an output; each output's module fills in an `OutputWriter`."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from pancam_graph.data import Solution, Traverse
+from pancam_graph.results._older import ONE_FILE, Older
+
+if TYPE_CHECKING:  # these import OpenCV, and names of outputs must be cheap
+    from pancam_graph.mosaic import MosaicOptions, WrittenMosaics
+    from pancam_graph.results._brightness import Brightness
+
+__all__ = ["Output", "OutputWriter", "Written"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Written:
+    """What outputs are made from, and what those before have added to it."""
+
+    solution: Solution
+    """With the warnings of the outputs so far."""
+    brightness: "Brightness"
+    mosaic_options: "MosaicOptions | None"
+    """None: no mosaics are written."""
+    progress: Callable[[str, int, int], None] | None
+    """Told of a stage, how many of its parts are done, and how many there are."""
+    seconds: Callable[[], float]
+    """How long writing has taken so far."""
+    mosaics: "WrittenMosaics | None" = None
+    """The mosaics, once they are written."""
+
+
+def _anything(traverse: Traverse) -> None:
+    """A solution of any traverse can be written."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputWriter:
+    """How an output is written."""
+
+    write: Callable[[Written, Path], Written]
+    """Write the file, or the files of the folder, at the path; a folder exists and is empty. Returns what it
+    was given, with what later outputs need of this one."""
+    check: Callable[[Traverse], None] = _anything
+    """Raise InputError if a solution of the traverse cannot be written; for before a long solve."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Output:
+    """A file or a folder in the folder of results."""
+
+    name: str
+    """Of the file or folder; of an export also its choice in options."""
+    when: Literal["always", "report", "mosaics", "export"]
+    """What has to be asked for to have it."""
+    writer: Callable[[], OutputWriter]
+    """Imports the module that writes it: only then, as names and choices must be quick to list."""
+    says: str = ""
+    """What an export is, as the help of an option says it."""
+    older: Older = ONE_FILE
+    """How one that an earlier run wrote is recognised."""
