@@ -1,6 +1,21 @@
 """The rig as a factor template, and landmarks as variables; options that shape a graph."""
 
+from pancam_graph.graph._factors import FactorList as FactorList
+from pancam_graph.graph._factors import Factors as Factors
+from pancam_graph.graph._factors import graph_of as graph_of
+from pancam_graph.graph._given import GivenFactor as GivenFactor
+from pancam_graph.graph._given import Seat as Seat
+from pancam_graph.graph._given import UserFactors as UserFactors
+from pancam_graph.graph._given import check_given as check_given
+from pancam_graph.graph._given import given_factors as given_factors
+from pancam_graph.graph._given import seated as seated
+from pancam_graph.graph._graph_keys import GraphKeys as GraphKeys
 from pancam_graph.graph._hard import HardTemplate as HardTemplate
+from pancam_graph.graph._keys import Kind as Kind
+from pancam_graph.graph._keys import index_of as index_of
+from pancam_graph.graph._keys import key_of as key_of
+from pancam_graph.graph._keys import kind_of as kind_of
+from pancam_graph.graph._keys import read_variable as read_variable
 from pancam_graph.graph._landmarks import ExplicitLandmarks as ExplicitLandmarks
 from pancam_graph.graph._options import DEFAULT_FLEX as DEFAULT_FLEX
 from pancam_graph.graph._options import RIGID as RIGID
@@ -12,4 +27,3 @@ from pancam_graph.graph._rig_variables import RigVariables as RigVariables
 from pancam_graph.graph._soft import SoftTemplate as SoftTemplate
 from pancam_graph.graph._template import FactorTemplate as FactorTemplate
 from pancam_graph.graph._template import diagonal_noise as diagonal_noise
-from pancam_graph.graph._template import read_variable as read_variable

@@ -22,7 +22,10 @@ from pancam_graph.base.geometry import (
 from pancam_graph.data import FIXED, Quantity, Sharing, State, Traverse
 from pancam_graph.elimination import Covariance, Linkage, Posture
 from pancam_graph.factors import Key
-from pancam_graph.graph._template import Factors, FactorTemplate, diagonal_noise
+from pancam_graph.graph._factors import FactorList
+from pancam_graph.graph._given import Seat
+from pancam_graph.graph._keys import Kind, key_of
+from pancam_graph.graph._template import FactorTemplate, diagonal_noise
 from pancam_graph.landmarks import CameraViews
 
 __all__ = ["HardTemplate"]
@@ -49,7 +52,7 @@ class HardTemplate(FactorTemplate):
     @staticmethod
     def angles_key(stop: int) -> int:
         """Key of the pan and tilt of those frames of a stop that are not held."""
-        return int(gtsam.symbol("A", stop))
+        return key_of(Kind.ANGLES, stop)
 
     @cached_property
     def linkage(self) -> Linkage:
@@ -206,18 +209,13 @@ class HardTemplate(FactorTemplate):
                 angles[frames] = values.atVector(self.angles_key(stop)).reshape(-1, 2)
         return angles
 
-    def factors(self) -> gtsam.NonlinearFactorGraph:
+    def priors(self) -> FactorList:
         """Priors of the masts, of the angles, and of what of the rig is free."""
-        graph = gtsam.NonlinearFactorGraph()
-        for stop in range(len(self.traverse.stops)):
-            for factor in (*self.stop_factors(stop), *self.angle_factors(stop)):
-                graph.push_back(factor)
-        for owner in (*range(len(self.traverse.stops)), None):
-            for factor in self.rig_variables.prior_factors(owner):
-                graph.push_back(factor)
-        return graph
+        stops = range(len(self.traverse.stops))
+        out = [factor for i in stops for factor in (*self.stop_factors(i), *self.angle_factors(i))]
+        return out + [f for owner in (*stops, None) for f in self.rig_variables.prior_factors(owner)]
 
-    def angle_factors(self, stop: int) -> Factors:
+    def angle_factors(self, stop: int) -> FactorList:
         """The prior of a stop's pan and tilt angles."""
         frames = self._frames[stop]
         if not len(frames):
@@ -258,6 +256,23 @@ class HardTemplate(FactorTemplate):
             if len(frames):
                 held[self.angles_key(stop)] = np.flatnonzero(self._sigmas[frames].ravel() == 0)
         return held
+
+    @property
+    def has_cameras(self) -> bool:
+        """No: camera poses follow from masts and angles."""
+        return False
+
+    def angle_seat(self, frame: int) -> Seat:
+        """Two entries of the vector of its stop; held where both sigmas are 0."""
+        if not self._sigmas[frame].any():
+            return Seat.fixed(self.traverse.pan_tilt_rad[frame])
+        stop = int(self.traverse.frame_stop[frame])
+        key, n = self.angles_key(stop), 2 * len(self._frames[stop])
+        begin = 2 * int(np.searchsorted(self._frames[stop], frame))
+        moves = np.zeros((2, n))
+        free = np.flatnonzero(self._sigmas[frame])
+        moves[free, begin + free] = 1.0
+        return Seat(read=lambda values: values.atVector(key)[begin : begin + 2], parts=((key, moves),))
 
     def angle_rows(self, frame: int, state: State) -> tuple[IntArray, FloatArray]:
         """A frame's pan and tilt are variables: columns (2,), rows (2, 2); no columns where they are held."""

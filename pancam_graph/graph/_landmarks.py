@@ -4,13 +4,16 @@ Another way to treat landmarks stands beside it: it too adds its factors to the 
 landmarks back from the values that the optimiser found.
 """
 
+from collections.abc import Sequence
+
 import gtsam
 import numpy as np
 
 from pancam_graph.base.geometry import BoolArray, FloatArray
+from pancam_graph.graph._given import GivenFactor, seated
+from pancam_graph.graph._keys import Kind, key_of, read_variable
 from pancam_graph.graph._native_calibrations import NativeCalibrations
 from pancam_graph.graph._soft import SoftTemplate
-from pancam_graph.graph._template import read_variable
 from pancam_graph.landmarks import SQUARED, Loss, Measurements
 
 __all__ = ["ExplicitLandmarks"]
@@ -37,7 +40,18 @@ class ExplicitLandmarks:
     @staticmethod
     def key(landmark: int) -> int:
         """Key of a landmark."""
-        return int(gtsam.symbol("L", landmark))
+        return key_of(Kind.LANDMARK, landmark)
+
+    def beside_landmarks(self, given: Sequence[GivenFactor] = ()) -> gtsam.NonlinearFactorGraph:
+        """All other factors: the template's, and the caller's own."""
+        own = self.template.factors(apart=True)
+        seats = self.calibrations.seats(self.template.seats(given))
+        placed = (seated(one, seats) for one in given)
+        graph = self.calibrations.in_place(own.graph)
+        for factor in placed:
+            if factor is not None:
+                graph.push_back(factor)
+        return graph
 
     def factors(self, accepted: BoolArray, loss: Loss = SQUARED) -> gtsam.NonlinearFactorGraph:
         """A native factor for each accepted observation."""

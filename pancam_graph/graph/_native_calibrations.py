@@ -12,6 +12,8 @@ import numpy as np
 from scipy.linalg import null_space
 
 from pancam_graph.base.geometry import FloatArray, IntArray
+from pancam_graph.graph._given import Seat
+from pancam_graph.graph._keys import Kind, key_of
 from pancam_graph.graph._rig_variables import RigVariable, RigVariables
 
 __all__ = ["NativeCalibrations"]
@@ -47,7 +49,7 @@ class NativeCalibrations:
             keys, nominal, basis = [], [], []
             for eye in np.unique(eyes[own]):
                 images = own & (eyes == eye)
-                keys.append(int(gtsam.symbol("C", number)))
+                keys.append(key_of(Kind.NATIVE_CALIBRATION, number))
                 number += 1
                 self._key_of_image[images] = keys[-1]
                 basis.append(rig.basis("calibration")[np.argmax(images)])
@@ -82,6 +84,10 @@ class NativeCalibrations:
             graph.push_back(_hold(n))
         return graph
 
+    def seats(self, seats: Mapping[int, Seat]) -> dict[int, Seat]:
+        """Where variables of given factors are: each `K` among its `C`."""
+        return {**seats, **{n.variable.key: _seat(n) for n in self._native if n.variable.key in seats}}
+
     def values_of(self, cameras: gtsam.Values) -> gtsam.Values:
         """A template's values, `K` replaced by `C`."""
         values = gtsam.Values(cameras)
@@ -94,11 +100,7 @@ class NativeCalibrations:
 
     def free_entries(self, values: gtsam.Values) -> dict[int, FloatArray]:
         """Each `K` (n,) by its key, from values that hold `C`."""
-        return {
-            n.variable.key: n.along
-            @ (np.concatenate([values.atCal3_S2(key).vector() for key in n.keys]) - n.nominal)
-            for n in self._native
-        }
+        return {n.variable.key: _entries(n, values) for n in self._native}
 
     def held(self, held: Mapping[int, IntArray]) -> dict[int, IntArray]:
         """By key, tangent components that factors hold: those given, and those of `C` that `K` does not move.
@@ -118,6 +120,17 @@ class NativeCalibrations:
         for n in self._native:
             out.insert(n.variable.key, n.along @ np.concatenate([step.at(key) for key in n.keys]))
         return out
+
+
+def _entries(native: _Native, values: gtsam.Values) -> FloatArray:
+    """`K` (n,) from values that hold `C`."""
+    numbers = np.concatenate([values.atCal3_S2(key).vector() for key in native.keys])
+    return np.asarray(native.along @ (numbers - native.nominal))
+
+
+def _seat(native: _Native) -> Seat:
+    parts = [(key, native.along[:, 5 * i : 5 * i + 5]) for i, key in enumerate(native.keys)]
+    return Seat(read=lambda values: _entries(native, values), parts=tuple(parts))
 
 
 def _numbers(calibration: FloatArray) -> tuple[float, float, float, float, float]:

@@ -19,9 +19,11 @@ from pancam_graph.cameras import (
 from pancam_graph.data import ENTRIES, Refined, RigCorrection, State, Traverse
 from pancam_graph.elimination import Covariance, Posture
 from pancam_graph.factors import Fixed, Key, projective_factor
+from pancam_graph.graph._factors import FactorList
+from pancam_graph.graph._keys import Kind
 from pancam_graph.graph._options import Flex
 from pancam_graph.graph._soft import SoftTemplate
-from pancam_graph.graph._template import Factors, diagonal_noise
+from pancam_graph.graph._template import diagonal_noise
 from pancam_graph.landmarks import CameraViews
 
 __all__ = ["ProjectiveTemplate"]
@@ -45,8 +47,8 @@ class ProjectiveTemplate(SoftTemplate):
     optimum is the same.
     """
 
-    _camera_letter = "P"
-    _poses = False
+    _camera_kind = Kind.PROJECTION
+    _camera_dim = 12
 
     def __init__(self, traverse: Traverse, flex: Flex, *, normalise: bool = True) -> None:
         super().__init__(traverse, "projective", flex)
@@ -81,7 +83,7 @@ class ProjectiveTemplate(SoftTemplate):
             chain=tangents[:, :11],
         )
 
-    def tie_factors(self, images: IntArray) -> Factors:
+    def tie_factors(self, images: IntArray) -> FactorList:
         """The ties of some images' matrices to the mast and to the rig's calibration, as one factor."""
         t, flex = self.traverse, self.flex
         pose = np.repeat([flex.rotation_rad, flex.translation_m], 3)

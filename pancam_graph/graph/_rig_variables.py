@@ -34,10 +34,16 @@ from pancam_graph.data import (
 )
 from pancam_graph.elimination import Covariance, Linkage
 from pancam_graph.factors import Corrected, Fixed, Key, PoseSlot, Slot
+from pancam_graph.graph._keys import Kind, key_of
 
 __all__ = ["RigVariable", "RigVariables"]
 
-_LETTER: Mapping[Quantity, str] = {"calibration": "K", "mounts": "E", "pan_T_tilt": "T", "radius": "R"}
+_KIND: Mapping[Quantity, Kind] = {
+    "calibration": Kind.CALIBRATION,
+    "mounts": Kind.MOUNT,
+    "pan_T_tilt": Kind.TILT_AXIS,
+    "radius": Kind.RADIUS,
+}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -77,7 +83,7 @@ class RigVariables:
         self._basis: dict[Quantity, FloatArray] = {}
         self.of: dict[Quantity, tuple[RigVariable, ...]] = {}
         """Variables of each quantity"""
-        for quantity in _LETTER:
+        for quantity in _KIND:
             freedom: Freedom | None = getattr(sharing, quantity)
             self.of[quantity] = self._variables(quantity, freedom or Freedom())
 
@@ -108,7 +114,7 @@ class RigVariables:
             out.append(
                 RigVariable(
                     quantity=quantity,
-                    key=int(gtsam.symbol(_LETTER[quantity], int(number))),
+                    key=key_of(_KIND[quantity], int(number)),
                     entries=entries,
                     sigma=np.array([freedom.sigma.get(e, default_sigma(e, focal)) for e in entries]),
                     usual=np.array([default_sigma(e, focal) for e in entries]),
@@ -177,15 +183,23 @@ class RigVariables:
         """(images, entries, columns), of pan_T_tilt (stops, ...): free entries to all of the correction."""
         return self._basis[quantity]
 
+    def owner(self, variable: RigVariable) -> str:
+        """Whose a variable is, in words: " of left at s1"; empty where all images share it."""
+        where = self._where(variable)
+        return f" of {' '.join(where)}".replace(" of at ", " at ") if where else ""
+
     def name(self, variable: RigVariable, entry: str) -> str:
         """An entry as a warning calls it."""
+        return " ".join([variable.quantity, *self._where(variable), entry])
+
+    def _where(self, variable: RigVariable) -> list[str]:
         t = self.traverse
         where = [] if variable.eye is None else [t.rig.eyes[variable.eye].name]
         if variable.image is not None:
             where = [t.images[variable.image].id]
         elif variable.stop is not None:
             where.append(f"at {t.stops[variable.stop].id}")
-        return " ".join([variable.quantity, *where, entry])
+        return where
 
     # --- values ---
 

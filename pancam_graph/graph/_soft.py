@@ -21,21 +21,22 @@ from pancam_graph.base.geometry import (
 from pancam_graph.data import Sharing, State, Traverse
 from pancam_graph.elimination import Linkage, Posture
 from pancam_graph.factors import CircleOffset, Fixed, Key, Slot, circle_factor, mast_factor
+from pancam_graph.graph._factors import FactorList
+from pancam_graph.graph._given import Seat
+from pancam_graph.graph._keys import Kind, key_of
 from pancam_graph.graph._options import Flex, Model
-from pancam_graph.graph._template import Factors, FactorTemplate, diagonal_noise
+from pancam_graph.graph._template import FactorTemplate, diagonal_noise
 from pancam_graph.landmarks import CameraViews
 
 __all__ = ["SoftTemplate"]
-
-_DIMENSION = {"A": 2, "M": 6, "P": 12, "X": 6}
 
 
 class SoftTemplate(FactorTemplate):
     """Factors and variables for camera poses that a tie holds; its sigma stands for the mast's flex."""
 
-    _camera_letter = "X"
-    _poses = True
-    """Whether a camera's variable is its own pose"""
+    _camera_kind = Kind.CAMERA
+    _camera_dim = 6
+    """Dimension of a camera's variable"""
     refines_landmarks = True
     """Cameras that are free to move far along what images hardly tell take landmarks with them, and far along
     the linear step of a landmark is off by more than noise. Three clusters of one eye took up to 81 steps
@@ -50,47 +51,49 @@ class SoftTemplate(FactorTemplate):
         entry = self.traverse.frames[frame]
         if entry.sigma_pan_rad == 0 and entry.sigma_tilt_rad == 0:
             return Fixed(self.traverse.pan_tilt_rad[frame])
-        return Key(gtsam.symbol("A", frame))
+        return Key(key_of(Kind.ANGLES, frame))
 
     @classmethod
     def camera_key(cls, image: int) -> int:
         """Key of an image's camera."""
-        return int(gtsam.symbol(cls._camera_letter, image))
+        return key_of(cls._camera_kind, image)
 
     @cached_property
     def linkage(self) -> Linkage:
         """One unit per image, which hangs on its own camera and calibration; ties join it to all else."""
         t, free = self.traverse, self.rig_variables
-        keys: list[int] = []
+        dim: dict[int, int] = {}
         group: list[int] = []
         for stop in range(len(t.stops)):
-            own = [self.camera_key(int(i)) for i in np.flatnonzero(t.image_stop == stop)]
-            slots = [*(self.pan_tilt(int(f)) for f in np.flatnonzero(t.frame_stop == stop)), self.mast(stop)]
-            own += [slot.key for slot in slots if isinstance(slot, Key)]
-            own += [v.key for v in free.of_stop(stop)]
-            keys += own
-            group += [stop] * len(own)
-        shared = [v.key for v in free.of_stop(None)]
-        keys += shared
+            before = len(dim)
+            dim |= {self.camera_key(int(i)): self._camera_dim for i in np.flatnonzero(t.image_stop == stop)}
+            angles = (self.pan_tilt(int(f)) for f in np.flatnonzero(t.frame_stop == stop))
+            dim |= {slot.key: 2 for slot in angles if isinstance(slot, Key)}
+            if isinstance(mast := self.mast(stop), Key):
+                dim[mast.key] = 6
+            dim |= {v.key: len(v.entries) for v in free.of_stop(stop)}
+            group += [stop] * (len(dim) - before)
+        shared = {v.key: len(v.entries) for v in free.of_stop(None)}
+        dim |= shared
         group += [len(t.stops)] * len(shared)
-        row, n = {key: i for i, key in enumerate(keys)}, len(t.images)
-        dim = _DIMENSION | {chr(gtsam.symbolChr(v.key)): len(v.entries) for v in free.variables}
+        row, n = {key: i for i, key in enumerate(dim)}, len(t.images)
         variable = np.array([[row[self.camera_key(i)]] for i in range(n)], dtype=np.int64)
-        width = np.full((n, 1), _DIMENSION[self._camera_letter])
+        width = np.full((n, 1), self._camera_dim)
         if free.of["calibration"]:
             own_K = np.array([row[v.key] for v in free.of["calibration"]])[free.place("calibration")]
             variable = np.column_stack([variable, own_K])
             width = np.column_stack([width, np.full(n, free.basis("calibration").shape[2])])
         return Linkage(
-            key=tuple(keys),
-            dim=np.array([dim[chr(gtsam.symbolChr(key))] for key in keys], dtype=np.int64),
+            key=tuple(dim),
+            dim=np.array(list(dim.values()), dtype=np.int64),
             group=np.array(group, dtype=np.int64),
             image_unit=np.arange(n),
             segment_begin=np.arange(n + 1) * variable.shape[1],
             segment_variable=variable.ravel(),
             segment_column=np.zeros(variable.size, dtype=np.int64),
             segment_width=width.ravel(),
-            segment_plain=(np.arange(variable.size) % variable.shape[1] == 0) & self._poses,
+            segment_plain=(np.arange(variable.size) % variable.shape[1] == 0)
+            & (self._camera_kind is Kind.CAMERA),
         )
 
     def posture(self, values: gtsam.Values) -> Posture:
@@ -109,7 +112,7 @@ class SoftTemplate(FactorTemplate):
         poses = [values.atPose3(self.camera_key(i)) for i in range(len(self.traverse.images))]
         return self.views_of(*pose_arrays(poses), values)
 
-    def frame_factors(self, frame: int) -> Factors:
+    def frame_factors(self, frame: int) -> FactorList:
         """The prior of a frame's pan and tilt."""
         entry, slot = self.traverse.frames[frame], self.pan_tilt(frame)
         if not isinstance(slot, Key):
@@ -117,7 +120,7 @@ class SoftTemplate(FactorTemplate):
         sigmas = np.array([entry.sigma_pan_rad, entry.sigma_tilt_rad])
         return [gtsam.PriorFactorVector(slot.key, self.traverse.pan_tilt_rad[frame], diagonal_noise(sigmas))]
 
-    def tie_factors(self, images: IntArray) -> Factors:
+    def tie_factors(self, images: IntArray) -> FactorList:
         """The ties of some images' camera poses to the mast, and to their circles where the model says so.
 
         One factor for all of them: evaluated one by one they would take most of a solve.
@@ -154,26 +157,34 @@ class SoftTemplate(FactorTemplate):
             circle_factor(on_circle, cameras, mast, [slot for slot, _ in radii], angles, offset),
         ]
 
-    def factors(self, *, apart: bool = False) -> gtsam.NonlinearFactorGraph:
-        """All factors but those of landmarks; ties stop by stop, or each `apart`.
-
-        Apart they leave a graph as sparse as it is, for those who have GTSAM eliminate all of it.
-        """
-        graph = gtsam.NonlinearFactorGraph()
+    def priors(self) -> FactorList:
+        """Priors of the masts, of the angles, and of what of the rig is free."""
         t = self.traverse
-        tied = range(len(t.images)) if apart else range(len(t.stops))
-        owner = np.arange(len(t.images)) if apart else t.image_stop
-        ties = [images for i in tied if len(images := np.flatnonzero(owner == i))]
         groups = [
             *(self.stop_factors(i) for i in range(len(t.stops))),
             *(self.frame_factors(i) for i in range(len(t.frames))),
-            *(self.tie_factors(images) for images in ties),
             *(self.rig_variables.prior_factors(i) for i in (*range(len(t.stops)), None)),
         ]
-        for group in groups:
-            for factor in group:
-                graph.push_back(factor)
-        return graph
+        return [factor for group in groups for factor in group]
+
+    def ties(self, *, apart: bool = False) -> FactorList:
+        """Ties of cameras to the mast: one factor for each stop, or for each image if `apart`."""
+        t = self.traverse
+        owner = np.arange(len(t.images)) if apart else t.image_stop
+        tied = [np.flatnonzero(owner == i) for i in range(len(t.images) if apart else len(t.stops))]
+        return [factor for images in tied if len(images) for factor in self.tie_factors(images)]
+
+    @property
+    def has_cameras(self) -> bool:
+        """Yes."""
+        return True
+
+    def angle_seat(self, frame: int) -> Seat:
+        """A variable of its own; held where both sigmas are 0."""
+        slot = self.pan_tilt(frame)
+        if not isinstance(slot, Key):
+            return Seat.fixed(slot.value)
+        return Seat.same(slot.key, 2, self._held_angles(frame))
 
     def values(self, state: State) -> gtsam.Values:
         """The variables at a state."""
@@ -222,10 +233,14 @@ class SoftTemplate(FactorTemplate):
     def held_columns(self) -> dict[int, IntArray]:
         """By key, tangent components that telemetry holds while others of the same variable are free."""
         held = self.held_of_stops()
-        for i, frame in enumerate(self.traverse.frames):
+        for i in range(len(self.traverse.frames)):
             if isinstance(slot := self.pan_tilt(i), Key):
-                held[slot.key] = np.flatnonzero(np.array([frame.sigma_pan_rad, frame.sigma_tilt_rad]) == 0)
+                held[slot.key] = self._held_angles(i)
         return held
+
+    def _held_angles(self, frame: int) -> IntArray:
+        entry = self.traverse.frames[frame]
+        return np.flatnonzero(np.array([entry.sigma_pan_rad, entry.sigma_tilt_rad]) == 0)
 
     def angle_rows(self, frame: int, state: State) -> tuple[IntArray, FloatArray]:
         """How a frame's pan and tilt move: they are variables, or what camera poses say.

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -11,13 +11,15 @@ from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.data import Refined, RigCorrection, Sharing, State, Traverse
 from pancam_graph.elimination import Covariance, Linkage, Posture
 from pancam_graph.factors import Fixed, Key, Slot
+from pancam_graph.graph._factors import FactorList, Factors
+from pancam_graph.graph._given import GivenFactor, Seat, seated
+from pancam_graph.graph._graph_keys import GraphKeys
+from pancam_graph.graph._keys import Kind, index_of, key_of, kind_of, read_variable
 from pancam_graph.graph._options import Model
 from pancam_graph.graph._rig_variables import RigVariables
 from pancam_graph.landmarks import CameraViews
 
-__all__ = ["FactorTemplate", "Factors", "diagonal_noise", "read_variable"]
-
-Factors = list[gtsam.NonlinearFactor]
+__all__ = ["FactorTemplate", "diagonal_noise"]
 
 
 class FactorTemplate(ABC):
@@ -52,8 +54,64 @@ class FactorTemplate(ABC):
         """Cameras of all images at the values."""
 
     @abstractmethod
-    def factors(self) -> gtsam.NonlinearFactorGraph:
-        """All factors but those of landmarks."""
+    def priors(self) -> FactorList:
+        """Priors of masts, angles, and free entries of the rig."""
+
+    def ties(self, *, apart: bool = False) -> FactorList:
+        """What joins cameras to the mast, stop by stop, or image by image if `apart`; here nothing."""
+        return []
+
+    def factors(
+        self,
+        given: Sequence[GivenFactor] = (),
+        *,
+        present: gtsam.Values | None = None,
+        apart: bool = False,
+    ) -> Factors:
+        """All factors but those of landmarks, with the caller's own.
+
+        `present` are values of another template, at which variables are held that given factors name and this
+        template does not have. `apart` as for `ties`: the graph stays sparse, for those who have GTSAM
+        eliminate all of it.
+        """
+        seats = self.seats(given, present)
+        placed = (seated(one, seats) for one in given)
+        return Factors(
+            priors=tuple(self.priors()),
+            ties=tuple(self.ties(apart=apart)),
+            given=tuple(given),
+            seated=tuple(factor for factor in placed if factor is not None),
+        )
+
+    @cached_property
+    def keys(self) -> GraphKeys:
+        """Keys as callers know them."""
+        return GraphKeys(self.traverse, self.rig_variables)
+
+    def seats(self, given: Sequence[GivenFactor], present: gtsam.Values | None = None) -> dict[int, Seat]:
+        """Where the variables of given factors are among this template's; see `factors`."""
+        held = self.held_columns() if given else {}
+        return {key: self._seat(key, held.get(key), present) for one in given for key in one.keys}
+
+    def _seat(self, key: int, held: IntArray | None, present: gtsam.Values | None) -> Seat:
+        kind = kind_of(key)
+        if kind is Kind.ANGLES:
+            return self.angle_seat(index_of(key))
+        if kind is Kind.MAST and isinstance(slot := self.mast(index_of(key)), Fixed):
+            return Seat.fixed(slot.value)
+        if key not in self.linkage.row:
+            assert present is not None  # every key of `keys` is a variable, or held by telemetry
+            return Seat.fixed(read_variable(present, key))
+        return Seat.same(key, int(self.linkage.dim[self.linkage.row[key]]), held)
+
+    @abstractmethod
+    def angle_seat(self, frame: int) -> Seat:
+        """Where pan and tilt of a frame are among the variables."""
+
+    @property
+    @abstractmethod
+    def has_cameras(self) -> bool:
+        """Whether each image's camera is a variable of its own, which a tie holds to the mast."""
 
     @abstractmethod
     def values(self, state: State) -> gtsam.Values:
@@ -95,7 +153,7 @@ class FactorTemplate(ABC):
         entry = self.traverse.stops[stop]
         if entry.sigma_rotation_rad == 0 and entry.sigma_translation_m == 0:
             return Fixed(entry.world_T_mast)
-        return Key(gtsam.symbol("M", stop))
+        return Key(key_of(Kind.MAST, stop))
 
     def masts(self, values: gtsam.Values) -> tuple[gtsam.Pose3, ...]:
         """Mast poses of all stops at the values."""
@@ -114,7 +172,7 @@ class FactorTemplate(ABC):
         """What the values say of every free entry of the rig; without sigmas these are NaN."""
         return self.rig_variables.refined(values, sigmas)
 
-    def stop_factors(self, stop: int) -> Factors:
+    def stop_factors(self, stop: int) -> FactorList:
         """The prior of a stop's mast pose."""
         entry, slot = self.traverse.stops[stop], self.mast(stop)
         if not isinstance(slot, Key):
@@ -162,13 +220,3 @@ def diagonal_noise(sigmas: FloatArray) -> gtsam.noiseModel.Base:
     if np.all(sigmas > 0):
         return gtsam.noiseModel.Diagonal.Sigmas(sigmas)
     return gtsam.noiseModel.Constrained.MixedSigmas(np.full(len(sigmas), 1e3), sigmas)
-
-
-def read_variable(values: gtsam.Values, key: int) -> Any:
-    """Value of a variable by the letter of its key: gtsam.Pose3, vector or number; of `C` five numbers."""
-    kind = chr(gtsam.symbolChr(key))
-    if kind in "MX":
-        return values.atPose3(key)
-    if kind == "C":
-        return values.atCal3_S2(key).vector()
-    return values.atDouble(key) if kind == "R" else values.atVector(key)

@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 
 from pancam_graph.data import Traverse
-from pancam_graph.graph import HardTemplate
+from pancam_graph.graph import Factors, HardTemplate
 from pancam_graph.landmarks import Landmarks
 from pancam_graph.smoother._map import DriveMap
 from pancam_graph.solve import EliminatedSolver, Problem, StopRule
@@ -29,13 +29,11 @@ def whole_traverse(drive: DriveMap) -> Traverse:
 
 def whole_problem(drive: DriveMap, values: gtsam.Values) -> Problem:
     """What is used of the drive, landmarks as they were linearised last."""
-    placed, factors = drive.whole(), gtsam.NonlinearFactorGraph()
-    for factor in drive.factors(firm=True):
-        factors.push_back(factor)
+    placed = drive.whole()
     template = HardTemplate(whole_traverse(drive), drive.stations[0].template.rig_variables.sharing)
     return Problem(
         template=template,
-        factors=factors,
+        factors=Factors(priors=tuple(drive.factors(firm=True))),
         measurements=placed.measurements,
         accepted=np.ones(len(placed.measurements.row), dtype=bool),
         values=values,

@@ -8,6 +8,7 @@ import numpy as np
 
 from pancam_graph.base.geometry import FloatArray
 from pancam_graph.base.threads import each
+from pancam_graph.graph import Kind, kind_of
 from pancam_graph.smoother._batch import solved_anew
 from pancam_graph.smoother._frame import orthonormal
 from pancam_graph.smoother._map import Change, DriveMap
@@ -167,12 +168,12 @@ class Engine:
         And those of their neighbours that would else be left apart from them.
         """
         o, moved, blocks = self._options, self._tree.moved, self._drive.blocks
-        limit = {"A": o.relinearise_rad, "K": _PIXELS * o.relinearise_rig}
+        limit = {Kind.ANGLES: o.relinearise_rad, Kind.CALIBRATION: _PIXELS * o.relinearise_rig}
         far = {
             key
             for key, delta in moved.items()
-            if (letter := chr(gtsam.symbolChr(key))) != "M"
-            and np.any(np.abs(delta) > limit.get(letter, o.relinearise_rig))
+            if (kind := kind_of(key)) is not Kind.MAST
+            and np.any(np.abs(delta) > limit.get(kind, o.relinearise_rig))
         }
         pending = {
             b

@@ -7,7 +7,7 @@ import numpy as np
 
 from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.data import Traverse
-from pancam_graph.graph import read_variable
+from pancam_graph.graph import Kind, kind_of, read_variable
 from pancam_graph.smoother._batch import whole_traverse
 from pancam_graph.smoother._map import DriveMap
 from pancam_graph.smoother._options import SmootherOptions
@@ -52,7 +52,7 @@ class SmootherState:
         out = gtsam.Values()
         parts = np.split(self.value, np.cumsum(self.width)[:-1])
         for key, numbers in zip(self.key.tolist(), parts, strict=True):
-            if chr(gtsam.symbolChr(key)) == "M":
+            if kind_of(key) is Kind.MAST:
                 matrix = numbers.reshape(3, 4)
                 out.insert(key, gtsam.Pose3(gtsam.Rot3(matrix[:, :3]), matrix[:, 3]))
             else:

@@ -10,7 +10,7 @@ from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.data import Sharing, State, Traverse
 from pancam_graph.elimination import Linkage, Posture
 from pancam_graph.factors import Key
-from pancam_graph.graph import HardTemplate, diagonal_noise, read_variable
+from pancam_graph.graph import HardTemplate, Kind, diagonal_noise, index_of, key_of, kind_of, read_variable
 from pancam_graph.landmarks import CameraViews
 
 __all__ = ["Patch", "Postures", "Station", "copied"]
@@ -29,7 +29,7 @@ class Station:
         slot = self.template.mast(0)
         self.mast = self.global_key[slot.key] if isinstance(slot, Key) else None
         """Key of the mast pose; None where it is held."""
-        self.angles = int(gtsam.symbol("A", number))
+        self.angles = key_of(Kind.ANGLES, number)
         """Key of its angles, if any is free."""
         self.after = -1
         """Number of the station from which odometry led here; -1: from none."""
@@ -42,16 +42,16 @@ class Station:
 
     def _global_keys(self) -> dict[int, int]:
         """The keys that a template of the whole drive has."""
-        out = {key: int(gtsam.symbol(chr(gtsam.symbolChr(key)), self.number)) for key in self.link.key}
+        out = {key: key_of(kind_of(key), self.number) for key in self.link.key}
         for v in self.template.rig_variables.variables:
-            letter, index = chr(gtsam.symbolChr(v.key)), gtsam.symbolIndex(v.key)
+            index = index_of(v.key)
             if v.image is not None:
                 index += self.first_image
             elif v.stop is not None:
                 index += (
                     self.number if v.quantity == "pan_T_tilt" else self.number * len(self.traverse.rig.eyes)
                 )
-            out[v.key] = int(gtsam.symbol(letter, index))
+            out[v.key] = key_of(kind_of(v.key), index)
         return out
 
     @property

@@ -17,7 +17,7 @@ import numpy as np
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray
 from pancam_graph.elimination import Panels, Posture, Root
-from pancam_graph.graph import FactorTemplate
+from pancam_graph.graph import FactorTemplate, graph_of
 from pancam_graph.landmarks import Loss
 from pancam_graph.solve._eliminated import EliminatedSolver
 from pancam_graph.solve._joint import all_columns, retracted
@@ -197,11 +197,9 @@ class _Shared(_Set):
         self._group = link.n_groups - 1
         self._columns = slice(*link.group_column[self._group : self._group + 2].tolist())
         own = {key for key, group in zip(link.key, link.group, strict=True) if group == self._group}
-        self._factors = gtsam.NonlinearFactorGraph()
-        """Those priors and ties that move with it"""
-        for i in range(point.factors.size()):
-            if not own.isdisjoint(point.factors.at(i).keys()):
-                self._factors.push_back(point.factors.at(i))
+        everything = (*point.factors.priors, *point.factors.ties, *point.factors.seated)
+        self._factors = graph_of(factor for factor in everything if not own.isdisjoint(factor.keys()))
+        """Those factors that move with it"""
         self._is_seen = bool(link.touched[link.group == self._group].any())
         """Whether cameras hang on it; else ties alone do"""
 

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 from scipy.linalg import eigh
 
@@ -10,7 +9,7 @@ from pancam_graph.base.errors import SolveError
 from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.data import State
 from pancam_graph.elimination import Covariance, FreeDirectionError, Root
-from pancam_graph.graph import FactorTemplate
+from pancam_graph.graph import FactorTemplate, Kind, index_of, kind_of
 from pancam_graph.solve._problem import Problem
 from pancam_graph.solve._reduced import ReducedSystem, held_columns, loosened_root
 
@@ -117,13 +116,13 @@ def _name(template: FactorTemplate, free: FreeDirectionError) -> str:
         columns = link.columns_of(key)
         if link.group[link.row[key]] != free.group or not columns.start <= free.column < columns.stop:
             continue
-        component, kind = free.column - columns.start, chr(gtsam.symbolChr(key))
-        if kind in "MX":
+        component, kind = free.column - columns.start, kind_of(key)
+        if kind in {Kind.MAST, Kind.CAMERA}:
             what = ("rotation about x", "rotation about y", "rotation about z", "x", "y", "z")[component]
-            entries = t.stops if kind == "M" else t.images
-            return f"the {what} of {entries[gtsam.symbolIndex(key)].id}, with what moves along"
-        if kind == "P":
-            return f"an entry of the projection matrix of {t.images[gtsam.symbolIndex(key)].id}"
+            entries = t.stops if kind is Kind.MAST else t.images
+            return f"the {what} of {entries[index_of(key)].id}, with what moves along"
+        if kind is Kind.PROJECTION:
+            return f"an entry of the projection matrix of {t.images[index_of(key)].id}"
         for v in template.rig_variables.variables:
             if v.key == key:
                 name = template.rig_variables.name(v, v.entries[component])

@@ -8,7 +8,7 @@ import gtsam
 from pancam_graph.base.geometry import IntArray
 from pancam_graph.elimination import LandmarkSystem, Root
 from pancam_graph.factors import LandmarkBlocks
-from pancam_graph.graph import HardTemplate, SoftTemplate, read_variable
+from pancam_graph.graph import HardTemplate, read_variable
 from pancam_graph.landmarks import SQUARED, Loss
 from pancam_graph.solve._joint import JointSystem, OnLastGroup
 from pancam_graph.solve._optimise import InOrder, Iteration, OnGraph, Outcome, optimise, parameters_of
@@ -49,7 +49,7 @@ class EliminatedSolver(Solver):
 
     def _fit(self, problem: Problem, rule: StopRule, loss: Loss, stage: str) -> tuple[Problem, Outcome]:
         costs: tuple[float, ...] = ()
-        if not self._is_near and isinstance(problem.template, SoftTemplate):
+        if not self._is_near and problem.template.has_cameras:
             problem, outcome = self._fit_rigid(problem, loss, stage)
             costs = outcome.costs[:-1]
         self._is_near = True
@@ -76,7 +76,7 @@ class EliminatedSolver(Solver):
         if not template.linkage.touched.any():
             return _only_landmarks(problem, loss)
         system, rows = system_of(problem, loss)
-        minimise = self._by_groups if isinstance(template, SoftTemplate) else self._by_blocks
+        minimise = self._by_groups if template.has_cameras else self._by_blocks
         outcome, joint = minimise(problem, system, rule, stage)
         return self._ended(problem, outcome, system, rows, joint), outcome
 
@@ -102,7 +102,7 @@ class EliminatedSolver(Solver):
         """Where few variables move many images."""
         template = problem.template
         blocks = LandmarkBlocks(system, read_variable, template.posture)
-        graph = gtsam.NonlinearFactorGraph(problem.factors)
+        graph = gtsam.NonlinearFactorGraph(problem.factors.graph)
         for factor in blocks.factors():
             graph.push_back(factor)
         joint: Root | None = None

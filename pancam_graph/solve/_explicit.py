@@ -59,7 +59,7 @@ class ExplicitSolver(Solver):
         problem = _placed(problem, loss)
         template = _soft(problem)
         explicit, present = ExplicitLandmarks(template, problem.measurements), problem.present
-        observed = explicit.calibrations.in_place(template.factors(apart=True))
+        observed = explicit.beside_landmarks(problem.factors.given)
         observed.push_back(explicit.factors(problem.kept, loss))
 
         def values_of(p: Problem) -> gtsam.Values:
@@ -121,7 +121,7 @@ class ExplicitSolver(Solver):
             _weak(problem),
         )
         points = problem.points_m()
-        graph = explicit.calibrations.in_place(template.factors(apart=True))
+        graph = explicit.beside_landmarks(problem.factors.given)
         graph.push_back(explicit.factors(problem.kept))
         graph.push_back(explicit.proximal_factors(points, weak.prior_m, weak.needs_prior))
         values = explicit.with_landmarks(problem.values, points, present)

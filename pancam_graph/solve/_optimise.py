@@ -10,7 +10,7 @@ import numpy as np
 
 from pancam_graph.base.errors import SolveError
 from pancam_graph.base.geometry import IntArray
-from pancam_graph.graph import read_variable
+from pancam_graph.graph import Kind, kind_of, read_variable
 from pancam_graph.solve._stopping import StopRule
 
 __all__ = [
@@ -192,8 +192,7 @@ def is_short(before: gtsam.Values | None, after: gtsam.Values, share: float) -> 
         return False
     length2 = 0.0
     for key in before.keys():  # noqa: SIM118  gtsam.Values is not a dictionary
-        is_landmark = chr(gtsam.symbolChr(key)) == "L"
-        value = before.atPoint3(key) if is_landmark else read_variable(before, key)
+        value = read_variable(before, key)
         if isinstance(value, gtsam.Pose3):
             value = [*gtsam.Rot3.Logmap(value.rotation()), *value.translation()]
         length2 += float(np.sum(np.square(value)))
@@ -259,7 +258,8 @@ class Elimination:
     def __init__(
         self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, *, by_qr: bool = False
     ) -> None:
-        last = [key for key in values.keys() if chr(gtsam.symbolChr(key)) in "ACEMRT"]  # noqa: SIM118  gtsam.Values
+        first = {Kind.CAMERA, Kind.LANDMARK}
+        last = [key for key in values.keys() if kind_of(key) not in first]  # noqa: SIM118  gtsam.Values
         self.ordering = gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(graph, last, False)
         self.by_qr = by_qr
 

@@ -11,7 +11,7 @@ import numpy as np
 from pancam_graph.base.errors import SolveError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.elimination import LandmarkSystem
-from pancam_graph.graph import FactorTemplate
+from pancam_graph.graph import Factors, FactorTemplate
 from pancam_graph.landmarks import SQUARED, CameraViews, Landmarks, Loss, Measurements, refine, residuals
 from pancam_graph.solve._optimise import Iteration, Outcome
 from pancam_graph.solve._stopping import StopRule
@@ -29,8 +29,8 @@ class Problem:
     """Cameras, landmarks and observations at one moment of a solve."""
 
     template: FactorTemplate
-    factors: gtsam.NonlinearFactorGraph
-    """The template's: priors and ties."""
+    factors: Factors
+    """On the template's variables: priors, ties, and the caller's own."""
     measurements: Measurements
     accepted: BoolArray
     """(n,) measurements that take part, but for those of landmarks with fewer than two of them"""
@@ -64,7 +64,7 @@ class Problem:
         return self.landmarks.points_m(furthest)
 
     def cost(self, loss: Loss = SQUARED) -> float:
-        """True cost: half the squares of priors and ties, and the loss of what takes part."""
+        """True cost: half the squares of priors, ties and given factors, and the loss of what takes part."""
         residual, _ = self.residuals()
         return float(self.factors.error(self.values) + loss.cost(residual)[self.kept].sum())
 
@@ -81,7 +81,8 @@ class Problem:
     def on(self, template: FactorTemplate) -> "Problem":
         """The same with other variables, cameras as near to where they are as these allow."""
         values = template.values(self.template.state(self.values, np.zeros((0, 3))))
-        return replace(self, template=template, factors=template.factors(), values=values)
+        factors = template.factors(self.factors.given, present=self.values)
+        return replace(self, template=template, factors=factors, values=values)
 
     def at(self, values: gtsam.Values, landmarks: Landmarks) -> "Problem":
         """The same elsewhere."""
@@ -145,6 +146,6 @@ def system_of(
         m = m.part(np.flatnonzero(take))
     landmarks = Landmarks(vector=problem.landmarks.vector[rows], origin_m=problem.landmarks.origin_m[rows])
     template = problem.template
-    cliques = [*template.cliques, *cliques]
+    cliques = [*template.cliques, *problem.factors.joined(template.linkage), *cliques]
     refined = template.refines_landmarks
     return LandmarkSystem(template.linkage, m, landmarks, loss, cliques=cliques, refined=refined), rows

@@ -1,5 +1,6 @@
 """A problem with its landmarks eliminated: the square root of the system in the cameras' variables."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -7,7 +8,7 @@ import numpy as np
 
 from pancam_graph.base.geometry import IntArray
 from pancam_graph.elimination import LandmarkSystem, Linkage, Panels, Root
-from pancam_graph.graph import FactorTemplate
+from pancam_graph.graph import Factors, FactorTemplate, graph_of
 from pancam_graph.solve._problem import Problem, system_of
 
 __all__ = ["ReducedSystem", "add_factors", "held_columns", "joint_panels", "joint_root", "loosened_root"]
@@ -35,37 +36,31 @@ class ReducedSystem:
         return ReducedSystem(system=system, rows=rows, root=root)
 
 
-def joint_root(
-    template: FactorTemplate, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, panels: Panels
-) -> Root:
-    """Square root of what is left of the landmarks, with priors and ties added. Destroys the panels."""
+def joint_root(template: FactorTemplate, factors: Factors, values: gtsam.Values, panels: Panels) -> Root:
+    """Square root of what is left of the landmarks, with all other factors added. Destroys the panels."""
     return joint_panels(template, factors, values, panels).root()
 
 
-def joint_panels(
-    template: FactorTemplate, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, panels: Panels
-) -> Panels:
-    """What is left of the landmarks, with priors and ties added in place."""
+def joint_panels(template: FactorTemplate, factors: Factors, values: gtsam.Values, panels: Panels) -> Panels:
+    """What is left of the landmarks, with all other factors added in place."""
     add_factors(panels, template.linkage, factors.linearize(values))
     panels.hold(held_columns(template))
     return panels
 
 
 def loosened_root(problem: Problem, system: LandmarkSystem, factor: float) -> Root:
-    """The square root at a problem's values, with the sigmas of all priors multiplied; not those of ties.
+    """The square root at a problem's values, with the sigmas of all priors multiplied by a factor.
 
-    `system` is the problem's, and is linearised anew.
+    Ties and given factors stay as they are. `system` is the problem's, and is linearised anew.
     """
-    template, link = problem.template, problem.template.linkage
-    priors, ties = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
-    for i in range(problem.factors.size()):
-        one = problem.factors.at(i)
-        # Where telemetry holds all else, a tie is of its camera pose alone.
-        of_camera = any(chr(gtsam.symbolChr(key)) == "X" for key in one.keys())  # noqa: SIM118  a gtsam factor
-        (ties if of_camera else priors).push_back(one)
+    template, link, factors = problem.template, problem.template.linkage, problem.factors
     panels = system.linearise(template.posture(problem.values))
-    add_factors(panels, link, ties.linearize(problem.values))
-    add_factors(panels, link, priors.linearize(problem.values), weight=factor**-2)
+
+    def add(which: Sequence[gtsam.NonlinearFactor], weight: float) -> None:
+        add_factors(panels, link, graph_of(which).linearize(problem.values), weight=weight)
+
+    add((*factors.ties, *factors.seated), 1.0)
+    add(factors.priors, factor**-2)
     panels.hold(held_columns(template))
     return panels.root()
 
@@ -78,7 +73,7 @@ def held_columns(template: FactorTemplate) -> dict[int, IntArray]:
 def add_factors(
     panels: Panels, linkage: Linkage, linear: gtsam.GaussianFactorGraph, weight: float = 1.0
 ) -> None:
-    """Add priors and ties, as GTSAM linearises them."""
+    """Add factors as GTSAM linearises them, with `weight` times their information."""
     for i in range(linear.size()):
         factor = linear.at(i)
         if factor is None:

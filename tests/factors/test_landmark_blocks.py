@@ -265,7 +265,7 @@ def test_an_exception_of_the_posture_reaches_the_caller_of_the_optimiser() -> No
             raise LookupError("no such posture: 4711")
         return problem.template.posture(values)
 
-    graph = gtsam.NonlinearFactorGraph(problem.factors)
+    graph = gtsam.NonlinearFactorGraph(problem.factors.graph)
     for factor in LandmarkBlocks(system, read_variable, posture).factors():
         graph.push_back(factor)
     optimiser = gtsam.LevenbergMarquardtOptimizer(graph, problem.values)

@@ -96,7 +96,7 @@ def solved(model: str) -> tuple[Problem, Solution, gtsam.Marginals]:
     problem = adjustment.problem
     assert isinstance(problem.template, SoftTemplate)
     explicit = ExplicitLandmarks(problem.template, problem.measurements)
-    graph = gtsam.NonlinearFactorGraph(problem.factors)
+    graph = gtsam.NonlinearFactorGraph(problem.factors.graph)
     graph.push_back(explicit.factors(problem.kept))
     values = explicit.with_landmarks(problem.values, problem.points_m(), problem.present)
     return problem, solution_from(adjustment), gtsam.Marginals(graph, values)

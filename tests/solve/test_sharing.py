@@ -491,7 +491,7 @@ def test_sigmas_are_gtsams(name: str) -> None:
     problem, solution = adjustment.problem, solution_from(adjustment)
     assert isinstance(problem.template, SoftTemplate)
     explicit = ExplicitLandmarks(problem.template, problem.measurements)
-    graph = explicit.calibrations.in_place(problem.factors)
+    graph = explicit.calibrations.in_place(problem.factors.graph)
     graph.push_back(explicit.factors(problem.kept))
     marginals = gtsam.Marginals(
         graph, explicit.with_landmarks(problem.values, problem.points_m(), problem.present)

@@ -139,7 +139,7 @@ def test_covariances_agree_with_gtsam_marginals() -> None:
     problem = adjustment.problem
     assert isinstance(problem.template, SoftTemplate)
     explicit = ExplicitLandmarks(problem.template, problem.measurements)
-    graph = problem.template.factors(apart=True)
+    graph = problem.template.factors(apart=True).graph
     graph.push_back(explicit.factors(problem.kept))
     values = explicit.with_landmarks(problem.values, problem.points_m(), problem.present)
     marginals = gtsam.Marginals(graph, values)

@@ -1,0 +1,224 @@
+"""GTSAM factors of the caller's, checked, and taken to the variables that a template works on.
+
+The caller writes factors on masts, on pan and tilt of single frames, and on corrections of the rig
+(`GraphKeys`). A template may have these in another form: held by telemetry, or the angles of all frames of a
+stop in one vector. A `Seat` says where each of the caller's variables is among the template's.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import gtsam
+import numpy as np
+
+from pancam_graph.base.errors import InputError, SolveError
+from pancam_graph.base.geometry import FloatArray, IntArray
+from pancam_graph.graph._graph_keys import GraphKeys
+from pancam_graph.graph._keys import read_variable
+
+__all__ = ["GivenFactor", "Seat", "UserFactors", "check_given", "given_factors", "seated"]
+
+UserFactors = Iterable[gtsam.NonlinearFactor] | gtsam.NonlinearFactorGraph
+"""What a caller may give: factors one by one, or a graph of them."""
+
+_T = TypeVar("_T")
+_WORST = 1e30
+"""Cost of a step to where a factor has no finite error: no optimiser takes it."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Seat:
+    """Where a variable of the caller's is among the variables of a template."""
+
+    read: Callable[[gtsam.Values], Any]
+    """Takes values of the template to the variable's own: gtsam.Pose3, vector or number."""
+    parts: tuple[tuple[int, FloatArray], ...]
+    """By key of the template, how the variable's tangent moves with that of the key (dim, dim of the key);
+    none where the variable is held."""
+
+    @staticmethod
+    def same(key: int, dim: int, held: IntArray | None = None) -> "Seat":
+        """A variable that the template has as it is; components in `held` do not move."""
+        moves = np.eye(dim)
+        if held is not None:
+            moves[held, held] = 0.0
+        return Seat(read=lambda values: read_variable(values, key), parts=((key, moves),))
+
+    @staticmethod
+    def fixed(value: Any) -> "Seat":
+        """A variable that nothing moves."""
+        return Seat(read=lambda _values: value, parts=())
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GivenFactor:
+    """A factor of the caller's on keys of `GraphKeys`."""
+
+    factor: gtsam.NonlinearFactor
+    name: str
+    """What an error calls it, with the variables that it is on."""
+
+    @property
+    def keys(self) -> tuple[int, ...]:
+        """The caller's keys."""
+        return tuple(self.factor.keys())
+
+    def cost(self, values: gtsam.Values) -> float:
+        """Its cost at values of its variables; `_WORST` where that is not finite.
+
+        Raises SolveError where the factor raises an exception.
+        """
+        try:
+            cost = float(self.factor.error(values))
+        except Exception as error:  # whatever a caller's function raises
+            raise SolveError(f"{self.name}: expected an error vector, found {_said(error)}") from error
+        return cost if np.isfinite(cost) else _WORST
+
+    def linear(self, values: gtsam.Values) -> tuple[list[int], FloatArray, FloatArray]:
+        """Keys, whitened Jacobian (rows, columns) key after key, and whitened residual (rows,) at values.
+
+        Raises SolveError where the factor raises an exception, or is not finite.
+        """
+        try:
+            linear = self.factor.linearize(values)
+            jacobian, minus_residual = linear.jacobian()
+        except Exception as error:  # whatever a caller's function raises
+            raise SolveError(f"{self.name}: expected Jacobians, found {_said(error)}") from error
+        if not (np.all(np.isfinite(jacobian)) and np.all(np.isfinite(minus_residual))):
+            raise SolveError(f"{self.name}: expected finite residuals and Jacobians, found NaN or infinity")
+        return list(linear.keys()), jacobian, -minus_residual
+
+
+def given_factors(factors: UserFactors | None, keys: GraphKeys) -> tuple[GivenFactor, ...]:
+    """The caller's factors with their names. Raises InputError for what is no factor on these keys."""
+    if factors is None:
+        return ()
+    if isinstance(factors, gtsam.NonlinearFactorGraph):
+        factors = [factors.at(i) for i in range(factors.size())]
+    elif isinstance(factors, gtsam.NonlinearFactor):
+        factors = [factors]
+    out = []
+    for i, factor in enumerate(factors):
+        if not isinstance(factor, gtsam.NonlinearFactor):
+            raise InputError(f"factors: factor {i}: expected a GTSAM factor, found {_kind(factor)}")
+        where = f"factors: factor {i} ({_kind(factor)})"
+        if not factor.keys():
+            raise InputError(f"{where}: expected a factor on one variable or more, found it on none")
+        names = [keys.name(key, where) for key in factor.keys()]  # noqa: SIM118  a gtsam factor
+        name = f"factors: factor {i} ({_kind(factor)} on {', '.join(names)})"
+        noise = factor.noiseModel() if hasattr(factor, "noiseModel") else None
+        if noise is not None and noise.isConstrained():
+            raise InputError(
+                f"{name}: expected sigmas above 0, found a constraint; a sigma far below the others' does it"
+            )
+        out.append(GivenFactor(factor=factor, name=name))
+    return tuple(out)
+
+
+def check_given(
+    given: Iterable[GivenFactor], seats: Mapping[int, Seat], values: gtsam.Values, keys: GraphKeys
+) -> None:
+    """Evaluate factors once at values of a template, before GTSAM does it unguarded.
+
+    Raises InputError naming the factor for one that cannot move anything, raises an exception, is not finite,
+    or has a noise model or a Jacobian of another size than its residual and its variables.
+    """
+    for one in given:
+        if not any(seats[key].parts for key in one.keys):
+            raise InputError(
+                f"{one.name}: expected a variable that is free, found only such as telemetry holds (sigma 0)"
+            )
+        _check(one, _own_values(one, seats, values), {key: keys.dim(key) for key in one.keys})
+
+
+def _check(one: GivenFactor, values: gtsam.Values, dim: Mapping[int, int]) -> None:
+    factor = one.factor
+    if isinstance(factor, gtsam.NoiseModelFactor):
+        jacobians = gtsam.JacobianVector([np.zeros((0, 0))] * len(one.keys))
+        residual = _called(one, lambda: np.atleast_1d(factor.unwhitenedError(values, jacobians)))
+        noise, n = factor.noiseModel(), len(residual)
+        if noise is not None and noise.dim() != n:
+            raise InputError(
+                f"{one.name}: expected a noise model of {n} rows as its error vector has, found {noise.dim()}"
+            )
+        # GTSAM itself reads beyond the end of a Jacobian with too few rows.
+        for key, jacobian in zip(one.keys, jacobians, strict=True):
+            if jacobian.shape != (n, dim[key]):
+                raise InputError(
+                    f"{one.name}: expected for {gtsam.DefaultKeyFormatter(key)} a Jacobian of {n} x {dim[key]}, "
+                    f"found {jacobian.shape[0]} x {jacobian.shape[1]}"
+                )
+    cost = _called(one, lambda: float(factor.error(values)))
+    if not np.isfinite(cost):
+        raise InputError(f"{one.name}: expected a finite error at the start, found {cost}")
+    try:
+        one.linear(values)
+    except SolveError as error:
+        raise InputError(str(error)) from error
+
+
+def _called(one: GivenFactor, evaluate: Callable[[], _T]) -> _T:
+    try:
+        return evaluate()
+    except Exception as error:  # whatever a caller's function raises
+        raise InputError(f"{one.name}: expected an error vector, found {_said(error)}") from error
+
+
+def seated(given: GivenFactor, seats: Mapping[int, Seat]) -> gtsam.CustomFactor | None:
+    """The factor on a template's variables; None where all variables of it are held.
+
+    Its cost and its linearisation are those of the caller's factor, whatever noise model that has.
+    """
+    moving = [key for key in given.keys if seats[key].parts]
+    own = list(dict.fromkeys(k for key in moving for k, _ in seats[key].parts))
+    if not own:
+        return None
+    place = {key: i for i, key in enumerate(own)}
+
+    def evaluate(
+        _this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
+    ) -> FloatArray:
+        local = _own_values(given, seats, values)
+        if jacobians is None:
+            return np.array([np.sqrt(2 * given.cost(local))])
+        keys, whole, residual = given.linear(local)
+        blocks: list[FloatArray | None] = [None] * len(own)
+        begin = 0
+        for key in keys:
+            width = _dim(local, key)
+            for k, moves in seats[key].parts:
+                part = whole[:, begin : begin + width] @ moves
+                before = blocks[place[k]]
+                blocks[place[k]] = part if before is None else before + part
+            begin += width
+        for i, block in enumerate(blocks):
+            assert block is not None
+            jacobians[i] = np.asfortranarray(block)
+        return residual
+
+    # No noise model: the rows are whitened already.
+    no_noise: Any = None
+    return gtsam.CustomFactor(no_noise, own, evaluate)
+
+
+def _own_values(one: GivenFactor, seats: Mapping[int, Seat], values: gtsam.Values) -> gtsam.Values:
+    """The caller's variables of one factor, from values of a template."""
+    out = gtsam.Values()
+    for key in one.keys:
+        out.insert(key, seats[key].read(values))
+    return out
+
+
+def _dim(values: gtsam.Values, key: int) -> int:
+    value = read_variable(values, key)
+    return 6 if isinstance(value, gtsam.Pose3) else int(np.size(value))
+
+
+def _kind(thing: object) -> str:
+    return type(thing).__name__
+
+
+def _said(error: Exception) -> str:
+    text = " ".join(str(error).split())
+    return f"{_kind(error)}: {text[:200]}" if text else _kind(error)

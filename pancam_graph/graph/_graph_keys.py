@@ -1,0 +1,169 @@
+"""Keys of a traverse's variables, for callers who write GTSAM factors of their own."""
+
+from collections.abc import Sequence
+from difflib import get_close_matches
+from typing import NoReturn
+
+import gtsam
+import numpy as np
+
+from pancam_graph.base.errors import InputError
+from pancam_graph.base.geometry import IntArray
+from pancam_graph.data import Quantity, Traverse
+from pancam_graph.graph._keys import Kind, key_of
+from pancam_graph.graph._rig_variables import RigVariable, RigVariables
+
+__all__ = ["GraphKeys"]
+
+_NAMED = 6
+_CALLED: dict[Quantity, str] = {
+    "calibration": "calibration",
+    "mounts": "mount",
+    "pan_T_tilt": "tilt axis",
+    "radius": "radius",
+}
+_POSE = ("rotation_x_rad", "rotation_y_rad", "rotation_z_rad", "x_m", "y_m", "z_m")
+
+
+class GraphKeys:
+    """Keys of the masts, the pan and tilt angles, and the free entries of the rig of one traverse.
+
+    Masts are gtsam.Pose3 (`world_T_mast`; tangent in the mast's frame, rotation first, radians and metres).
+    Angles are vectors (2,): pan and tilt of one frame, radians. Variables of the rig are vectors of
+    corrections to what the rig says, 0 where nothing differs; of `radius` numbers, metres. What telemetry
+    holds (sigma 0) has a key too: a factor may name it, and it does not move.
+    """
+
+    def __init__(self, traverse: Traverse, rig: RigVariables) -> None:
+        """`rig` has the free entries of the traverse's rig."""
+        self._traverse, self._rig = traverse, rig
+        self._stop = {stop.id: key_of(Kind.MAST, i) for i, stop in enumerate(traverse.stops)}
+        self._frame = {frame.id: key_of(Kind.ANGLES, i) for i, frame in enumerate(traverse.frames)}
+        self._name = {key: f"mast of {stop}" for stop, key in self._stop.items()}
+        self._name |= {key: f"angles of {frame}" for frame, key in self._frame.items()}
+        self._name |= {v.key: self._name_of(v) for v in rig.variables}
+        self._entries: dict[int, tuple[str, ...]] = dict.fromkeys(self._stop.values(), _POSE)
+        self._entries |= dict.fromkeys(self._frame.values(), ("pan_rad", "tilt_rad"))
+        self._entries |= {v.key: v.entries for v in rig.variables}
+
+    def mast(self, stop: str) -> int:
+        """Key of the mast pose of a stop, by its id. Raises InputError for an unknown id."""
+        return self._stop[stop] if stop in self._stop else _unknown("stop", stop, list(self._stop))
+
+    def angles(self, frame: str) -> int:
+        """Key of pan and tilt of a frame, by its id. Raises InputError for an unknown id.
+
+        In models other than `mast` these are the angles that the mast has, which the cameras follow loosely.
+        """
+        return self._frame[frame] if frame in self._frame else _unknown("frame", frame, list(self._frame))
+
+    def calibration(
+        self, camera: str | None = None, *, stop: str | None = None, image: str | None = None
+    ) -> int:
+        """Key of the free entries of a calibration, by as much of its owner as tells it from others.
+
+        Raises InputError where no calibration is free, and where several or none fit.
+        """
+        return self._rig_key("calibration", camera, stop, image)
+
+    def mount(self, camera: str | None = None, *, stop: str | None = None, image: str | None = None) -> int:
+        """Key of the free entries of a mount (`head_T_camera`); see `calibration`."""
+        return self._rig_key("mounts", camera, stop, image)
+
+    def tilt_axis(self, *, stop: str | None = None) -> int:
+        """Key of the free entries of the tilt axis (`pan_T_tilt`); see `calibration`."""
+        return self._rig_key("pan_T_tilt", None, stop, None)
+
+    def radius(self, camera: str | None = None, *, stop: str | None = None, image: str | None = None) -> int:
+        """Key of the radius of a camera's circle (model `circle`); see `calibration`."""
+        return self._rig_key("radius", camera, stop, image)
+
+    def landmark(self, name: str) -> NoReturn:
+        """Raise InputError: terrain points have no keys yet."""
+        raise InputError(
+            f"landmark {name!r}: expected a mast, angles or a variable of the rig; factors on terrain points "
+            "are not supported yet"
+        )
+
+    def entries(self, key: int) -> tuple[str, ...]:
+        """Names, with units, of the tangent's components of a key, in their order."""
+        self.name(key)
+        return self._entries[key]
+
+    def dim(self, key: int) -> int:
+        """Number of the tangent's components of a key."""
+        return len(self._entries[key])
+
+    def name(self, key: int, where: str = "key") -> str:
+        """What a key is, in words. Raises InputError, beginning with `where`, for a key of something else."""
+        if key in self._name:
+            return self._name[key]
+        shown = gtsam.DefaultKeyFormatter(key)
+        letter, index = chr(gtsam.symbolChr(key)), gtsam.symbolIndex(key)
+        alike = [k for k in self._name if chr(gtsam.symbolChr(k)) == letter]
+        hint = ""
+        if alike:
+            nearest = min(alike, key=lambda k: abs(int(gtsam.symbolIndex(k)) - int(index)))
+            hint = f"; is {gtsam.DefaultKeyFormatter(nearest)}, the {self._name[nearest]}, meant?"
+        elif letter == Kind.LANDMARK.value:
+            hint = "; factors on terrain points are not supported yet"
+        elif letter in {kind.value for kind in Kind}:
+            hint = "; with this model and sharing there is no such variable"
+        raise InputError(
+            f"{where}: expected keys of graph_keys(traverse, options): {self._summary()}; found {shown}{hint}"
+        )
+
+    def _summary(self) -> str:
+        parts = [f"{len(self._stop)} masts", f"angles of {len(self._frame)} frames"]
+        return ", ".join([*parts, *(self._name[v.key] for v in self._rig.variables[:_NAMED])])
+
+    def _name_of(self, v: RigVariable) -> str:
+        return f"{_CALLED[v.quantity]}{self._rig.owner(v)}"
+
+    def _rig_key(self, quantity: Quantity, camera: str | None, stop: str | None, image: str | None) -> int:
+        called, t = _CALLED[quantity], self._traverse
+        variables = self._rig.of[quantity]
+        if not variables:
+            raise InputError(
+                f"{called}: expected it to be free, found it fixed; Sharing({quantity}=...) frees it"
+            )
+        axis = quantity == "pan_T_tilt"
+        sites = np.ones(len(t.stops if axis else t.images), dtype=bool)
+        if camera is not None:
+            names = [eye.name for eye in t.rig.eyes]
+            sites &= t.image_eye == (
+                names.index(camera) if camera in names else _unknown("camera", camera, names)
+            )
+        if stop is not None:
+            self.mast(stop)
+            wanted = list(self._stop).index(stop)
+            of_site: IntArray = np.arange(len(t.stops)) if axis else t.image_stop
+            sites &= of_site == wanted
+        if image is not None:
+            ids = [one.id for one in t.images]
+            sites &= np.arange(len(ids)) == (
+                ids.index(image) if image in ids else _unknown("image", image, ids)
+            )
+        fitting = np.unique(self._rig.place(quantity)[sites])
+        if len(fitting) == 1:
+            return variables[int(fitting[0])].key
+        among = [self._name[variables[int(i)].key] for i in fitting] or [self._name[v.key] for v in variables]
+        found = ", ".join(
+            f"{what} {name!r}"
+            for what, name in (("camera", camera), ("stop", stop), ("image", image))
+            if name is not None
+        )
+        raise InputError(
+            f"{called}: expected one of {_some(among)}; found {found or 'nothing that says which'}"
+        )
+
+
+def _unknown(what: str, found: str, names: Sequence[str]) -> NoReturn:
+    near = get_close_matches(str(found), names, n=1, cutoff=0.5)
+    hint = f"; is {near[0]!r} meant?" if near else ""
+    raise InputError(f"{what}: expected one of {_some(names)}; found {found!r}{hint}")
+
+
+def _some(names: Sequence[str]) -> str:
+    shown = ", ".join(names[:_NAMED])
+    return shown if len(names) <= _NAMED else f"{shown} and {len(names) - _NAMED} more"

@@ -1,0 +1,60 @@
+"""What a variable of a graph is, told by its key: the only place where keys are made and read."""
+
+from enum import Enum
+from typing import Any
+
+import gtsam
+
+__all__ = ["Kind", "index_of", "key_of", "kind_of", "read_variable"]
+
+
+class Kind(Enum):
+    """Kinds of variables; the value of each is the letter that its keys have in GTSAM."""
+
+    MAST = "M"
+    """Mast pose of a stop (Pose3)."""
+    ANGLES = "A"
+    """Pan and tilt: of one frame (vector of 2), or stacked of all frames of a stop that are not held."""
+    CAMERA = "X"
+    """Camera pose of an image (Pose3)."""
+    PROJECTION = "P"
+    """Entries of the conditioned projection matrix of an image (vector of 12)."""
+    LANDMARK = "L"
+    """Terrain point (Point3)."""
+    CALIBRATION = "K"
+    """Free entries of a correction of a calibration (vector)."""
+    MOUNT = "E"
+    """Free entries of a correction of a mount, `head_T_camera` (vector)."""
+    TILT_AXIS = "T"
+    """Free entries of a correction of a tilt axis, `pan_T_tilt` (vector)."""
+    RADIUS = "R"
+    """Radius of an eye's circle, metres (number)."""
+    NATIVE_CALIBRATION = "C"
+    """Calibration as GTSAM's projection factors want it (Cal3_S2)."""
+
+
+def key_of(kind: Kind, index: int) -> int:
+    """Key of a variable, by its kind and its number among those of its kind."""
+    return int(gtsam.symbol(kind.value, index))
+
+
+def kind_of(key: int) -> Kind:
+    """Kind of the variable that a key made here names. Raises ValueError for any other key."""
+    return Kind(chr(gtsam.symbolChr(key)))
+
+
+def index_of(key: int) -> int:
+    """Number of the variable among those of its kind."""
+    return int(gtsam.symbolIndex(key))
+
+
+def read_variable(values: gtsam.Values, key: int) -> Any:
+    """Value of a variable: gtsam.Pose3, vector or number; of a Cal3_S2 its five numbers (5,)."""
+    kind = kind_of(key)
+    if kind in {Kind.MAST, Kind.CAMERA}:
+        return values.atPose3(key)
+    if kind is Kind.LANDMARK:
+        return values.atPoint3(key)
+    if kind is Kind.NATIVE_CALIBRATION:
+        return values.atCal3_S2(key).vector()
+    return values.atDouble(key) if kind is Kind.RADIUS else values.atVector(key)
