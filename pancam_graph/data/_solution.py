@@ -6,11 +6,14 @@ from functools import cached_property
 import gtsam
 import numpy as np
 
+from pancam_graph.base.choices import expected_one_of
+from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, corrected_poses
 from pancam_graph.cameras import CALIBRATION_ENTRIES, Camera, projection_matrix
 from pancam_graph.data._cross_validation import CrossValidation
 from pancam_graph.data._sharing import Quantity
 from pancam_graph.data._traverse import Traverse
+from pancam_graph.elimination import JointCovariance, relative_pose_covariance
 from pancam_graph.rigs import Rig
 
 __all__ = ["Incremental", "Refined", "RigCorrection", "Seconds", "Solution", "State", "rms_px"]
@@ -164,6 +167,8 @@ class Solution:
     """(observations, 2, 2) covariance each was weighted with in the end, where the input has covariances."""
     landmark_covariance_m2: FloatArray | None = None
     """(landmarks, 3, 3) of `final.landmarks_m`, all else marginalised; formal; where it was asked for."""
+    mast_covariance: JointCovariance | None = field(default=None, repr=False)
+    """What `stop_covariance_between` works from; None where the solution leaves a direction free."""
     came_back: BoolArray | None = None
     """(observations,) whether each took part in the end after it had been set aside; None: not followed."""
     refined: tuple[Refined, ...] = ()
@@ -259,6 +264,32 @@ class Solution:
     def correction_rad(self) -> FloatArray:
         """(frames, 2) how far pan and tilt moved from the telemetry."""
         return self.final.pan_tilt_rad - self.traverse.pan_tilt_rad
+
+    def stop_covariance_between(self, stop_a: str, stop_b: str) -> FloatArray:
+        """Joint covariance (12, 12) of two stops' mast poses, all else marginalised; formal.
+
+        In body-frame tangents, rotation first: those of `stop_a`, then those of `stop_b`; its diagonal blocks
+        are `stop_covariance`. 0 where a pose is held, NaN where the solution leaves a direction free. Raises
+        InputError for an unknown stop.
+        """
+        i, j = self._stop_row(stop_a), self._stop_row(stop_b)
+        return np.full((12, 12), np.nan) if self.mast_covariance is None else self.mast_covariance.of(i, j)
+
+    def relative_covariance(self, stop_a: str, stop_b: str) -> FloatArray:
+        """Covariance (6, 6) of a_T_b, where b's mast is as a's sees it; rotation first, in the frame of b.
+
+        What is wrong with both alike does not count: this is how well images join two stops. See
+        `stop_covariance_between`.
+        """
+        joint = self.stop_covariance_between(stop_a, stop_b)
+        a, b = (self.final.world_T_mast[self._stop_row(stop)] for stop in (stop_a, stop_b))
+        return relative_pose_covariance(a, b, joint)
+
+    def _stop_row(self, stop: str) -> int:
+        ids = [entry.id for entry in self.traverse.stops]
+        if stop not in ids:
+            raise InputError(expected_one_of("stop", stop, ids))
+        return ids.index(stop)
 
     def with_seconds(self, **seconds: float) -> "Solution":
         """The same solution with some wall-clock times filled in."""

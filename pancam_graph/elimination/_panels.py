@@ -258,6 +258,32 @@ class Root:
             x[begin[g] : begin[g + 1]] = found
         return x
 
+    def inverse_columns(self, g: int, columns: slice) -> FloatArray:
+        """Columns (all columns, n) of the inverse of R'R that belong to some columns of group g.
+
+        By forward and back substitution, so blocks of any two groups are at hand. Raises FreeDirectionError
+        where R leaves a direction free.
+        """
+        st = self.structure
+        begin = np.concatenate([[0], np.cumsum(st.dim)])
+        x = np.zeros((int(begin[-1]), columns.stop - columns.start))
+        x[begin[g] + columns.start : begin[g] + columns.stop] = np.eye(x.shape[1])
+        for h in st.order:
+            n, rows = int(st.dim[h]), self.rows[h]
+            if len(rows) < n:
+                raise FreeDirectionError(h, _loosest(rows[:, :n]))
+            own = slice(begin[h], begin[h + 1])
+            if x[own].any():
+                x[own] = np.linalg.solve(rows[:, :n].T, x[own])
+                for k, a, b in zip(st.after[h][1:], st.begin[h][1:-1], st.begin[h][2:], strict=True):
+                    x[begin[k] : begin[k + 1]] -= rows[:, a:b].T @ x[own]
+        for h in reversed(st.order):
+            n, rows = int(st.dim[h]), self.rows[h]
+            own = slice(begin[h], begin[h + 1])
+            rest = np.concatenate([x[:0], *(x[begin[k] : begin[k + 1]] for k in st.after[h][1:])])
+            x[own] = np.linalg.solve(rows[:, :n], x[own] - rows[:, n:-1] @ rest)
+        return x
+
     def covariance(self) -> "Covariance":
         """The blocks of the inverse of R'R where R is filled (Takahashi's recursion).
 

@@ -145,8 +145,9 @@ def _check(one: GivenFactor, values: gtsam.Values, dim: Mapping[int, int]) -> No
         # GTSAM itself reads beyond the end of a Jacobian with too few rows.
         for key, jacobian in zip(one.keys, jacobians, strict=True):
             if jacobian.shape != (n, dim[key]):
+                shown = gtsam.DefaultKeyFormatter(key)
                 raise InputError(
-                    f"{one.name}: expected for {gtsam.DefaultKeyFormatter(key)} a Jacobian of {n} x {dim[key]}, "
+                    f"{one.name}: expected for {shown} a Jacobian of {n} x {dim[key]}, "
                     f"found {jacobian.shape[0]} x {jacobian.shape[1]}"
                 )
     cost = _called(one, lambda: float(factor.error(values)))

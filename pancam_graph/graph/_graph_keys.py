@@ -1,14 +1,13 @@
 """Keys of a traverse's variables, for callers who write GTSAM factors of their own."""
 
-from collections.abc import Sequence
-from difflib import get_close_matches
 from typing import NoReturn
 
 import gtsam
 import numpy as np
 
+from pancam_graph.base.choices import expected_one_of, some_of
 from pancam_graph.base.errors import InputError
-from pancam_graph.base.geometry import IntArray
+from pancam_graph.base.geometry import BoolArray
 from pancam_graph.data import Quantity, Traverse
 from pancam_graph.graph._keys import Kind, key_of
 from pancam_graph.graph._rig_variables import RigVariable, RigVariables
@@ -48,14 +47,18 @@ class GraphKeys:
 
     def mast(self, stop: str) -> int:
         """Key of the mast pose of a stop, by its id. Raises InputError for an unknown id."""
-        return self._stop[stop] if stop in self._stop else _unknown("stop", stop, list(self._stop))
+        if stop not in self._stop:
+            raise InputError(expected_one_of("stop", stop, list(self._stop)))
+        return self._stop[stop]
 
     def angles(self, frame: str) -> int:
         """Key of pan and tilt of a frame, by its id. Raises InputError for an unknown id.
 
         In models other than `mast` these are the angles that the mast has, which the cameras follow loosely.
         """
-        return self._frame[frame] if frame in self._frame else _unknown("frame", frame, list(self._frame))
+        if frame not in self._frame:
+            raise InputError(expected_one_of("frame", frame, list(self._frame)))
+        return self._frame[frame]
 
     def calibration(
         self, camera: str | None = None, *, stop: str | None = None, image: str | None = None
@@ -121,30 +124,13 @@ class GraphKeys:
         return f"{_CALLED[v.quantity]}{self._rig.owner(v)}"
 
     def _rig_key(self, quantity: Quantity, camera: str | None, stop: str | None, image: str | None) -> int:
-        called, t = _CALLED[quantity], self._traverse
+        called = _CALLED[quantity]
         variables = self._rig.of[quantity]
         if not variables:
             raise InputError(
                 f"{called}: expected it to be free, found it fixed; Sharing({quantity}=...) frees it"
             )
-        axis = quantity == "pan_T_tilt"
-        sites = np.ones(len(t.stops if axis else t.images), dtype=bool)
-        if camera is not None:
-            names = [eye.name for eye in t.rig.eyes]
-            sites &= t.image_eye == (
-                names.index(camera) if camera in names else _unknown("camera", camera, names)
-            )
-        if stop is not None:
-            self.mast(stop)
-            wanted = list(self._stop).index(stop)
-            of_site: IntArray = np.arange(len(t.stops)) if axis else t.image_stop
-            sites &= of_site == wanted
-        if image is not None:
-            ids = [one.id for one in t.images]
-            sites &= np.arange(len(ids)) == (
-                ids.index(image) if image in ids else _unknown("image", image, ids)
-            )
-        fitting = np.unique(self._rig.place(quantity)[sites])
+        fitting = np.unique(self._rig.place(quantity)[self._sites(quantity, camera, stop, image)])
         if len(fitting) == 1:
             return variables[int(fitting[0])].key
         among = [self._name[variables[int(i)].key] for i in fitting] or [self._name[v.key] for v in variables]
@@ -154,16 +140,23 @@ class GraphKeys:
             if name is not None
         )
         raise InputError(
-            f"{called}: expected one of {_some(among)}; found {found or 'nothing that says which'}"
+            f"{called}: expected one of {some_of(among)}; found {found or 'nothing that says which'}"
         )
 
-
-def _unknown(what: str, found: str, names: Sequence[str]) -> NoReturn:
-    near = get_close_matches(str(found), names, n=1, cutoff=0.5)
-    hint = f"; is {near[0]!r} meant?" if near else ""
-    raise InputError(f"{what}: expected one of {_some(names)}; found {found!r}{hint}")
-
-
-def _some(names: Sequence[str]) -> str:
-    shown = ", ".join(names[:_NAMED])
-    return shown if len(names) <= _NAMED else f"{shown} and {len(names) - _NAMED} more"
+    def _sites(
+        self, quantity: Quantity, camera: str | None, stop: str | None, image: str | None
+    ) -> BoolArray:
+        """Which images (of pan_T_tilt: stops) are of a camera, of a stop, or one image."""
+        t = self._traverse
+        axis = quantity == "pan_T_tilt"
+        sites = np.ones(len(t.stops if axis else t.images), dtype=bool)
+        for what, found, names, of_site in (
+            ("camera", camera, [eye.name for eye in t.rig.eyes], t.image_eye),
+            ("stop", stop, list(self._stop), np.arange(len(t.stops)) if axis else t.image_stop),
+            ("image", image, [one.id for one in t.images], np.arange(len(t.images))),
+        ):
+            if found is not None:
+                if found not in names:
+                    raise InputError(expected_one_of(what, found, names))
+                sites &= of_site == names.index(found)
+        return sites

@@ -9,7 +9,7 @@ import numpy as np
 
 from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.data import Refined, RigCorrection, Sharing, State, Traverse
-from pancam_graph.elimination import Covariance, Linkage, Posture
+from pancam_graph.elimination import Covariance, JointCovariance, Linkage, PosePlace, Posture, Root
 from pancam_graph.factors import Fixed, Key, Slot
 from pancam_graph.graph._factors import FactorList, Factors
 from pancam_graph.graph._given import GivenFactor, Seat, seated
@@ -192,6 +192,19 @@ class FactorTemplate(ABC):
                 rows = self.linkage.columns_of(slot.key)
                 out[i] = covariance.block(i, i)[rows, rows]
         return out
+
+    def mast_covariance(self, root: Root) -> JointCovariance:
+        """Joint covariances of mast poses, from the square root of this template's whole system."""
+        held = self.held_of_stops()
+        places: list[PosePlace | None] = []
+        for i in range(len(self.traverse.stops)):
+            slot = self.mast(i)
+            place = None
+            if isinstance(slot, Key):
+                columns = self.linkage.columns_of(slot.key)
+                place = PosePlace(group=i, columns=columns, held=held[slot.key])
+            places.append(place)
+        return JointCovariance(root=root, places=tuple(places))
 
     def views_of(
         self, world_R_camera: FloatArray, world_t_camera: FloatArray, values: gtsam.Values

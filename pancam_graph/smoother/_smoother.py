@@ -12,6 +12,7 @@ from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.base.threads import blas_on_one_thread
 from pancam_graph.cameras import carry_to_pinhole
 from pancam_graph.data import Frame, Image, Observations, Sharing, Stop, Traverse
+from pancam_graph.elimination import relative_pose_covariance
 from pancam_graph.landmarks import Landmarks
 from pancam_graph.rigs import Rig
 from pancam_graph.smoother._batch import whole_traverse
@@ -100,9 +101,7 @@ class TraverseSmoother:
         if a is b:
             return np.zeros((6, 6))
         values = self._engine.estimate
-        by_a = -b.world_T_mast(values).between(a.world_T_mast(values)).AdjointMap()
-        jacobian = np.hstack([by_a, np.eye(6)])
-        return np.asarray(jacobian @ self._joint([a, b]) @ jacobian.T)
+        return relative_pose_covariance(a.world_T_mast(values), b.world_T_mast(values), self._joint([a, b]))
 
     def _joint(self, stations: Sequence[Station]) -> FloatArray:
         """Joint covariance of mast poses; 0 where held."""

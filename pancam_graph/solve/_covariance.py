@@ -8,7 +8,7 @@ from scipy.linalg import eigh
 from pancam_graph.base.errors import SolveError
 from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.data import State
-from pancam_graph.elimination import Covariance, FreeDirectionError, Root
+from pancam_graph.elimination import Covariance, FreeDirectionError, JointCovariance, Root
 from pancam_graph.graph import FactorTemplate, Kind, index_of, kind_of
 from pancam_graph.solve._problem import Problem
 from pancam_graph.solve._reduced import ReducedSystem, held_columns, loosened_root
@@ -37,6 +37,8 @@ class Uncertainty:
     """(entries,) of each variable of the rig; None where unknown"""
     unseen: tuple[str, ...] = ()
     """Directions of the rig that images do not tell, by the entries that they consist of"""
+    masts: JointCovariance | None = None
+    """Of pairs of mast poses; None where unknown"""
 
 
 def uncertainty(
@@ -57,6 +59,7 @@ def uncertainty(
         spread[rows] = system.landmark_covariance_m2(covariance)
     return Uncertainty(
         stop_covariance=template.stop_covariance(covariance),
+        masts=template.mast_covariance(reduced.root),
         angle_sigma_rad=template.angle_sigma_rad(covariance, state),
         landmark_covariance_m2=spread,
         undetermined=undetermined,

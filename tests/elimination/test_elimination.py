@@ -10,7 +10,18 @@ import pytest
 
 from pancam_graph.base.errors import SolveError
 from pancam_graph.base.geometry import FloatArray, IntArray
-from pancam_graph.elimination import LandmarkSystem, Linkage, Panels, Posture, Root, pattern
+from pancam_graph.elimination import (
+    FreeDirectionError,
+    JointCovariance,
+    LandmarkSystem,
+    Linkage,
+    Panels,
+    PosePlace,
+    Posture,
+    Root,
+    pattern,
+    relative_pose_covariance,
+)
 from pancam_graph.landmarks import CameraViews, LossName, kernel, loss_of
 from support.elimination_reference import assert_systems_agree, dense_of, true_cost, whole
 from support.landmark_scenes import measure, random_points, random_views, unit
@@ -447,3 +458,66 @@ def test_the_innermost_loop_in_vectors_is_the_plain_one(pairs: tuple[int, ...]) 
             S[pair[p], pair[q]] -= arms_of[p].T @ arms_of[q]
     assert tiles == pytest.approx(S.ravel(), abs=1e-14)
     assert plain == pytest.approx(S.ravel(), abs=1e-14)
+
+
+@pytest.mark.parametrize("name", GRAPHS)
+def test_columns_of_the_inverse_are_those_of_a_dense_one(name: str) -> None:
+    """Of groups that no clique joins too."""
+    random = Random(name, scaled=True)
+    inverse = np.linalg.inv(random.S)
+    root = random.panels.root()
+    size = np.sqrt(np.diag(inverse))
+    for g, dim in enumerate(random.dim.tolist()):
+        columns = slice(dim // 2, dim)
+        found = root.inverse_columns(g, columns)
+        expected = inverse[:, random.begin[g] + columns.start : random.begin[g] + columns.stop]
+        scale = np.outer(size, size[random.begin[g] + columns.start : random.begin[g] + columns.stop])
+        assert np.abs((found - expected) / scale).max() < 1e-9
+
+
+def test_columns_of_the_inverse_need_all_directions() -> None:
+    panels = Panels(pattern(np.array([3, 3]), [(0, 1)]))
+    panels.add([0], np.diag([1.0, 1.0, 0.0]), np.zeros(3))
+    panels.add([1], np.eye(3), np.zeros(3))
+    with pytest.raises(FreeDirectionError):
+        panels.root().inverse_columns(1, slice(0, 3))
+
+
+def test_joint_covariance_of_poses_is_that_of_a_dense_inverse() -> None:
+    """Of poses that no clique joins, one of them partly held, one held altogether."""
+    random = Random("chain")  # group 0 has 6 columns, group 3 has 12
+    held = np.array([3, 5])
+    panels = random.panels.copy()
+    panels.hold({3: 6 + held})
+    joint = JointCovariance(
+        root=panels.root(),
+        places=(
+            PosePlace(group=0, columns=slice(0, 6), held=np.zeros(0, dtype=np.int64)),
+            PosePlace(group=3, columns=slice(6, 12), held=held),
+            None,
+        ),
+    )
+    free = np.setdiff1d(np.arange(len(random.S)), random.begin[3] + 6 + held)
+    inverse = np.zeros_like(random.S)
+    inverse[np.ix_(free, free)] = np.linalg.inv(random.S[np.ix_(free, free)])
+    rows = np.concatenate([np.arange(6), random.begin[3] + np.arange(6, 12)])
+    assert joint.of(0, 1) == pytest.approx(inverse[np.ix_(rows, rows)], abs=1e-12 * np.abs(inverse).max())
+    assert joint.of(1, 0)[6:, 6:] == pytest.approx(joint.of(0, 1)[:6, :6])
+    with_held = joint.of(2, 0)
+    assert not with_held[:6].any()
+    assert not with_held[:, :6].any()
+    assert with_held[6:, 6:] == pytest.approx(joint.of(0, 1)[:6, :6])
+
+
+def test_covariance_of_a_relative_pose_is_that_of_samples() -> None:
+    rng = np.random.default_rng(2)
+    a, b = (gtsam.Pose3.Expmap(rng.normal(size=6)) for _ in range(2))
+    half = 1e-3 * rng.normal(size=(12, 12))
+    steps = rng.normal(size=(40_000, 12)) @ half.T
+    relative = a.between(b)
+    moved = np.array(
+        [relative.localCoordinates(a.retract(step[:6]).between(b.retract(step[6:]))) for step in steps]
+    )
+    expected = relative_pose_covariance(a, b, half @ half.T)
+    size = np.sqrt(np.diag(expected))
+    assert np.abs((moved.T @ moved / len(moved) - expected) / np.outer(size, size)).max() < 0.03
