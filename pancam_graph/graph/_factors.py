@@ -18,19 +18,31 @@ FactorList = list[gtsam.NonlinearFactor]
 class Factors:
     """All factors of a problem but those of landmarks, on the variables of one template."""
 
-    priors: tuple[gtsam.NonlinearFactor, ...]
-    """What telemetry, odometry and the rig's own priors say."""
+    telemetry: tuple[gtsam.NonlinearFactor, ...]
+    """Priors of masts and angles, and motions from stop to stop."""
     ties: tuple[gtsam.NonlinearFactor, ...] = ()
     """What joins camera poses, or projection matrices, to the mast."""
+    rig: tuple[gtsam.NonlinearFactor, ...] = ()
+    """Priors of free entries of the rig."""
     given: tuple[GivenFactor, ...] = ()
     """Factors of the caller's, on the keys that the caller knows."""
     seated: tuple[gtsam.NonlinearFactor, ...] = ()
     """The same on the template's own variables; fewer where all variables of one are held."""
 
+    @property
+    def priors(self) -> tuple[gtsam.NonlinearFactor, ...]:
+        """What is known beside images and given factors, ties apart."""
+        return (*self.telemetry, *self.rig)
+
+    @property
+    def all(self) -> tuple[gtsam.NonlinearFactor, ...]:
+        """All of them, on the template's variables."""
+        return (*self.telemetry, *self.ties, *self.rig, *self.seated)
+
     @cached_property
     def graph(self) -> gtsam.NonlinearFactorGraph:
-        """All of them: priors, ties, given factors."""
-        return graph_of((*self.priors, *self.ties, *self.seated))
+        """All of them as a graph."""
+        return graph_of(self.all)
 
     def joined(self, linkage: Linkage) -> list[set[int]]:
         """Groups of variables that each given factor joins."""

@@ -209,11 +209,10 @@ class HardTemplate(FactorTemplate):
                 angles[frames] = values.atVector(self.angles_key(stop)).reshape(-1, 2)
         return angles
 
-    def priors(self) -> FactorList:
-        """Priors of the masts, of the angles, and of what of the rig is free."""
+    def telemetry_priors(self) -> FactorList:
+        """Priors of masts and angles, stop by stop."""
         stops = range(len(self.traverse.stops))
-        out = [factor for i in stops for factor in (*self.stop_factors(i), *self.angle_factors(i))]
-        return out + [f for owner in (*stops, None) for f in self.rig_variables.prior_factors(owner)]
+        return [factor for i in stops for factor in (*self.stop_factors(i), *self.angle_factors(i))]
 
     def angle_factors(self, stop: int) -> FactorList:
         """The prior of a stop's pan and tilt angles."""

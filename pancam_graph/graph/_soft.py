@@ -157,15 +157,11 @@ class SoftTemplate(FactorTemplate):
             circle_factor(on_circle, cameras, mast, [slot for slot, _ in radii], angles, offset),
         ]
 
-    def priors(self) -> FactorList:
-        """Priors of the masts, of the angles, and of what of the rig is free."""
+    def telemetry_priors(self) -> FactorList:
+        """Priors of masts, then of angles."""
         t = self.traverse
-        groups = [
-            *(self.stop_factors(i) for i in range(len(t.stops))),
-            *(self.frame_factors(i) for i in range(len(t.frames))),
-            *(self.rig_variables.prior_factors(i) for i in (*range(len(t.stops)), None)),
-        ]
-        return [factor for group in groups for factor in group]
+        masts = [factor for i in range(len(t.stops)) for factor in self.stop_factors(i)]
+        return masts + [factor for i in range(len(t.frames)) for factor in self.frame_factors(i)]
 
     def ties(self, *, apart: bool = False) -> FactorList:
         """Ties of cameras to the mast: one factor for each stop, or for each image if `apart`."""

@@ -54,8 +54,8 @@ class FactorTemplate(ABC):
         """Cameras of all images at the values."""
 
     @abstractmethod
-    def priors(self) -> FactorList:
-        """Priors of masts, angles, and free entries of the rig."""
+    def telemetry_priors(self) -> FactorList:
+        """Priors of masts and angles."""
 
     def ties(self, *, apart: bool = False) -> FactorList:
         """What joins cameras to the mast, stop by stop, or image by image if `apart`; here nothing."""
@@ -75,10 +75,12 @@ class FactorTemplate(ABC):
         eliminate all of it.
         """
         seats = self.seats(given, present)
+        owners = (*range(len(self.traverse.stops)), None)
         placed = (seated(one, seats) for one in given)
         return Factors(
-            priors=tuple(self.priors()),
+            telemetry=tuple(self.telemetry_priors()),
             ties=tuple(self.ties(apart=apart)),
+            rig=tuple(factor for owner in owners for factor in self.rig_variables.prior_factors(owner)),
             given=tuple(given),
             seated=tuple(factor for factor in placed if factor is not None),
         )

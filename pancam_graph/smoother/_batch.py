@@ -33,7 +33,7 @@ def whole_problem(drive: DriveMap, values: gtsam.Values) -> Problem:
     template = HardTemplate(whole_traverse(drive), drive.stations[0].template.rig_variables.sharing)
     return Problem(
         template=template,
-        factors=Factors(priors=tuple(drive.factors(firm=True))),
+        factors=Factors(telemetry=tuple(drive.factors(firm=True))),
         measurements=placed.measurements,
         accepted=np.ones(len(placed.measurements.row), dtype=bool),
         values=values,

@@ -197,8 +197,7 @@ class _Shared(_Set):
         self._group = link.n_groups - 1
         self._columns = slice(*link.group_column[self._group : self._group + 2].tolist())
         own = {key for key, group in zip(link.key, link.group, strict=True) if group == self._group}
-        everything = (*point.factors.priors, *point.factors.ties, *point.factors.seated)
-        self._factors = graph_of(factor for factor in everything if not own.isdisjoint(factor.keys()))
+        self._factors = graph_of(f for f in point.factors.all if not own.isdisjoint(f.keys()))
         """Those factors that move with it"""
         self._is_seen = bool(link.touched[link.group == self._group].any())
         """Whether cameras hang on it; else ties alone do"""
