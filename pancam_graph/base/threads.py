@@ -67,7 +67,7 @@ def in_parallel(function: Callable[[int, int], None], n: int, *, grain: int) -> 
             for i, (begin, end) in waiting:  # drawn under the interpreter's lock: each range once
                 try:
                     function(begin, end)
-                except Exception as error:  # noqa: PERF203  a range is worth far more than a try
+                except Exception as error:
                     failed[i] = error  # raised below, in the caller's thread
         finally:  # an interrupt passes through
             _THREAD.is_busy = was_busy

@@ -49,9 +49,9 @@ class ImageMask:
     def usable(self, *, between_stops: bool, margin_px: int = _MARGIN_PX) -> BoolArray:
         """Pixels (height, width) farther than a margin from what is left out; skylines have no margin."""
         hard = Reason.USER | Reason.SATURATED | (Reason.ROVER if between_stops else 0)
-        out = (self.reasons & np.uint8(hard) > 0).astype(np.uint8)
-        out = cv2.dilate(out, np.ones((2 * margin_px + 1,) * 2, np.uint8))
-        return np.asarray((out == 0) & (self.reasons & np.uint8(Reason.MISSING | Reason.SKY) == 0))
+        left_out = (self.reasons & np.uint8(hard) > 0).astype(np.uint8)
+        near_it = cv2.dilate(left_out, np.ones((2 * margin_px + 1,) * 2, np.uint8))
+        return np.asarray((near_it == 0) & (self.reasons & np.uint8(Reason.MISSING | Reason.SKY) == 0))
 
     def share(self, reason: Reason) -> float:
         """Of the image that is left out for a reason."""

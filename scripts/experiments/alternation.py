@@ -39,7 +39,7 @@ class AlternationTask:
         for method in _METHODS:
             try:
                 histories[method] = solve(traverse, replace(options, method=method)).cost_history
-            except PancamGraphError as error:  # noqa: PERF203  a solve takes far longer than a try
+            except PancamGraphError as error:
                 failures[method] = str(error)
         best = min((h[-1] for h in histories.values()), default=1.0)
         return [

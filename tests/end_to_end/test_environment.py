@@ -32,7 +32,7 @@ esac
 
 
 class Checkout:
-    """A copy of the scripts in an empty folder, and a PATH that holds stubs and the few tools that they need."""
+    """A copy of the scripts, and a PATH that holds stubs and the few tools that the scripts need."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder / "repository"
@@ -52,7 +52,9 @@ class Checkout:
             assert real
             (self.path / tool).symlink_to(real)
 
-    def stub(self, where: str, dotted: str, *, venv: bool = True, implementation: str = "", pip: str = ":") -> Path:
+    def stub(
+        self, where: str, dotted: str, *, venv: bool = True, implementation: str = "", pip: str = ":"
+    ) -> Path:
         """An interpreter of a version: `where` is a name on the PATH or a path below the home folder."""
         also = "" if venv else "sys.modules['ensurepip'] = None; "
         if implementation:
@@ -160,11 +162,16 @@ Prepared = Callable[[Checkout], object]
         (lambda c: c.stub("python3", "3.10.13"), "python3 is Python 3.10"),
         (lambda c: c.stub("python3", "3.11.7", implementation="pypy"), "python3 is pypy, not CPython"),
         (lambda c: c.stub("python3", "3.11.7", venv=False), "have it in python3.11-venv"),
-        (lambda c: (c.stub("python3", "3.9.2"), c.stub("python3.12", "3.12.1", venv=False)), "python3 is Python 3.9"),
+        (
+            lambda c: (c.stub("python3", "3.9.2"), c.stub("python3.12", "3.12.1", venv=False)),
+            "python3 is Python 3.9",
+        ),
     ],
     ids=["nothing", "too old", "PyPy", "no venv module", "two that do not do"],
 )
-def test_says_in_one_sentence_that_no_interpreter_will_do(checkout: Checkout, have: Prepared, said: str) -> None:
+def test_says_in_one_sentence_that_no_interpreter_will_do(
+    checkout: Checkout, have: Prepared, said: str
+) -> None:
     have(checkout)
     done = checkout.run()
     assert done.returncode == 2
@@ -177,7 +184,9 @@ def test_says_in_one_sentence_that_no_interpreter_will_do(checkout: Checkout, ha
     assert checkout.calls == []
 
 
-def test_an_environment_is_filled_once_for_each_place_and_each_pyproject(checkout: Checkout, tmp_path: Path) -> None:
+def test_an_environment_is_filled_once_for_each_place_and_each_pyproject(
+    checkout: Checkout, tmp_path: Path
+) -> None:
     checkout.stub("python3", "3.11.7")
     for _ in range(2):
         assert checkout.run().returncode == 0
@@ -218,7 +227,9 @@ def test_a_broken_environment_is_made_anew(checkout: Checkout, broken: str) -> N
         python.chmod(0o755)
     done = checkout.run()
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.startswith(".venv is broken: its interpreter does not start\nmaking .venv with Python 3.11.7\n")
+    assert done.stdout.startswith(
+        ".venv is broken: its interpreter does not start\nmaking .venv with Python 3.11.7\n"
+    )
     assert checkout.installations == 2
 
 

@@ -70,7 +70,9 @@ def optimum(equations: Equations) -> Optimum:
 def _factors(jacobian: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Left vectors, all singular values (also where there are fewer rows than columns), all right vectors."""
     rows, columns = jacobian.shape
-    padded = jacobian if rows >= columns else np.vstack([jacobian, np.zeros((columns - rows, columns))])
+    padded: FloatArray = (
+        jacobian if rows >= columns else np.vstack([jacobian, np.zeros((columns - rows, columns))])
+    )
     left, values, right = np.linalg.svd(padded, full_matrices=False)
     return left[:rows], values, right
 
