@@ -5,7 +5,7 @@
 #   interpreter_of VERSION    prints the path of a usable interpreter of that version, or nothing
 #   make_environment, install_into: the two steps of `prepare`, for environments elsewhere
 
-# Versions of everything that development needs; how to renew it is written at its top.
+# The versions that development and CI use. To renew them: the command at the top of the file, with --upgrade.
 LOCK=.ci/requirements.lock
 
 promised_versions() {

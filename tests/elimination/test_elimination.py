@@ -398,7 +398,7 @@ def test_what_landmarks_took_from_a_group_can_be_put_back(shared: bool, loss: Lo
         panels.add([g], np.diag(size**2), 2 * size)
         S, s = system.put_back(panels, g)
         assert S / np.outer(size, size) == pytest.approx(A.T @ A / np.outer(size, size) + np.eye(n), abs=1e-8)
-        assert s / size == pytest.approx(A.T @ dense.r / size + 2, abs=1e-8 * np.linalg.norm(dense.r))
+        assert s / size == pytest.approx(A.T @ dense.r / size + 2, abs=1e-8 * float(np.linalg.norm(dense.r)))
 
 
 @pytest.mark.parametrize("loss", ["none", "huber"])
