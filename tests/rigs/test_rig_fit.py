@@ -1,6 +1,5 @@
-"""Fit of a rig: exact without noise, honest with it, and clear about what cameras cannot tell."""
+"""Fit of a rig: exact without noise, honest with it, and the labels of a real rover."""
 
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,81 +9,32 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pancam_graph.base.errors import InputError
-from pancam_graph.base.geometry import HEAD_R_FORWARD_CAMERA, FloatArray, pose_arrays, ry, rz
+from pancam_graph.base.geometry import HEAD_R_FORWARD_CAMERA, pose_arrays
 from pancam_graph.cameras import CAHV, CAHVORE, Pinhole
 from pancam_graph.factors import mast_residual
 from pancam_graph.io import read_pds
 from pancam_graph.io._pds_label import read_label
 from pancam_graph.rigs import (
     MSL_MAST,
-    ReferenceSigma,
-    Rig,
-    RigFit,
     RigFitOptions,
     fit_rig,
     mars2020_navcam,
-    msl_navcam,
     stereo_pan_tilt,
 )
 from pancam_graph.rigs._chain import Chain, PosedCameras
 from support.published_cameras import MODEL_B
-
-NAVCAM = msl_navcam()
-"""A tilt axis that is neither square to the pan axis nor meets it."""
-WORLD_T_MAST = gtsam.Pose3(gtsam.Rot3.Expmap(np.array([0.02, -0.03, 1.1])), np.array([0.8, -0.5, 1.9]))
-
-
-def turned(angle_rotation: FloatArray) -> gtsam.Pose3:
-    return gtsam.Pose3(gtsam.Rot3(angle_rotation), np.zeros(3))
-
-
-def camera_at(
-    world_T_mast: gtsam.Pose3,
-    pan_T_tilt: gtsam.Pose3,
-    head_T_camera: gtsam.Pose3,
-    angles: Sequence[float],
-) -> gtsam.Pose3:
-    """The chain written out with gtsam's poses, apart from the package's own."""
-    pan, tilt = angles
-    return world_T_mast * turned(rz(pan)) * pan_T_tilt * turned(ry(-tilt)) * head_T_camera
-
-
-def cameras_of(
-    rig: Rig, angles: FloatArray, eyes: Sequence[str], world_T_mast: gtsam.Pose3 = WORLD_T_MAST
-) -> list[gtsam.Pose3]:
-    mounts = [rig.eyes[rig.eye_index(e)].head_T_camera for e in eyes]
-    return [
-        camera_at(world_T_mast, rig.pan_T_tilt, m, a) for m, a in zip(mounts, angles.tolist(), strict=True)
-    ]
-
-
-def angles_of(n: int, seed: int = 0) -> FloatArray:
-    return np.random.default_rng(seed).uniform([-2.5, -0.9], [2.5, 0.6], (n, 2))
-
-
-def worst_unseen(fit: RigFit, rig: Rig) -> float:
-    """Largest miss, metres or radians, of the fit at pointings that it was not made from."""
-    worst = 0.0
-    for angles in angles_of(7, seed=99):
-        for eye, mount in zip(fit.eyes, fit.head_T_camera, strict=True):
-            found = camera_at(
-                fit.world_T_mast, fit.pan_T_tilt, mount, (angles + fit.angle_offset_rad).tolist()
-            )
-            (true,) = cameras_of(rig, angles[None], [eye])
-            worst = max(worst, float(np.abs(true.localCoordinates(found)).max()))
-    return worst
-
-
-def noisy(poses: Sequence[gtsam.Pose3], sigma: float, rng: np.random.Generator) -> list[gtsam.Pose3]:
-    """Rotation disturbed in the camera's frame, centre in the world's, independently."""
-    return [
-        gtsam.Pose3(
-            p.rotation() * gtsam.Rot3.Expmap(sigma * rng.standard_normal(3)),
-            p.translation() + sigma * rng.standard_normal(3),
-        )
-        for p in poses
-    ]
-
+from support.rig_cameras import (
+    ALWAYS_FREE,
+    NAVCAM,
+    WORLD_T_MAST,
+    angles_of,
+    camera_at,
+    cameras_of,
+    noisy,
+    texts,
+    turned,
+    worst_unseen,
+)
 
 # --- Derivatives ----------------------------------------------------------------------------------
 
@@ -153,12 +103,6 @@ def test_twists_agree_with_the_mast_factor() -> None:
 
 
 # --- Exact without noise --------------------------------------------------------------------------
-
-ALWAYS_FREE = ("zero point of pan", "height", "zero point of tilt", "place along the tilt axis")
-
-
-def texts(fit: RigFit) -> list[str]:
-    return [d.text for d in fit.free_directions]
 
 
 @pytest.mark.parametrize("eyes", [("left",), ("left", "right")], ids=["one eye", "two eyes"])
@@ -268,167 +212,6 @@ def test_poses_need_cameras_to_be_a_rig() -> None:
     assert rig.eyes[0].head_T_camera is fit.head_T_camera[0]
 
 
-# --- What cameras leave open ----------------------------------------------------------------------
-
-PAN, TILT = (
-    ("direction of the pan axis", "place of the pan axis"),
-    ("direction of the tilt axis", "place of the tilt axis"),
-)
-
-
-@pytest.mark.parametrize(
-    ("angles", "eyes", "named"),
-    [
-        ([(p, -0.2) for p, _ in angles_of(6)], ["left", "right"] * 3, {*ALWAYS_FREE, *TILT}),
-        ([(p, -0.2 + 1e-7 * t) for p, t in angles_of(6)], ["left", "right"] * 3, {*ALWAYS_FREE, *TILT}),
-        ([(0.4, t) for _, t in angles_of(6)], ["left", "right"] * 3, {*ALWAYS_FREE, *PAN}),
-        ([(0.4, -0.3)] * 2, ["left", "right"], {*ALWAYS_FREE, *PAN, *TILT}),
-        ([(0.4, -0.3)] * 5, ["left"] * 5, {*ALWAYS_FREE, *PAN, *TILT}),
-        ([(0.4, -0.3), (-1.0, 0.2)], ["left"] * 2, {*ALWAYS_FREE, "a combination"}),
-    ],
-    ids=["one tilt", "hardly two tilts", "one pan", "one pointing", "all equal", "two cameras"],
-)
-def test_degenerate_sets_are_fitted_and_named(
-    angles: list[tuple[float, float]], eyes: list[str], named: set[str]
-) -> None:
-    pan_tilt = np.array(angles)
-    fit = fit_rig(cameras_of(NAVCAM, pan_tilt, eyes), pan_tilt, eyes=eyes)
-    assert fit.converged
-    assert max(fit.worst_m, fit.worst_rad) < 1e-9
-    starts = {t.split(":")[0].split(",")[0] for t in texts(fit)}
-    assert starts == named
-    assert len(fit.free_directions) == np.sum(fit.singular_values < 1)
-    for name in (*PAN, *TILT):  # about x and y, along x and y
-        assert sum(t.startswith(name) for t in texts(fit)) == (2 if name in named else 0)
-    steps = np.array([d.step for d in fit.free_directions])
-    assert np.linalg.matrix_rank(steps / np.linalg.norm(steps, axis=1)[:, None]) == len(steps)
-    assert np.isfinite(fit.covariance).all()
-
-
-def moved(fit: RigFit, step: FloatArray) -> list[gtsam.Pose3]:
-    """The fitted cameras with every pose turned and shifted in its own frame, by a small step."""
-    poses = [fit.world_T_mast, fit.pan_T_tilt, *fit.head_T_camera]
-    changed = [
-        p * gtsam.Pose3(gtsam.Rot3.Expmap(s[:3]), s[3:])
-        for p, s in zip(poses, step[:-2].reshape(-1, 6), strict=True)
-    ]
-    return [
-        camera_at(changed[0], changed[1], changed[2 + i % len(fit.eyes)], (a + step[-2:]).tolist())
-        for i, a in enumerate(fit.pan_tilt_rad)
-    ]
-
-
-@pytest.mark.parametrize("case", ["rich", "one tilt", "two cameras", "one pointing"])
-def test_along_a_free_direction_no_camera_moves(case: str) -> None:
-    """And the number of free directions is what a numerical Jacobian has, apart from the package's."""
-    pan_tilt = angles_of({"rich": 8, "two cameras": 2}.get(case, 4), seed=2)
-    if case == "one tilt":
-        pan_tilt[:, 1] = -0.3
-    if case == "one pointing":
-        pan_tilt[:] = (0.3, -0.4)
-    names = ["left", "right"] * (len(pan_tilt) // 2)
-    fit = fit_rig(
-        cameras_of(NAVCAM, pan_tilt, names),
-        pan_tilt,
-        eyes=names,
-        reference=NAVCAM,
-        world_T_mast=WORLD_T_MAST,
-        options=RigFitOptions(angles="offsets"),
-    )
-    before = moved(fit, np.zeros(len(fit.names)))
-
-    def change(step: FloatArray) -> FloatArray:
-        h = 1e-5
-        pairs = zip(moved(fit, h * step), moved(fit, -h * step), strict=True)
-        ends = [
-            (b.localCoordinates(high), b.localCoordinates(low))
-            for b, (high, low) in zip(before, pairs, strict=True)
-        ]
-        return np.concatenate([(high - low) / (2 * h) for high, low in ends])
-
-    for direction in fit.free_directions:
-        assert np.abs(direction.step).max() > 1e-4
-        assert np.abs(change(direction.step)).max() < 1e-8
-    jacobian = np.column_stack([change(e) for e in np.eye(len(fit.names))])
-    rank = np.linalg.matrix_rank(jacobian, tol=1e-6)
-    assert len(fit.free_directions) == len(fit.names) - rank
-
-
-@pytest.mark.parametrize("case", ["rich", "one tilt", "one pan", "two cameras"])
-def test_what_is_free_stays_as_near_to_the_reference_as_can_be(case: str) -> None:
-    """Consistent references are kept to the last digit; others are left across the free directions only."""
-    pan_tilt = angles_of(2 if case == "two cameras" else 8, seed=4)
-    if case == "one tilt":
-        pan_tilt[:, 1] = -0.3
-    if case == "one pan":
-        pan_tilt[:, 0] = 0.7
-    names = ["left", "right"] * (len(pan_tilt) // 2)
-    poses = cameras_of(NAVCAM, pan_tilt, names)
-    kept = fit_rig(poses, pan_tilt, eyes=names, reference=NAVCAM, world_T_mast=WORLD_T_MAST)
-    for found, true in zip(
-        (kept.world_T_mast, kept.pan_T_tilt, *kept.head_T_camera),
-        (WORLD_T_MAST, NAVCAM.pan_T_tilt, *(e.head_T_camera for e in NAVCAM.eyes)),
-        strict=True,
-    ):
-        assert np.abs(true.localCoordinates(found)).max() < 1e-10
-    rng = np.random.default_rng(0)
-    off = [gtsam.Pose3.Expmap(3e-3 * rng.normal(size=6)) for _ in range(4)]
-    eyes = tuple(
-        replace(e, head_T_camera=e.head_T_camera * d) for e, d in zip(NAVCAM.eyes, off[2:], strict=True)
-    )
-    reference = replace(NAVCAM, pan_T_tilt=NAVCAM.pan_T_tilt * off[0], eyes=eyes)
-    mast = WORLD_T_MAST * off[1]
-    fit = fit_rig(poses, pan_tilt, eyes=names, reference=reference, world_T_mast=mast)
-    assert max(fit.worst_m, fit.worst_rad) < 1e-9
-    away = []
-    for found, given in zip(
-        (fit.world_T_mast, fit.pan_T_tilt, *fit.head_T_camera),
-        (mast, reference.pan_T_tilt, *(e.head_T_camera for e in eyes)),
-        strict=True,
-    ):
-        between = given.between(found)
-        away += [*gtsam.Rot3.Logmap(between.rotation()), *between.translation()]
-    s = ReferenceSigma()
-    units = [(s.mast_rad, s.mast_m), (s.axis_rad, s.axis_m), *[(s.mount_rad, s.mount_m)] * 2]
-    sigma = np.repeat(np.array(units), 3, axis=1).ravel()
-    in_units = np.array(away) / sigma
-    assert np.linalg.norm(in_units) > 0.1
-    for direction in fit.free_directions:
-        assert abs(in_units @ (direction.step[:-2] / sigma)) < 1e-7 * np.linalg.norm(in_units)
-
-
-def test_a_chain_that_is_held_is_only_compared() -> None:
-    nothing = ReferenceSigma(mast_rad=0, mast_m=0, axis_rad=0, axis_m=0, mount_rad=0, mount_m=0)
-    pan_tilt, names = angles_of(4), ["left", "right"] * 2
-    poses = cameras_of(NAVCAM, pan_tilt, names)
-    poses[1] = poses[1] * gtsam.Pose3(gtsam.Rot3.Rx(2e-3), np.array([3e-3, 0, 0]))
-    fit = fit_rig(
-        poses,
-        pan_tilt,
-        eyes=names,
-        reference=NAVCAM,
-        world_T_mast=WORLD_T_MAST,
-        options=RigFitOptions(reference_sigma=nothing),
-    )
-    assert fit.converged
-    assert (fit.worst_m, fit.worst_rad) == pytest.approx((3e-3, 2e-3))
-    assert (fit.rms_m, fit.rms_rad) == pytest.approx((1.5e-3, 1e-3))
-    assert "worst 3.0000 mm (camera 1)" in fit.report()
-    assert "directions that the cameras do not tell: 0 of 0" in fit.report()
-
-
-def test_a_mast_that_is_held_stays_where_it_is() -> None:
-    """Only mounts are sought: one camera is enough, and nothing is free."""
-    held = RigFitOptions(reference_sigma=ReferenceSigma(mast_rad=0, mast_m=0, axis_rad=0, axis_m=0))
-    pan_tilt = np.array([[0.3, -0.2]])
-    (pose,) = cameras_of(NAVCAM, pan_tilt, ["left"])
-    fit = fit_rig([pose], pan_tilt, world_T_mast=WORLD_T_MAST, pan_T_tilt=NAVCAM.pan_T_tilt, options=held)
-    assert fit.free_directions == ()
-    assert fit.world_T_mast.equals(WORLD_T_MAST, 1e-15)
-    assert fit.head_T_camera[0].equals(NAVCAM.eyes[0].head_T_camera, 1e-12)
-    assert fit.covariance[:12].tolist() == np.zeros((12, len(fit.names))).tolist()
-
-
 # --- With noise -----------------------------------------------------------------------------------
 
 
@@ -529,77 +312,6 @@ def test_opportunitys_labels_follow_the_chain(source: str, opportunity_folder: P
     np.testing.assert_allclose(fit.world_T_mast.translation()[:2], pivot[:2], atol=2e-5)
     assert fit.world_T_mast.rotation().matrix()[:, 2] == pytest.approx([0, 0, -1], abs=2e-5)
     assert np.abs(fit.pan_T_tilt.translation()[[0, 2]]).max() < 2e-5
-
-
-# --- Bad input ------------------------------------------------------------------------------------
-
-POSES = cameras_of(NAVCAM, angles_of(4), ["left"] * 4)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        ({"cameras": []}, "cameras: expected 2 or more, found 0"),
-        ({"cameras": POSES[:1], "pan_tilt_rad": np.zeros((1, 2))}, "cameras: expected 2 or more, found 1"),
-        ({"pan_tilt_rad": np.zeros((3, 2))}, r"pan_tilt_rad: expected shape \(4, 2\), found \(3, 2\)"),
-        ({"pan_tilt_rad": np.zeros((2, 4))}, r"pan_tilt_rad: expected shape \(4, 2\), found \(2, 4\)"),
-        (
-            {"pan_tilt_rad": np.full((4, 2), np.nan)},
-            r"pan_tilt_rad, row 0: expected finite angles, found \[nan, nan\]",
-        ),
-        ({"eyes": ["left"] * 3}, "eyes: expected 4 names, one per camera, found 3"),
-        ({"pointings": [0]}, "pointings: expected 4 numbers, one per camera, found 1"),
-        ({"eyes": ["up"] * 4, "reference": NAVCAM}, "camera 'up': the rig msl-navcam has left, right"),
-        (
-            {"reference": NAVCAM, "pan_T_tilt": gtsam.Pose3(), "eyes": ["left"] * 4},
-            "pan_T_tilt: expected none beside a reference rig, which has one; found one",
-        ),
-        (
-            {"cameras": [*POSES[:3], gtsam.Pose3(gtsam.Rot3(), np.array([np.nan, 0, 0]))]},
-            r"cameras\[3\]: expected a pose of finite numbers, found .*nan",
-        ),
-        (
-            {"cameras": [*POSES[:3], gtsam.Pose3(gtsam.Rot3(), np.array([1e300, 0, 0]))]},
-            r"cameras\[3\]: expected a pose of finite numbers, found .*1e\+300",
-        ),
-        (
-            {"cameras": [*POSES[:3], MODEL_B]},
-            r"cameras\[3\]: expected a pose like the others of eye camera, found a CAHVOR of 1024 x 1024",
-        ),
-        (
-            {"cameras": [MODEL_B, MODEL_B, replace(MODEL_B, width_px=512), MODEL_B]},
-            r"cameras\[2\]: expected a CAHVOR of 1024 x 1024 like the others of eye camera, found .* 512 x",
-        ),
-    ],
-)
-def test_what_cannot_be_fitted_is_said_in_one_sentence(arguments: dict[str, object], sentence: str) -> None:
-    given: dict[str, object] = {"cameras": POSES, "pan_tilt_rad": np.zeros((len(POSES), 2))}
-    given |= arguments
-    if given["cameras"] == []:
-        given["pan_tilt_rad"] = np.zeros((0, 2))
-    with pytest.raises(InputError, match=sentence) as caught:
-        fit_rig(**given)  # type: ignore[arg-type]  # what a type checker would refuse too
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("make", "sentence"),
-    [
-        (
-            lambda: RigFitOptions(angles="about right"),  # type: ignore[arg-type]  # the mistake under test
-            "angles: expected exact, offsets or free; found 'about",
-        ),
-        (lambda: RigFitOptions(centre_sigma_m=0.0), "centre_sigma_m: expected a number above 0, found 0.0"),
-        (lambda: RigFitOptions(angle_sigma_rad=float("nan")), "angle_sigma_rad: expected a number above 0"),
-        (
-            lambda: RigFitOptions(reference_sigma=ReferenceSigma(axis_m=-1.0)),
-            r"reference_sigma: axis_m: expected 0 \(held\) or above, found -1.0",
-        ),
-    ],
-)
-def test_options_of_nonsense_are_refused(make: Callable[[], RigFitOptions], sentence: str) -> None:
-    with pytest.raises(InputError, match=sentence):
-        make()
 
 
 def test_angles_that_count_the_other_way_stand_the_mast_on_its_head() -> None:
