@@ -4,8 +4,11 @@ import importlib
 import re
 from functools import reduce
 from pathlib import Path
+from typing import Any
 
 import pytest
+
+import pancam_graph
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -138,3 +141,55 @@ def test_links_lead_to_pages_and_headings(page: Path) -> None:
             if anchor not in {slug(heading) for heading in headings}:
                 wrong.append(target)
     assert wrong == []
+
+
+def python_of(page: str) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(encoding="utf-8"), flags=re.DOTALL)
+
+
+def run(blocks: list[str], page: str) -> dict[str, Any]:
+    names: dict[str, Any] = {}
+    for block in blocks:
+        exec(compile(block, page, "exec"), names)
+    return names
+
+
+def test_the_python_of_own_rig_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """All but the block that renders pictures; what the page says of its numbers is so."""
+    monkeypatch.chdir(tmp_path)
+    names = run([block for block in python_of("own_rig.md") if "pg.render" not in block], "own_rig.md")
+    printed = capsys.readouterr().out
+    (_, fixed), (_, freed) = re.findall(r"residuals ([\d.]+) -> ([\d.]+) px", printed)
+    assert float(freed) < 0.35
+    assert float(fixed) > 0.6
+    aside = [int(number) for number in re.findall(r"(\d+) set aside", printed)]
+    outliers = int(names["field"].truth.outlier.sum())
+    assert aside[1] < 2 * outliers
+    assert aside[0] > 4 * outliers
+    assert (tmp_path / "field" / "traverse.json").exists()
+    assert (tmp_path / "out" / "field" / "report.html").exists()
+    assert names["fit"].worst_rad < 1e-9
+
+
+@pytest.mark.slow
+def test_pictures_of_own_rig_are_solved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    first, *others = python_of("own_rig.md")
+    names = run([first, *(block for block in others if "replace" in block)], "own_rig.md")
+    assert names["solution"].converged
+    assert names["solution"].rms_final_px < 0.2
+    assert (tmp_path / "out" / "pictures" / "report.html").exists()
+
+
+def test_one_version_everywhere() -> None:
+    """The version is in pancam_graph/__init__.py; what repeats it for readers is the same."""
+    version = re.escape(pancam_graph.__version__)
+    changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    released = re.findall(r"(?m)^## \[([\d.]+)\] - (\d{4}-\d\d-\d\d)$", changelog)
+    (date,) = (day for number, day in released if number == pancam_graph.__version__)
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert re.search(rf"(?m)^version: {version}$", citation)
+    assert f'date-released: "{date}"' in citation
+    assert 'dynamic = ["version"]' in (ROOT / "pyproject.toml").read_text(encoding="utf-8")
