@@ -18,14 +18,14 @@ from benchmarks.engines import ENGINES
 from benchmarks.report import against_baseline, read_baseline, write_baseline
 from benchmarks.running import prepare, run_cases
 from pancam_graph.base.errors import InputError
-from pancam_graph.cli._program import Parser, run, show_log
+from pancam_graph.cli import ScriptParser, run, show_log
 
 BASELINE = Path(__file__).with_name("benchmark_baseline.json")
 
 
 def main() -> int:
     """Make the cases, measure, compare, write."""
-    parser = Parser(__doc__ or "")
+    parser = ScriptParser(__doc__ or "")
     add = parser.add_argument
     add("--cases", nargs="+", choices=CASES, default=DEFAULT_CASES, metavar="CASE", help=", ".join(CASES))
     add(

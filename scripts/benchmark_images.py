@@ -18,7 +18,7 @@ from benchmarks.steps import Steps
 from pancam_graph import find_observations, read_input, solve
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.threads import n_workers
-from pancam_graph.cli._program import Parser, Progress, run, show_log
+from pancam_graph.cli import Progress, ScriptParser, run, show_log
 from pancam_graph.results import write_results
 
 RENDER = Path(__file__).with_name("render_traverse.py")
@@ -26,7 +26,7 @@ RENDER = Path(__file__).with_name("render_traverse.py")
 
 def main() -> int:
     """Render where that is needed, measure, print."""
-    parser = Parser(__doc__ or "")
+    parser = ScriptParser(__doc__ or "")
     parser.add_argument("traverse", metavar="TRAVERSE", type=Path)
     parser.add_argument("--stops", type=int, default=10, help="to render (%(default)s)")
     parser.add_argument("--rig", default="mer-navcam", help="to render (%(default)s)")

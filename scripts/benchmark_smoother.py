@@ -17,7 +17,7 @@ from benchmarks.cases import CASES, chosen_cases, make
 from benchmarks.engines import ENGINES, NotRun, measure, run_module
 from benchmarks.running import prepare
 from pancam_graph.base.errors import InputError
-from pancam_graph.cli._program import Parser, run, show_log
+from pancam_graph.cli import ScriptParser, run, show_log
 
 _ENGINE = "eliminated"
 """Whose compiled code the smoother uses."""
@@ -25,7 +25,7 @@ _ENGINE = "eliminated"
 
 def main() -> int:
     """Make the cases, drive, solve all at once with Ceres, write."""
-    parser = Parser(__doc__ or "")
+    parser = ScriptParser(__doc__ or "")
     add = parser.add_argument
     default = ["mid", "long"]
     add("--cases", nargs="+", choices=CASES, default=default, metavar="CASE", help=", ".join(CASES))

@@ -13,12 +13,12 @@ from experiments.output import require_new, write_results
 from experiments.registry import FAMILIES, plan
 from experiments.running import run_tasks
 from pancam_graph.base.errors import InputError
-from pancam_graph.cli._program import Parser, Progress, run, show_log
+from pancam_graph.cli import Progress, ScriptParser, run, show_log
 
 
 def main() -> int:
     """Plan, run, write."""
-    parser = Parser(__doc__ or "")
+    parser = ScriptParser(__doc__ or "")
     add = parser.add_argument
     add("--out", metavar="OUT", type=Path, required=True, help="folder to write; must be new or empty")
     add("--quick", action="store_true", help="5 seeds and two noises, for a look")

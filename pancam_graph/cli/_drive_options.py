@@ -1,55 +1,76 @@
-"""Command lines of programs that make a drive up."""
+"""Options of the subcommands that make a drive up."""
 
-from pathlib import Path
-from typing import Any, Generic, TypeVar
+from argparse import Namespace
+from collections.abc import Iterable
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from pancam_graph.cli._program import Parser, degrees, show_log
-from pancam_graph.rigs import TEMPLATES, Rig, rig_template
-from pancam_graph.simulate import DriveOptions
+from pancam_graph.cli._parser import CommandParser, LateChoice, degrees
 
-__all__ = ["DriveParser"]
+if TYPE_CHECKING:
+    from pancam_graph.simulate import DriveOptions
 
-Options = TypeVar("Options", bound=DriveOptions)
+__all__ = ["add_drive_options", "add_rig_option", "drive_options"]
+
+_Options = TypeVar("_Options", bound="DriveOptions")
 
 
-class DriveParser(Parser, Generic[Options]):
-    """Parser of what is made up by driving: the options that all such scripts have, with their defaults."""
+def _templates() -> Iterable[str]:
+    from pancam_graph.rigs import TEMPLATES
 
-    def __init__(
-        self, description: str, options: type[Options], *, pans: str, sweep: str, tilts: str
-    ) -> None:
-        super().__init__(description)
-        self._options = options
-        d, add = options(), self.add_argument
-        add("--rig", choices=TEMPLATES, default="mer-navcam", help="cameras (%(default)s)")
-        add("--seed", type=int, default=0, help="another seed, another world (%(default)s)")
-        add("--stops", type=int, default=d.stops, help="places of the mast (%(default)s)")
-        add(
-            "--spacing-m", "--step-m", type=float, default=d.spacing_m, help="from stop to stop (%(default)s)"
-        )
-        add("--pans", "--azimuths", type=int, default=d.pans, help=f"frames per row ({pans})")
-        add("--sweep-deg", **_angle("sweep_rad", d.sweep_rad), help=f"range of pan ({sweep})")
-        add("--tilts-deg", **_angle("tilts_rad"), nargs="+", help=f"of each row, up positive ({tilts})")
-        add("--pointing-scale", type=float, default=1.0, help="errors of pan and tilt, times the rig's (1)")
-        add("--sigma-stop-m", type=float, default=d.sigma_stop_m, help="odometry's, per axis (%(default)s)")
-        add("--sigma-stop-deg", **_angle("sigma_stop_rad", d.sigma_stop_rad), help="(0.57)")
-        add("--focal-error", type=float, default=0.0, help="of the rig that the traverse claims, a share (0)")
-        add("--mount-error-deg", **_angle("mount_error_rad", 0.0), help="of its mounts (0)")
-        add("--mount-error-m", type=float, default=0.0, help="of its mounts (0)")
-        add("--radius-error-m", type=float, default=0.0, help="of its circles (0)")
+    return TEMPLATES
 
-    def parse_drive(self) -> tuple[Path, Rig, int, Options]:
-        """OUT, the rig, the seed, and all other arguments as options; the log is on from here.
 
-        Raises InputError for options that make no sense.
-        """
-        a = vars(self.parse_args())
-        out, rig, seed, verbose = (a.pop(k) for k in ("out", "rig", "seed", "verbose"))
-        show_log(verbose=verbose)
-        tilts = a.pop("tilts_rad")
-        return out, rig_template(rig), seed, self._options(**a, tilts_rad=tilts and tuple(tilts))
+def add_rig_option(parser: CommandParser) -> None:
+    """Add the name of a rig template."""
+    help_text = "template of the cameras and the mast (%(default)s); an unknown one lists all"
+    parser.add_argument(
+        "--rig", type=LateChoice(_templates), default="mer-navcam", metavar="RIG", help=help_text
+    )
+
+
+def add_drive_options(
+    parser: CommandParser,
+    *,
+    stops: int,
+    spacing_m: float,
+    pans: int | None,
+    sweep_rad: float | None,
+    say_pans: str,
+    say_sweep: str,
+    say_tilts: str,
+) -> None:
+    """Add the options that all subcommands with a drive have.
+
+    The numbers are the defaults of those options in which the subcommands differ; the texts say in help what
+    happens without an option where no number can. They must agree with the defaults of the options' class.
+    """
+    add = parser.add_argument
+    add_rig_option(parser)
+    add("--seed", type=int, default=0, help="another seed, another world (%(default)s)")
+    add("--stops", type=int, default=stops, help="places of the mast (%(default)s)")
+    add("--spacing-m", "--step-m", type=float, default=spacing_m, help="from stop to stop (%(default)s)")
+    add("--pans", "--azimuths", type=int, default=pans, help=f"frames per row ({say_pans})")
+    add("--sweep-deg", **_angle("sweep_rad", sweep_rad), help=f"range of pan ({say_sweep})")
+    add("--tilts-deg", **_angle("tilts_rad"), nargs="+", help=f"of each row, up positive ({say_tilts})")
+    add("--pointing-scale", type=float, default=1.0, help="errors of pan and tilt, times the rig's (1)")
+    add("--sigma-stop-m", type=float, default=0.1, help="odometry's, per axis (%(default)s)")
+    add("--sigma-stop-deg", **_angle("sigma_stop_rad", 0.01), help="odometry's, per axis (0.57)")
+    add("--focal-error", type=float, default=0.0, help="of the rig that the traverse claims, a share (0)")
+    add("--mount-error-deg", **_angle("mount_error_rad", 0.0), help="of its mounts (0)")
+    add("--mount-error-m", type=float, default=0.0, help="of its mounts (0)")
+    add("--radius-error-m", type=float, default=0.0, help="of its circles (0)")
+
+
+def drive_options(arguments: Namespace, options: type[_Options]) -> _Options:
+    """The arguments as options. Raises InputError for options that make no sense."""
+    given = vars(arguments)
+    chosen: dict[str, Any] = {f.name: given[f.name] for f in fields(options) if f.name in given}
+    tilts = chosen["tilts_rad"]
+    return options(**{**chosen, "tilts_rad": None if tilts is None else tuple(tilts)})
 
 
 def _angle(name: str, default: float | None = None) -> dict[str, Any]:
     """How an option in degrees sets a field in radians."""
-    return {"dest": name, "type": degrees, "default": default}
+    metavar = name.removesuffix("_rad").upper() + "_DEG"
+    return {"dest": name, "type": degrees, "default": default, "metavar": metavar}

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from pancam_graph import SolveOptions, read_traverse, solve
-from pancam_graph.cli._program import run
+from pancam_graph.cli import run
 from pancam_graph.data import Traverse
 from pancam_graph.smoother import TraverseSmoother, Update
 from pancam_graph.smoother._incremental import stops_of

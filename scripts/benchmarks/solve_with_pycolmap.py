@@ -16,7 +16,7 @@ import pycolmap
 from benchmarks.memory import peak_memory_mb
 from pancam_graph import Traverse, read_traverse
 from pancam_graph.base.geometry import FloatArray
-from pancam_graph.cli._program import run
+from pancam_graph.cli import run
 
 _FUNCTION_TOLERANCE = 1e-6
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from benchmarks.memory import peak_memory_mb
 from pancam_graph import SolveOptions, read_traverse, solve
-from pancam_graph.cli._program import run
+from pancam_graph.cli import run
 
 
 def main() -> int:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pancam_graph.cli._program import print_summary
+from pancam_graph.cli._summary import print_summary
 from pancam_graph.data import Matching, PairMatching, Refined, Refusal, Solution, StopMatching
 from pancam_graph.report._images import image_residuals
 from pancam_graph.report._page import make_page

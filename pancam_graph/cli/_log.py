@@ -1,0 +1,98 @@
+"""The log of a run: on standard error, and in a file."""
+
+import logging
+import shlex
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from pancam_graph import __version__
+from pancam_graph.base.errors import InputError
+from pancam_graph.cli._streams import write
+
+__all__ = ["check_log_outside", "logged", "show_log"]
+
+_LOG = logging.getLogger(__name__)
+_FIRST_LINE = "# log of pancam-graph"
+
+
+class _ToStandardError(logging.Handler):
+    """Messages as lines on standard error."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a message."""
+        write("stderr", f"{record.levelname:<8}{record.getMessage()}")
+
+
+@contextmanager
+def logged(*, verbose: bool, file: Path | None) -> Iterator[None]:
+    """While the block runs, the package's log goes to standard error if `verbose`, and to a file if given.
+
+    The file gets everything, with times: what it held before stays. Raises InputError where it cannot be
+    written, or holds what is no log of this program.
+    """
+    root, package = logging.getLogger(), logging.getLogger("pancam_graph")
+    levels = root.level, package.level
+    handlers: list[logging.Handler] = []
+    if verbose:
+        handlers.append(_standard_error())
+    if file is not None:
+        handlers.append(_in_file(file))
+    for handler in handlers:
+        root.addHandler(handler)
+    if verbose:
+        root.setLevel(logging.INFO)
+    if file is not None:
+        package.setLevel(logging.DEBUG)
+    try:
+        _LOG.debug("pancam-graph %s: %s", __version__, shlex.join(sys.argv))
+        yield
+    finally:
+        root.setLevel(levels[0])
+        package.setLevel(levels[1])
+        for handler in handlers:
+            root.removeHandler(handler)
+            handler.close()
+
+
+def show_log(*, verbose: bool) -> None:
+    """Send the package's log to standard error from here on, if asked for."""
+    if verbose:
+        logging.basicConfig(level=logging.INFO, handlers=[_standard_error()])
+
+
+def check_log_outside(file: Path | None, out: Path) -> None:
+    """Raise InputError for a log in the folder of results, which is replaced as a whole."""
+    if file is not None and out.resolve() in file.resolve().parents:
+        raise InputError(f"{file}: expected a log outside {out}, whose content is replaced, found it inside")
+
+
+def _standard_error() -> logging.Handler:
+    if sys.stderr is not None and sys.stderr.isatty():
+        from rich.console import Console
+        from rich.logging import RichHandler
+
+        shown: logging.Handler = RichHandler(console=Console(stderr=True), level=logging.INFO)
+        shown.setFormatter(logging.Formatter("%(message)s"))
+        return shown
+    return _ToStandardError(level=logging.INFO)
+
+
+def _in_file(file: Path) -> logging.Handler:
+    expected = f"{file}: expected a new file or an older log of this program"
+    try:
+        has_content = file.is_file() and file.stat().st_size > 0  # neither a device nor a pipe
+        if has_content:
+            with file.open("rb") as older:
+                if older.read(len(_FIRST_LINE)) != _FIRST_LINE.encode():
+                    raise InputError(f"{expected}, found something else in it")
+        else:
+            file.write_text(f"{_FIRST_LINE}\n", encoding="utf-8")
+        handler = logging.FileHandler(file, mode="a", encoding="utf-8")
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(f"{expected}, found a place that cannot be written to ({reason})") from error
+    handler.setLevel(logging.DEBUG)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    return handler

@@ -1,0 +1,228 @@
+"""Progress of long work: events, and the ways to show them on standard error."""
+
+import json
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, Protocol
+
+from pancam_graph.cli._streams import write
+
+if TYPE_CHECKING:
+    from rich.status import Status
+
+    from pancam_graph.smoother import Update
+    from pancam_graph.solve import Iteration
+
+__all__ = ["Display", "Event", "JsonLines", "NoDisplay", "PlainLines", "Progress", "display_for"]
+
+_STAGES = {"screening": "looking for outliers", "approach": "adjusting", "solve": "adjusting to the end"}
+_PERIOD_S = 20.0
+"""Time between two plain lines."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Event:
+    """Where the work is."""
+
+    stage: str
+    """What is being done, in words."""
+    done: int | None = None
+    """How many steps of it are done; None where they are not counted."""
+    total: int | None = None
+    """How many steps it has; None where that is not known."""
+    seconds_left: float | None = None
+    """How long the rest of the stage takes, if its steps take as long as those before; None: not known."""
+    detail: str = ""
+    """What else there is to say."""
+
+    @property
+    def text(self) -> str:
+        """The event in words."""
+        counted = "" if self.done is None else f": step {self.done}"
+        if self.done is not None and self.total is not None:
+            counted = f" {self.done} of {self.total}"
+        return f"{self.stage}{counted}{', ' if self.detail else ''}{self.detail}"
+
+
+class Display(Protocol):
+    """A way to show events."""
+
+    def begin(self) -> None:
+        """Long work begins."""
+
+    def show(self, event: Event) -> None:
+        """Show an event, between `begin` and `end`."""
+
+    def end(self) -> None:
+        """Long work ends, well or not."""
+
+
+class NoDisplay:
+    """Nothing is shown."""
+
+    def begin(self) -> None:
+        """Do nothing."""
+
+    def show(self, event: Event) -> None:
+        """Do nothing."""
+
+    def end(self) -> None:
+        """Do nothing."""
+
+
+class TerminalLine:
+    """A line at the bottom of a terminal that changes."""
+
+    def __init__(self) -> None:
+        self._status: Status | None = None
+
+    def begin(self) -> None:
+        """Show the line, still without words."""
+        from rich.console import Console
+
+        self._status = Console(stderr=True).status("")
+        self._status.start()
+
+    def show(self, event: Event) -> None:
+        """Change the line."""
+        if self._status is not None:
+            self._status.update(event.text)
+
+    def end(self) -> None:
+        """Take the line away."""
+        if self._status is not None:
+            self._status.stop()
+
+
+class PlainLines:
+    """A line now and then, for files and pipes; also while one long step has no events."""
+
+    def __init__(self, period_s: float = _PERIOD_S) -> None:
+        self._period_s = period_s
+        self._latest: Event | None = None
+        self._begun_s = 0.0
+        self._over = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def begin(self) -> None:
+        """Start the thread that writes."""
+        self._begun_s = time.monotonic()
+        self._over.clear()
+        self._thread = threading.Thread(target=self._write, name="pancam-graph-progress", daemon=True)
+        self._thread.start()
+
+    def show(self, event: Event) -> None:
+        """Keep the event for the next line."""
+        self._latest = event
+
+    def end(self) -> None:
+        """Stop the thread."""
+        self._over.set()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _write(self) -> None:
+        while not self._over.wait(self._period_s):
+            event = self._latest
+            if event is not None:
+                left = "" if event.seconds_left is None else f", about {_duration(event.seconds_left)} left"
+                since = _duration(time.monotonic() - self._begun_s)
+                write("stderr", f"{event.text} ({since} since the beginning{left})")
+
+
+class JsonLines:
+    """Every event as a line of JSON with the keys stage, done, total, seconds_left; null: not known."""
+
+    def begin(self) -> None:
+        """Do nothing."""
+
+    def show(self, event: Event) -> None:
+        """Write the event."""
+        left = None if event.seconds_left is None else round(event.seconds_left, 1)
+        entry = {"stage": event.stage, "done": event.done, "total": event.total, "seconds_left": left}
+        write("stderr", json.dumps(entry))
+
+    def end(self) -> None:
+        """Do nothing."""
+
+
+def display_for(way: Literal["auto", "json"] = "auto", *, quiet: bool = False) -> Display:
+    """The display that a user asked for; `quiet` silences all but JSON."""
+    if way == "json":
+        return JsonLines()
+    if quiet:
+        return NoDisplay()
+    return TerminalLine() if sys.stderr is not None and sys.stderr.isatty() else PlainLines()
+
+
+class Progress:
+    """The functions that the library calls back, as events on a display."""
+
+    def __init__(self, display: Display | None = None, *, quiet: bool = False) -> None:
+        self._display = display or display_for()
+        self._quiet = quiet
+        self._stage = ""
+        self._first = (0, 0.0)
+        self._stops = 0
+
+    @contextmanager
+    def shown(self, stage: str) -> Iterator[None]:
+        """Show progress while the block runs, which begins with this stage."""
+        self._display.begin()
+        try:
+            self.say(stage)
+            yield
+        finally:
+            self._display.end()
+
+    def say(self, stage: str) -> None:
+        """A stage whose steps are not counted begins."""
+        self._display.show(Event(stage=stage))
+
+    def counted(self, what: str, done: int, total: int) -> None:
+        """So many of a stage's steps are done."""
+        left = self._seconds_left(what, done, total)
+        self._display.show(Event(stage=what, done=done, total=total, seconds_left=left))
+
+    def iteration(self, iteration: "Iteration") -> None:
+        """The solve has made a step."""
+        stage, detail = _STAGES[iteration.stage], f"cost {iteration.cost:.6g}"
+        self._display.show(Event(stage=stage, done=iteration.number, detail=detail))
+
+    def stop(self, update: "Update", total: int | None = None) -> None:
+        """A stop was added: an event, and a line on standard output, which a terminal or a file shows."""
+        self._stops += 1
+        left = None if total is None else self._seconds_left("adding stops", self._stops, total)
+        self._display.show(Event(stage="adding stops", done=self._stops, total=total, seconds_left=left))
+        if self._quiet:
+            return
+        closed = "".join(f", closes a loop to {c.other}" for c in update.closures if c.accepted)
+        write(
+            "stdout",
+            f"{update.stop}: {update.observations} observations, cost {update.cost:.6g}, "
+            f"{update.blocks} blocks, {update.relinearised} relinearised, {update.seconds:.3f} s{closed}",
+        )
+
+    def _seconds_left(self, stage: str, done: int, total: int) -> float | None:
+        """Time for the steps to come, at the pace since the first event of the stage."""
+        now_s = time.monotonic()
+        if stage != self._stage:
+            self._stage, self._first = stage, (done, now_s)
+        first, begun_s = self._first
+        if done >= total:
+            return 0.0
+        return (now_s - begun_s) / (done - first) * (total - done) if done > first else None
+
+
+def _duration(seconds: float) -> str:
+    """A time in words."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    return (
+        f"{whole // 60} min {whole % 60} s" if whole < 3600 else f"{whole // 3600} h {whole % 3600 // 60} min"
+    )

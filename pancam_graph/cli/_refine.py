@@ -1,0 +1,165 @@
+"""The subcommand refine: adjust a traverse and write a folder of results."""
+
+import time
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from pancam_graph.cli._command import Command, Invocation
+from pancam_graph.cli._parser import CommandParser, Flag, LateChoice, Several
+
+__all__ = ["REFINE"]
+
+_DESCRIPTION = """\
+Refine a rover traverse: mast poses, pointing and terrain points from images taken by a camera mast.
+
+FOLDER has a traverse.json, or rover images with PDS labels (MER, MSL, Mars 2020). OUT gets solution.json,
+points.ply, residuals.csv and report.html, and with --mosaic a folder of mosaics; an older OUT is replaced
+once the new results are complete. OUT/cache keeps what was found in images: the same command goes on after
+an interrupt, and again only with what has changed.
+
+Exit status: 0 solved, 1 not converged (results are written), 2 bad input or a fault (nothing is written),
+130 interrupted.
+"""
+_SHARING_HELP = (
+    "what of the rig is estimated, and who shares it: QUANTITY=SCOPE[:ENTRY[~SIGMA],...] with quantities "
+    "calibration (fx_px fy_px skew_px cx_px cy_px, or focal), mounts and pan_T_tilt (rx_rad ry_rad rz_rad "
+    "x_m y_m z_m), radius (radius_m; model circle) and scopes fixed, all, eye, stop, image; without entries "
+    "all are free; SIGMA is the prior's, inf for none; what traverse.json says of a quantity is overridden; "
+    "for example calibration=eye:focal mounts=eye"
+)
+
+
+def _exports() -> Iterable[str]:
+    from pancam_graph.results import EXPORTS
+
+    return EXPORTS
+
+
+def _add_options(parser: CommandParser) -> None:
+    add = parser.add_argument
+    add("folder", type=Path, metavar="FOLDER", help="folder to read")
+    add("--out", type=Path, required=True, help="folder to write")
+    add(
+        "--model",
+        choices=("mast", "circle", "free", "projective"),
+        default="mast",
+        help="mast: rigid pan-tilt mast (default); circle: camera centres on the mast's circles, rotations "
+        "free; free: every camera on its own; projective: every projection matrix on its own",
+    )
+    add(
+        "--landmarks",
+        choices=("eliminated", "explicit"),
+        default="eliminated",
+        help="eliminated: terrain points follow the cameras (default); explicit: they are variables, slow",
+    )
+    add(
+        "--method",
+        choices=("joint", "alternation"),
+        default="joint",
+        help="joint: everything at once (default); alternation: what all stops share and everything else in "
+        "turn, slow",
+    )
+    add(
+        "--loss",
+        choices=("none", "huber", "cauchy"),
+        default="huber",
+        help="robust loss while outliers are sought (default huber); none: keep every observation",
+    )
+    add(
+        "--stop",
+        action=Several,
+        default=(),
+        metavar="NAME=NUMBER",
+        help="when the final iterations end; may be given for each of max_iterations (default 100), "
+        "relative_decrease (of the cost, 1e-7), relative_step, max_gradient, residual_sigmas; 0: not used",
+    )
+    add("--sharing", nargs="+", default=(), metavar="WORD", help=_SHARING_HELP)
+    add(
+        "--incremental",
+        action=Flag,
+        help="add the stops one by one as a rover does, with iSAM2 (model mast), a line for each",
+    )
+    add(
+        "--cross-validate",
+        action=Flag,
+        help="solve halves of the terrain points too, and show honest sigmas beside the formal ones",
+    )
+    add(
+        "--export",
+        action=Several,
+        type=LateChoice(_exports),
+        default=(),
+        metavar="FORMAT",
+        help="write a folder more into OUT for each of one or more FORMATs; colmap: undistorted images and a "
+        "model with rigs and frames, for dense reconstruction; cahvor: the refined cameras as text files",
+    )
+    add(
+        "--mosaic",
+        action=Flag,
+        help="write mosaics of each stop before and after too, around the horizon and from above",
+    )
+    add("--report", action=Flag, default=True, help="write report.html (default)")
+
+
+def _work(call: Invocation) -> int:
+    """Read, match images where observations are missing, solve, write."""
+    from pancam_graph import SolveOptions, cross_validate, find_observations, read_input, solve
+    from pancam_graph.cli._resumable import resumable
+    from pancam_graph.cli._summary import print_summary
+    from pancam_graph.data._sharing import parse_sharing
+    from pancam_graph.images import cache_folder
+    from pancam_graph.landmarks.kernel import must_compile
+    from pancam_graph.mosaic import MosaicOptions
+    from pancam_graph.results import check_exports, check_out, write_results
+    from pancam_graph.smoother._incremental import solve_incrementally
+    from pancam_graph.solve._solve import COMPILING
+    from pancam_graph.solve._stopping import criteria
+
+    arguments, progress = call.arguments, call.progress
+    chosen: dict[str, Any] = {n: getattr(arguments, n) for n in ("model", "landmarks", "method", "loss")}
+    chosen.update(criteria(arguments.stop))
+    sharing = parse_sharing(arguments.sharing)
+    # Covariances of terrain points take at most a twentieth of the solve: points.ply always has them.
+    options = SolveOptions(**chosen, sharing=sharing, landmark_covariances=True)
+
+    begin = time.perf_counter()
+    check_out(arguments.out)
+    with progress.shown(f"reading {arguments.folder}"), resumable(arguments.out):
+        traverse = read_input(arguments.folder)
+        check_exports(traverse, arguments.export)
+        options = replace(options, sharing=parse_sharing(arguments.sharing, traverse.sharing))
+        if traverse.observations is None:
+            traverse = find_observations(
+                traverse, progress=progress.counted, cache=cache_folder(arguments.out)
+            )
+        read_s = time.perf_counter() - begin
+        if must_compile():
+            progress.say(COMPILING)
+        if arguments.incremental:
+            n_stops = len(traverse.stops)
+            solution = solve_incrementally(
+                traverse, options, on_stop=lambda update: progress.stop(update, n_stops)
+            )
+        else:
+            solution = solve(traverse, options, on_iteration=progress.iteration)
+        solution = solution.with_seconds(read=read_s)
+        if arguments.cross_validate:
+            validated = cross_validate(traverse, options, solution=solution, progress=progress.counted)
+            solution = solution.with_cross_validation(validated)
+        progress.say("writing the results")
+        mosaics = MosaicOptions() if arguments.mosaic else None
+        results = {"report": arguments.report, "exports": arguments.export, "mosaics": mosaics}
+        solution = write_results(solution, arguments.out, **results, progress=progress.counted)
+    print_summary(solution, str(arguments.out), quiet=arguments.quiet)
+    return 0 if solution.converged else 1
+
+
+REFINE = Command(
+    name="refine",
+    summary="adjust a traverse of images or observations, and write a report",
+    description=_DESCRIPTION,
+    add_options=_add_options,
+    work=_work,
+)

@@ -1,0 +1,14 @@
+"""The subcommands, in the order of help. To add one: write its module and register it here."""
+
+from collections.abc import Mapping
+
+from pancam_graph.cli._command import Command
+from pancam_graph.cli._completion import COMPLETION
+from pancam_graph.cli._drive import DRIVE
+from pancam_graph.cli._refine import REFINE
+from pancam_graph.cli._render import RENDER
+from pancam_graph.cli._simulate import SIMULATE
+
+__all__ = ["COMMANDS"]
+
+COMMANDS: Mapping[str, Command] = {c.name: c for c in (REFINE, SIMULATE, RENDER, DRIVE, COMPLETION)}

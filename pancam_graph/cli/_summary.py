@@ -1,0 +1,98 @@
+"""What a solve did, in a few lines."""
+
+import sys
+from collections import Counter
+
+import numpy as np
+
+from pancam_graph.cli._streams import write
+from pancam_graph.data import CrossValidation, Solution
+
+__all__ = ["print_summary"]
+
+
+def print_summary(solution: Solution, where: str, *, quiet: bool = False) -> None:
+    """Print what a solve did: a table on a terminal, a few lines where standard output is piped.
+
+    `where` names the folder of the results. Warnings go to standard error where there is no terminal, a line
+    each; with `quiet` they are all that is printed.
+    """
+    warnings = solution.warnings
+    if solution.cross_validation is not None:
+        warnings = (*warnings, *solution.cross_validation.warnings)
+    if not quiet and sys.stdout is not None and sys.stdout.isatty():
+        _print_table(solution, where, warnings)
+        return
+    if not quiet:
+        write("stdout", _one_line(solution, where))
+        for line in _lines_below(solution):
+            write("stdout", line)
+    for warning in warnings:
+        write("stderr", f"warning: {warning}")
+
+
+def _one_line(solution: Solution, where: str) -> str:
+    used, total = int(solution.used.sum()), len(solution.used)
+    return (
+        f"{'converged' if solution.converged else 'NOT converged'}: RMS {solution.rms_initial_px:.3f} -> "
+        f"{solution.rms_final_px:.3f} px over {used} of {total} observations; {where}"
+    )
+
+
+def _print_table(solution: Solution, where: str, warnings: tuple[str, ...]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    table = Table(title=solution.traverse.name or None, title_justify="left")
+    for column in ("", "before", "after"):
+        table.add_column(column, justify="right" if column else "left")
+    table.add_row(
+        "RMS of the residuals, px", f"{solution.rms_initial_px:.3f}", f"{solution.rms_final_px:.3f}"
+    )
+    table.add_row("cost", f"{solution.cost_initial:.6g}", f"{solution.cost_final:.6g}")
+    table.add_row("observations", f"{len(solution.used)}", f"{int(solution.used.sum())} used")
+    console.print(table)
+    state = "converged" if solution.converged else "[bold red]not converged[/]"
+    console.print(f"{state}: {solution.stop_reason}; {solution.seconds.solve:.1f} s")
+    for line in _lines_below(solution):
+        console.print(line, highlight=False)
+    for warning in warnings:
+        console.print(f"[yellow]warning[/] {warning}", highlight=False)
+    console.print(f"results in [bold]{where}[/]", highlight=False)
+
+
+def _lines_below(solution: Solution) -> tuple[str, ...]:
+    """What there is to say of images and of cross-validation."""
+    validated = solution.cross_validation
+    return (*_of_images(solution), *([] if validated is None else [_of_cross_validation(validated)]))
+
+
+def _of_images(solution: Solution) -> tuple[str, ...]:
+    """What was left out of the observations that were found in images, and why.
+
+    Nothing for observations from elsewhere.
+    """
+    if solution.traverse.matching is None:
+        return ()
+    why = [f"{count} {name}" for name, count in sorted(Counter(solution.reason).items()) if name and count]
+    if solution.came_back is not None:
+        why.append(f"{int(solution.came_back.sum())} of those used came back after they had been set aside")
+    left_out = int(np.count_nonzero(~solution.used))
+    inside = f"in the solve: {left_out} of {len(solution.used)} observations left out; {', '.join(why)}"
+    return (*solution.traverse.matching.summary(), inside)
+
+
+def _of_cross_validation(validated: CrossValidation) -> str:
+    """One line: by how much honest sigmas exceed formal ones, and how halves fit each other."""
+    relative = len(validated.pairs) > 0
+    ratio = validated.relative_pointing.ratio if relative else validated.pointing.ratio
+    known = ratio[~np.isnan(ratio)]
+    what = "relative pointing" if relative else "pointing"
+    times = f"{np.median(known):.1f} times the formal ones (median)" if len(known) else "unknown"
+    scored, expected = validated.score_px("upper_lower")
+    return (
+        f"cross-validation: honest sigmas of {what} {times}; image halves under each other's cameras "
+        f"{scored:.3f} px, by noise {expected:.3f}; {len(validated.scores)} half solves, "
+        f"{validated.seconds:.1f} s"
+    )
