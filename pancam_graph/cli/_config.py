@@ -98,7 +98,7 @@ def _single(where: str, action: argparse.Action, value: object) -> Any:
     except argparse.ArgumentTypeError as error:
         raise InputError(f"{where}: {error}") from error
     except ValueError as error:  # numbers of thousands of digits
-        raise InputError(f"{where}: expected {expected}, found one that is too long") from error
+        raise InputError(f"{where}: expected {expected}, found one too long") from error
     if action.choices is not None and made not in action.choices:
         names = [str(c) for c in action.choices]
         raise InputError(
@@ -123,5 +123,5 @@ def _described(value: object) -> str:
     try:
         text = ascii(value) if isinstance(value, str) else str(value)
     except ValueError:
-        return "a number that is too long"
+        return "a number too long"
     return text if len(text) <= 60 else f"{text[:57]}..."

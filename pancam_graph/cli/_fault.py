@@ -1,6 +1,5 @@
 """The report of a fault of the program itself: what its developers need to find it."""
 
-import logging
 import os
 import platform
 import shlex
@@ -14,7 +13,6 @@ from pancam_graph import __version__
 
 __all__ = ["write_fault_report"]
 
-_LOG = logging.getLogger(__name__)
 _LIBRARIES = (
     "gtsam",
     "numpy",
@@ -34,7 +32,6 @@ def write_fault_report(error: BaseException) -> str:
     The file is in the temporary folder. Where it cannot be written, the sentence says where in the code the
     exception was raised.
     """
-    _LOG.error("a fault of the program", exc_info=error)
     what = " ".join(f"{type(error).__name__}: {error}".split())
     what = what if len(what) <= 200 else f"{what[:197]}..."
     begin = f"a fault of the program, not of your input: {what}"

@@ -48,6 +48,9 @@ def logged(*, verbose: bool, file: Path | None) -> Iterator[None]:
     try:
         _LOG.debug("pancam-graph %s: %s", __version__, shlex.join(sys.argv))
         yield
+    except BaseException as end:
+        _LOG.debug("ended by %s", type(end).__name__, exc_info=True)
+        raise
     finally:
         root.setLevel(levels[0])
         package.setLevel(levels[1])

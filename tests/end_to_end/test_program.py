@@ -75,7 +75,8 @@ def traverse_folder(tmp_path: Path) -> Path:
 def test_solves_and_writes_the_contract(run_apart: Run, traverse_folder: Path, tmp_path: Path) -> None:
     done = run_apart("optimize_traverse.py", "traverse", "--out", "out")
     assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
+    # Where the kernel is compiled first, and elsewhere on a slow machine, a line says so now and then.
+    assert [line for line in done.stderr.splitlines() if not line.endswith("since the beginning)")] == []
     assert done.stdout.count("\n") == 1
     out = tmp_path / "out"
     assert {p.name for p in out.iterdir()} == {"solution.json", "points.ply", "residuals.csv", "report.html"}

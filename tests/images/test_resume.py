@@ -126,7 +126,8 @@ def test_bad_input_that_shows_late_leaves_nothing_behind_that_was_not_there(
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="Ctrl-C is another thing there")
-def test_control_c_in_a_process_of_its_own(scripts_folder: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_to_a_process_of_its_own(scripts_folder: Path, tmp_path: Path, sent: signal.Signals) -> None:
     (tmp_path / "traverse").mkdir()
     pans = tuple(np.linspace(-80, 80, 9))
     truth, _ = make_traverse(tmp_path / "traverse", pans_deg=pans)
@@ -136,7 +137,7 @@ def test_control_c_in_a_process_of_its_own(scripts_folder: Path, tmp_path: Path)
     cache = tmp_path / "out" / "cache"
     while process.poll() is None and not list(cache.glob("matches-*")):
         time.sleep(0.02)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(sent)
     _, err = process.communicate()
     assert process.returncode == 130
     assert "run the same command again to go on from there" in err

@@ -1,0 +1,142 @@
+"""The public names of the package, and what an import of them loads."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import pancam_graph
+
+PUBLIC = {
+    "CrossValidation",
+    "Frame",
+    "Freedom",
+    "Image",
+    "Observations",
+    "PancamGraphError",
+    "RenderOptions",
+    "Rendering",
+    "Sharing",
+    "SimulationOptions",
+    "SmootherOptions",
+    "Solution",
+    "SolveOptions",
+    "Stop",
+    "StopRule",
+    "Traverse",
+    "TraverseSmoother",
+    "cross_validate",
+    "find_observations",
+    "read_input",
+    "read_pds",
+    "read_traverse",
+    "render",
+    "simulate",
+    "solve",
+    "write_cameras",
+    "write_colmap",
+    "write_rendering",
+    "write_report",
+    "write_results",
+    "write_traverse",
+}
+HEAVY = {"cv2", "gtsam", "llvmlite", "numba", "numpy", "plotly", "pvl", "pydantic", "rich", "scipy", "shtab"}
+
+
+def python(code: str) -> list[str]:
+    """What a fresh interpreter prints, as words."""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split()
+
+
+def loaded_by(code: str) -> set[str]:
+    """Modules that a fresh interpreter has after running some code."""
+    return set(python(f"import sys\n{code}\nprint('MODULES', *sys.modules)"))
+
+
+def test_the_public_names_are_these() -> None:
+    assert set(pancam_graph.__all__) == PUBLIC
+    assert len(pancam_graph.__all__) == len(PUBLIC)
+    assert set(dir(pancam_graph)) >= PUBLIC
+
+
+@pytest.mark.parametrize("name", sorted(PUBLIC))
+def test_a_public_name_is_a_class_or_a_function_of_its_own(name: str) -> None:
+    value = getattr(pancam_graph, name)
+    assert callable(value)
+    assert not isinstance(value, ModuleType)
+    assert value.__name__ == name
+
+
+def test_type_checkers_see_the_same_names_from_the_same_rooms() -> None:
+    tree = ast.parse(Path(pancam_graph.__file__).read_text(encoding="utf-8"))
+    (block,) = [n for n in tree.body if isinstance(n, ast.If)]
+    seen = {
+        alias.asname: str(line.module)
+        for line in block.body
+        if isinstance(line, ast.ImportFrom)
+        for alias in line.names
+    }
+    assert seen == {name: f"pancam_graph.{room}" for name, room in pancam_graph._ROOM_OF.items()}
+
+
+def test_another_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="'pancam_graph' has no attribute 'unsolve'"):
+        _ = pancam_graph.unsolve  # type: ignore[attr-defined]  # that is what is tested
+    with pytest.raises(ImportError, match="unsolve"):
+        exec("from pancam_graph import unsolve")
+
+
+def test_everything_can_be_imported_at_once() -> None:
+    names: dict[str, object] = {}
+    exec("from pancam_graph import *", names)
+    assert set(names) >= PUBLIC
+
+
+@pytest.mark.parametrize("name", ["solve", "simulate"])
+@pytest.mark.parametrize(
+    "before",
+    [
+        "",
+        "import pancam_graph.{name}",
+        "import pancam_graph.{name}._options",
+        "from pancam_graph.{name} import {name}",
+        "import importlib; importlib.import_module('pancam_graph.{name}')",
+        "import pancam_graph; pancam_graph.{name}",
+        "from pancam_graph import {name}; import pancam_graph.{name}._options; import pancam_graph.{name}",
+        "import pancam_graph; from pancam_graph.{name} import _options",
+        "import pancam_graph.cli; import pancam_graph.results; import pancam_graph.smoother",
+    ],
+)
+def test_no_room_hides_the_function_of_its_name(name: str, before: str) -> None:
+    code = f"""
+{before.format(name=name)}
+import pancam_graph, sys
+from pancam_graph import {name}
+from pancam_graph.{name} import {name} as same
+assert {name} is same is pancam_graph.{name}
+assert callable({name}) and {name}.__name__ == "{name}"
+room = sys.modules["pancam_graph.{name}"]
+import pancam_graph.{name}._options
+assert pancam_graph.{name} is {name}
+assert sys.modules["pancam_graph.{name}"] is room and room.{name} is {name}
+"""
+    python(code)
+
+
+def test_the_package_alone_loads_no_room_and_no_library() -> None:
+    loaded = loaded_by("import pancam_graph")
+    assert {m for m in loaded if m.startswith("pancam_graph")} == {"pancam_graph"}
+    assert loaded & HEAVY == set()
+    assert len(loaded) < 120
+
+
+@pytest.mark.parametrize("words", [["--help"], ["refin"], ["refine", "--help"], ["render", "-h"]])
+def test_help_loads_no_library(words: list[str]) -> None:
+    loaded = loaded_by(f"from pancam_graph.cli import main\nmain({words})")
+    assert loaded & HEAVY == set()
+    assert {m.split(".")[1] for m in loaded if m.startswith("pancam_graph.")} == {"base", "cli"}
