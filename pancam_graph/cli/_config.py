@@ -1,11 +1,10 @@
 """Files of options: TOML with a table for each subcommand, checked against the subcommand's parser."""
 
 import argparse
+import tomllib
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
-
-import tomllib
 
 from pancam_graph.base.errors import InputError
 from pancam_graph.cli._parser import COMMON_OPTIONS, Flag, Parser, Several, degrees, nearest

@@ -92,8 +92,9 @@ def _add_options(parser: CommandParser) -> None:
         type=LateChoice(_exports),
         default=(),
         metavar="FORMAT",
-        help="write a folder more into OUT for each of one or more FORMATs; colmap: undistorted images and a "
-        "model with rigs and frames, for dense reconstruction; cahvor: the refined cameras as text files",
+        help="write a folder more into OUT for each of one or more FORMATs, such as colmap (undistorted "
+        "images and a model with rigs and frames, for dense reconstruction) and cahvor (the refined cameras "
+        "as text files); an unknown one lists all",
     )
     add(
         "--mosaic",

@@ -115,7 +115,7 @@ def test_what_is_wrong_is_one_sentence(tmp_path: Path, text: str, says: str) -> 
         ("[simulate]\nseed = 1.0", "[simulate] seed: expected a whole number, found 1.0"),
         ("[simulate]\nseed = true", "[simulate] seed: expected a whole number, found true"),
         ("[simulate]\nsweep-deg = '90'", "[simulate] sweep-deg: expected a number of degrees, found '90'"),
-        ("[simulate]\nseed = 0x" + "f" * 5000, "[simulate] seed: expected a whole number, found one too long"),
+        ("[simulate]\nseed = 0x" + "f" * 5000, "[simulate] seed: expected a whole number, found one too long"),  # noqa: E501  the whole sentence
     ],
 )  # fmt: skip
 def test_wrong_numbers_are_one_sentence(tmp_path: Path, text: str, says: str) -> None:
