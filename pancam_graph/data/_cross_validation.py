@@ -1,4 +1,4 @@
-"""Formal standard deviations, and beside them what halves of the observations say of them."""
+"""Results of cross-validation: formal standard deviations beside those that halves of the tracks show."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -10,26 +10,28 @@ from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 __all__ = ["CrossValidation", "HalfScore", "Sigmas", "Splitting", "Spread"]
 
 Splitting = Literal["random", "upper_lower"]
-"""How tracks are halved: by lot, or by the half of the images that they lie in."""
+"""Ways of halving the tracks: "random" by lot, "upper_lower" by the half of the image in which they lie."""
 
 _LEAST_SHARE = 1e-6
-"""Where dropping half of the tracks changes the variance by a smaller share, telemetry alone decides."""
+"""Least relative change of a variance when half of the tracks is dropped, for images to count as its
+source."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Spread:
-    """What one way of halving says of n quantities with k components; NaN where no halving tells.
+    """Spread of n quantities with k components over one way of halving; NaN where no halving determines it.
 
-    A half tells nothing of a frame that it does not see, or that it cuts off from its neighbours.
+    A half determines nothing about a frame that it does not see or cuts off from its neighbours.
     """
 
     difference: FloatArray
-    """(n, k) between the solutions of the two halves; RMS over the halvings"""
+    """(n, k) difference between the solutions of the two halves; RMS over the halvings."""
     ratio: FloatArray
-    """(n, k) RMS over halves and halvings of the step from the whole solution to the half's, divided by the
-    standard deviation that this step should have; 1 if noise is all there is. NaN where telemetry decides"""
+    """(n, k) step from the whole solution to a half's over its expected standard deviation, RMS over halves
+    and halvings; about 1 if noise is the only error. NaN where telemetry alone determines the quantity."""
     sigma: FloatArray
-    """(n, k) standard deviation of the whole solution, the images' part of it multiplied by `ratio`"""
+    """(n, k) standard deviation of the whole solution, with the part that is due to images scaled by
+    `ratio`."""
 
     @property
     def overall(self) -> float:
@@ -38,7 +40,7 @@ class Spread:
         return float(np.sqrt(np.mean(known**2))) if len(known) else np.nan
 
     def part(self, rows: slice, shape: tuple[int, int]) -> "Spread":
-        """Some rows of a spread of vectors, in another shape."""
+        """The spread of a range of components of one long vector, reshaped to (n, k)."""
         return Spread(
             difference=self.difference[rows].reshape(shape),
             ratio=self.ratio[rows].reshape(shape),
@@ -47,14 +49,14 @@ class Spread:
 
     @staticmethod
     def of(formal: FloatArray, step: FloatArray, half_variance: FloatArray) -> "Spread":
-        """From formal sigmas (...), and of m halvings steps and variances of halves (m, 2, ...).
+        """Spread from formal sigmas (...), and steps and variances (m, 2, ...) of the halves of m halvings.
 
-        Steps lead from the whole solution to the half's; both are NaN where a half tells nothing. An
-        estimate from all observations is efficient, so the step from it to one from a part of them has the
-        variance of the part's less that of the whole, whatever priors both share: Hausman, Specification
-        tests in econometrics, 1978, lemma 2.1. If images decide and halves are alike, that is the variance
-        of the whole, and the mean squared step over random halves estimates it without knowing the noise:
-        McCarthy, Pseudo-replication: half samples, 1969.
+        A step leads from the whole solution to the half's. Steps and variances are NaN where a half
+        determines nothing. The estimate from all observations is efficient, so the variance of the step is
+        the half's variance less the whole's, whatever priors both share: Hausman, Specification tests in
+        econometrics, 1978, lemma 2.1. If images decide and both halves are equally strong, this difference
+        equals the variance of the whole; the mean squared step over random halves then estimates it without
+        knowledge of the noise: McCarthy, Pseudo-replication: half samples, 1969.
         """
         step_variance = half_variance - formal**2
         told: BoolArray = np.all(np.isfinite(step), axis=1)
@@ -78,30 +80,31 @@ class Spread:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sigmas:
-    """Standard deviations of n quantities with k components: formal, and what halves say."""
+    """Standard deviations of n quantities with k components: formal, and by halves of the tracks."""
 
     formal: FloatArray
-    """(n, k) of the whole solution, landmarks marginalised; 0 where held, NaN where a direction is free"""
+    """(n, k) formal sigma of the whole solution, landmarks marginalised; 0 if held, NaN if a direction is
+    free."""
     random: Spread
-    """From halves of the tracks drawn by lot: sees noise that is larger than its sigma, or not Gaussian"""
+    """Spread over halves drawn by lot: shows noise that is larger than its sigma, or not Gaussian."""
     upper_lower: Spread
-    """From the tracks in the upper and in the lower halves of images: sees errors of the camera model too"""
+    """Spread over tracks of upper and lower image halves: shows errors of the camera model too."""
 
     @property
     def honest(self) -> FloatArray:
-        """(n, k) the largest of the three; NaN where no half tells anything."""
+        """(n, k) largest of the three sigmas; NaN where no half determines the quantity."""
         told = np.fmax(self.random.sigma, self.upper_lower.sigma)
         return np.asarray(np.where(np.isnan(told), np.nan, np.fmax(told, self.formal)))
 
     @property
     def ratio(self) -> FloatArray:
-        """(n, k) honest over formal, 1 or above; NaN where held or unknown."""
+        """(n, k) honest over formal sigma, 1 or above; NaN where held or unknown."""
         return np.asarray(self.honest / np.where(self.formal > 0, self.formal, np.nan))
 
 
 @dataclass(frozen=True, kw_only=True)
 class HalfScore:
-    """Tracks of one half, placed with its own cameras and with those of the other half."""
+    """Residuals of the tracks of one half, with its own cameras and with those of the other half."""
 
     splitting: Splitting
     halving: int
@@ -110,51 +113,53 @@ class HalfScore:
     tracks: int
     """Tracks of this half."""
     scored: int
-    """Tracks that are scored: the other half sees all their frames, and joins them."""
+    """Tracks whose frames the other half sees and connects; only these are scored."""
     observations: int
     """Observations of the scored tracks."""
     own_px: float
-    """RMS residual of the scored tracks with cameras of the half's own solution, pixels per observation."""
+    """RMS residual of the scored tracks with the cameras of the half's own solution, pixels per
+    observation."""
     own_expected_px: float
-    """What noise alone would make it; exact where all observations have one sigma."""
+    """Value of `own_px` that noise alone would cause; exact if all observations have one sigma."""
     other_px: float
     """RMS residual of the scored tracks, triangulated with the other half's cameras held."""
     other_expected_px: float
-    """What noise alone would make it, the other half's formal covariance included."""
+    """Value of `other_px` that noise and the other half's formal covariance would cause."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CrossValidation:
-    """Honest sigmas beside the formal ones, and how each half's cameras fit the other half's tracks."""
+    """Honest sigmas beside formal ones, and residuals of each half under the other half's cameras."""
 
     halvings: int
-    """How often tracks were halved by lot."""
+    """Number of halvings by lot."""
     seed: int
     pointing: Sigmas
-    """(frames, 2) pan and tilt of each frame, radians; telemetry has its part in these"""
+    """(frames, 2) pan and tilt of each frame, radians; determined by telemetry and images together."""
     pairs: IntArray
-    """(pairs, 2) rows of frames of one stop that share tracks: a tree over each group of frames, made of the
-    pairs with the most tracks in common"""
+    """(pairs, 2) rows of frames of one stop that share tracks: the spanning tree of each connected group of
+    frames whose pairs have the most tracks in common."""
     pair_tracks: IntArray
-    """(pairs,) how many tracks both see"""
+    """(pairs,) number of tracks that both frames see."""
     relative_pointing: Sigmas
-    """(pairs, 2) pan and tilt of the second less those of the first, radians: what images determine"""
+    """(pairs, 2) pan and tilt of the second frame less those of the first, radians; images determine
+    these."""
     stops: Sigmas
-    """(stops, 6) mast poses, rotation first (rad, then m), in the body frame"""
+    """(stops, 6) mast poses in the body frame: rotation (radians), then translation (metres)."""
     scores: tuple[HalfScore, ...]
     warnings: tuple[str, ...]
     seconds: float
     """Wall-clock time."""
 
     def score_px(self, splitting: Splitting) -> tuple[float, float]:
-        """RMS of tracks scored with the other half's cameras, and what noise alone would make it, pixels.
+        """RMS residual under the other half's cameras, and the value that noise alone would cause, pixels.
 
-        Over all halves of a splitting, each observation counting alike; NaN where none was scored.
+        Over all halves of a splitting, with equal weight for every observation; NaN if none was scored.
         """
         scores = [s for s in self.scores if s.splitting == splitting and s.observations > 0]
         n = np.array([s.observations for s in scores])
         squares = np.array([[s.other_px, s.other_expected_px] for s in scores]).reshape(-1, 2) ** 2
         if not len(n):
             return np.nan, np.nan
-        found, expected = np.sqrt(n @ squares / n.sum())
-        return float(found), float(expected)
+        measured, expected = np.sqrt(n @ squares / n.sum())
+        return float(measured), float(expected)

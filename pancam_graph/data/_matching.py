@@ -1,4 +1,4 @@
-"""What the search for observations in images found, what it threw away, and why."""
+"""Statistics of the search for observations in images: matches kept, matches refused, and why."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -7,14 +7,14 @@ __all__ = ["Matching", "PairMatching", "Refusal", "StopMatching"]
 
 
 class Refusal(IntEnum):
-    """Why a pair of images, or of stops, gives nothing."""
+    """Reason why a pair of images, or of stops, yields no matches."""
 
     NONE = 0
-    """It gives something."""
+    """The pair yields matches."""
     FEW_ALIKE = 1
     """Too few features look alike where telemetry leaves a place for them."""
     CHANCE = 2
-    """No more agree about the geometry than chance would give."""
+    """Matches that agree about the geometry are no more than chance explains."""
     FEW_GUIDED = 3
     """Too few look alike where the corrected geometry leaves a place for them."""
     FEW_ON_LINES = 4
@@ -22,7 +22,7 @@ class Refusal(IntEnum):
 
     @property
     def text(self) -> str:
-        """In words, to follow a colon; empty for none."""
+        """The reason in words, to stand after a colon; empty for NONE."""
         return _TEXTS[self]
 
 
@@ -37,58 +37,60 @@ _TEXTS = {
 
 @dataclass(frozen=True, kw_only=True)
 class PairMatching:
-    """Features of two images that overlap by pointing. Candidates are kept, or refused for a reason."""
+    """Match statistics of two images that overlap by their pointing."""
 
     a: int
     """Row of image a."""
     b: int
     """Row of image b."""
     candidates: int
-    """Features of a with a best counterpart in b, in the last search that was made."""
+    """Features of image a with a best counterpart in image b, in the last search."""
     rover: int
-    """Of these, how many stand still relative to the mast between two stops."""
+    """Candidates that do not move relative to the mast between two stops, as the rover's own body."""
     off_line: int
-    """How many are off their epipolar lines under the known rig's geometry, corrected."""
+    """Candidates too far from their epipolar lines under the corrected geometry."""
     kept: int
-    """The others; 0 where the pair was refused as a whole."""
+    """Candidates that are kept; 0 if the pair was refused as a whole."""
     refusal: Refusal = Refusal.NONE
 
 
 @dataclass(frozen=True, kw_only=True)
 class StopMatching:
-    """Patches of the terrain of one stop, sought in the images of another. Kept, or not for a reason."""
+    """Statistics of terrain patches of one stop that are sought in the images of another."""
 
     a: int
     """Row of the stop that places the terrain."""
     b: int
     """Row of the stop whose images are searched."""
     sought: int
-    """Patches, each counted once for every image that may show it."""
+    """Patches sought, counted once for every image that may show them."""
     unlike: int
-    """Found nowhere with enough correlation: hidden, in shadow, or seen too differently."""
+    """Patches without a place of sufficient correlation: hidden, in shadow, or seen too differently."""
     ambiguous: int
-    """As like at another place."""
+    """Patches that correlate as well at a second place."""
     unstable: int
-    """Not confirmed: moved away from where they were found, or back to another place than they came from."""
+    """Patches whose refinement left the place of best correlation, or whose search back missed their
+    origin."""
     masked: int
-    """Found where a mask leaves out the image."""
+    """Patches located on masked pixels."""
     off_pose: int
-    """Not where the pose that most others agree on has them."""
+    """Patches that contradict the pose on which most others agree."""
     kept: int
+    """Patches that are kept."""
     noise_px: float
-    """Of a coordinate of those kept, measured from their scatter; 0 where nothing is kept."""
+    """Standard deviation of a coordinate of kept patches, measured from their scatter; 0 if none is kept."""
     refusal: Refusal = Refusal.NONE
 
 
 @dataclass(frozen=True, kw_only=True)
 class Matching:
-    """By pairs of images and by pairs of stops, the latter once for each direction."""
+    """Statistics of matching, by pairs of images and by ordered pairs of stops."""
 
     pairs: tuple[PairMatching, ...] = ()
     stops: tuple[StopMatching, ...] = ()
 
     def summary(self) -> tuple[str, ...]:
-        """A line for each step: how much was looked at, how much was kept, and why not the rest."""
+        """One line for each step: how much was examined, how much kept, and why the rest was not."""
         lines = []
         if self.pairs:
             refused = _counted({r.text: sum(p.refusal == r for p in self.pairs) for r in Refusal if r})
@@ -102,7 +104,7 @@ class Matching:
             lines.append(f"their matches: {kept} of {candidates} kept{_counted(why)}")
         if self.stops:
             why = {name: sum(getattr(s, field) for s in self.stops) for name, field in _PATCHES.items()}
-            # Those that were found, of a pair of stops that is refused as a whole.
+            # Patches that were located, but whose pair of stops was refused as a whole.
             sought, kept = sum(s.sought for s in self.stops), sum(s.kept for s in self.stops)
             why["of stops that were refused"] = sought - kept - sum(why.values())
             lines.append(f"patches between stops: {kept} of {sought} kept{_counted(why)}")

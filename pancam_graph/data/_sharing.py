@@ -1,7 +1,8 @@
-"""Which numbers of the rig are estimated, and which images share them (thesis 4.3, 5.4: parameter mask).
+"""Numbers of the rig that are estimated, and images that share them (thesis 4.3, 5.4: parameter mask).
 
-Each quantity of a rig is fixed, or free with a prior about the rig's own value: one correction shared by
-all, one per eye, per stop or per image. Single entries of a quantity can be held while others are free.
+Each quantity of a rig is fixed, or free with a prior whose mean is the rig's own value. One correction is
+shared by all images, by the images of an eye, by those of a stop, or belongs to a single image. Single
+entries of a quantity can be held while others are free.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,8 +14,9 @@ from pancam_graph.base.errors import InputError
 __all__ = ["ENTRIES", "Freedom", "Quantity", "Scope", "Sharing", "default_sigma", "parse_sharing"]
 
 Scope = Literal["fixed", "all", "eye", "stop", "image"]
-"""Who shares a correction: nobody has one (fixed), all images, the images of an eye, those of an eye at a
-stop, or each image has its own. `pan_T_tilt` belongs to no eye: one for all, or one per stop."""
+"""Images that share one correction: "fixed" none (there is no correction), "all" all images, "eye" the images
+of an eye, "stop" the images of an eye at a stop, "image" each image alone. `pan_T_tilt` belongs to no eye:
+"all" is one for the traverse, "stop" one per stop."""
 
 Quantity = Literal["calibration", "mounts", "pan_T_tilt", "radius"]
 
@@ -25,9 +27,8 @@ ENTRIES: Mapping[Quantity, tuple[str, ...]] = {
     "pan_T_tilt": _POSE,
     "radius": ("radius_m",),
 }
-"""Entries of each quantity; all are free unless said otherwise. `calibration` knows one more, `focal`: a
-factor on fx and fy in common. Those of a pose turn and shift it in its own frame
-(geometry.corrected_poses)."""
+"""Names of the entries of each quantity. `calibration` has one more, `focal`: a common factor on fx and fy.
+Entries of a pose are a rotation vector and a shift in the pose's own frame (geometry.corrected_poses)."""
 
 FOCAL = "focal"
 
@@ -76,11 +77,11 @@ _DEFAULT_SIGMA = {
     # The circle of Opportunity's five Navcam centres misses them by up to a millimetre.
     "radius_m": 1e-3,
 }
-"""Standard deviations of the priors; those in pixels as shares of the focal length."""
+"""Standard deviations of the priors; entries in pixels as shares of the focal length, `focal` as a share."""
 
 
 def default_sigma(entry: str, focal_px: float) -> float:
-    """Standard deviation of an entry's prior where none is given, for a focal length in pixels."""
+    """Default standard deviation of an entry's prior; `focal_px` scales entries in pixels."""
     if entry in {"fx_px", "fy_px"}:
         return _DEFAULT_SIGMA[FOCAL] * focal_px
     return _DEFAULT_SIGMA[entry] * (focal_px if entry.endswith("_px") else 1.0)
@@ -88,23 +89,23 @@ def default_sigma(entry: str, focal_px: float) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Freedom:
-    """How free one quantity is, and who shares it."""
+    """Freedom of one quantity of the rig: who shares a correction, its entries, and their priors."""
 
     scope: Scope = "fixed"
     free: tuple[str, ...] | None = None
-    """Entries that are free; None: all. The others are held: they stay what the rig says, bit for bit."""
+    """Free entries; None means all. Other entries keep the value of the rig, bit for bit."""
     sigma: Mapping[str, float] = field(default_factory=dict, hash=False)
-    """Standard deviation of the prior of some free entries, about the rig's value; infinite: none. Default:
-    what real rigs differ by (`default_sigma`)."""
+    """Standard deviations of priors by entry; infinite means no prior. Entries that are not named get
+    `default_sigma`, the amount by which real rigs differ."""
 
     def __post_init__(self) -> None:
-        """Take copies: what was given may change."""
+        """Copy mutable arguments."""
         if self.free is not None:
             object.__setattr__(self, "free", tuple(self.free))
         object.__setattr__(self, "sigma", {name: float(value) for name, value in self.sigma.items()})
 
     def entries(self, quantity: Quantity) -> tuple[str, ...]:
-        """The free entries, in their own order; none where the scope is fixed."""
+        """Free entries in the order of `ENTRIES`; empty for the scope "fixed"."""
         if self.scope == "fixed":
             return ()
         if self.free is None:
@@ -117,15 +118,18 @@ FIXED = Freedom()
 
 @dataclass(frozen=True, kw_only=True)
 class Sharing:
-    """Freedom of each quantity of a rig. Raises InputError for what contradicts itself or means nothing."""
+    """Freedom of each quantity of a rig.
+
+    Raises InputError for scopes and entries that a quantity does not have, and for contradictions.
+    """
 
     calibration: Freedom = FIXED
     mounts: Freedom = FIXED
     """`head_T_camera`, in the camera's frame; model `mast`."""
     pan_T_tilt: Freedom = FIXED
-    """Where the tilt axis sits, in its own frame; model `mast`."""
+    """Pose of the tilt axis on the pan axis, corrected in the tilt frame; model `mast`."""
     radius: Freedom | None = None
-    """Of the circles of model `circle`. None: free per eye there, with the default prior."""
+    """Radius of the circles of model `circle`; None means free per eye there, with the default prior."""
 
     def __post_init__(self) -> None:
         """Check scopes, entries and sigmas."""
@@ -142,7 +146,7 @@ class Sharing:
         return [(quantity, freedom) for quantity, freedom in freedoms if freedom is not None]
 
     def for_model(self, model: str) -> "Sharing":
-        """The same with what the model itself says where nothing was given.
+        """The same sharing with the radius that the model asks for, where none was given.
 
         Raises InputError for a free quantity that the model does not have.
         """
@@ -159,7 +163,7 @@ class Sharing:
 
     @property
     def any_free(self) -> bool:
-        """Whether anything is."""
+        """Whether any quantity is free."""
         return any(freedom.scope != "fixed" for _, freedom in self._given())
 
 
@@ -208,11 +212,11 @@ def _check(quantity: Quantity, freedom: Freedom) -> None:
 
 
 def parse_sharing(words: Sequence[str], base: Sharing | None = None) -> Sharing | None:
-    """A sharing from words like `calibration=eye:fx_px,fy_px~2` as a command line has them.
+    """A sharing from words such as `calibration=eye:fx_px,fy_px~2` of a command line.
 
-    QUANTITY=SCOPE[:ENTRY[~SIGMA],...]: without entries all are free; SIGMA is the prior's, `inf` for none. A
-    quantity that is named replaces that of `base`; without words `base` it is. Raises InputError saying which
-    word is wrong.
+    Each word is QUANTITY=SCOPE[:ENTRY[~SIGMA],...]. Without entries all are free. SIGMA is the standard
+    deviation of the prior, `inf` for none. A named quantity replaces that of `base`; without words the result
+    is `base`. Raises InputError naming the wrong word.
     """
     if not words:
         return base

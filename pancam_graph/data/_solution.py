@@ -1,4 +1,4 @@
-"""What an adjustment returns."""
+"""The result of an adjustment."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -21,21 +21,21 @@ __all__ = ["Incremental", "Refined", "RigCorrection", "Seconds", "Solution", "St
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RigCorrection:
-    """By how much a rig's numbers differ from what the traverse's rig says; 0 where they were held."""
+    """Differences between the adjusted rig and the rig of the traverse; 0 where a number was held."""
 
     calibration_px: FloatArray
     """(images, 5) added to fx, fy, skew, cx and cy of each image's camera."""
     mount: FloatArray
-    """(images, 6) of each image's `head_T_camera`: rotation vector, radians, and shift, metres, in the
-    camera's own frame (geometry.corrected_poses)."""
+    """(images, 6) correction of each image's `head_T_camera`: rotation vector, radians, and shift, metres, in
+    the camera's own frame (geometry.corrected_poses)."""
     pan_T_tilt: FloatArray
-    """(stops, 6) the same of the tilt axis."""
+    """(stops, 6) correction of the tilt axis, in the same form, in its own frame."""
     radius_m: FloatArray
-    """(images,) added to the radius of the image's circle; model `circle`."""
+    """(images,) metres added to the radius of the image's circle; model `circle`."""
 
     @staticmethod
     def to_calibrations(traverse: Traverse, calibration: FloatArray) -> "RigCorrection":
-        """That from the rig's calibrations to these, K (images, 3, 3); all else is as the rig has it."""
+        """The correction from the rig's calibrations to K (images, 3, 3); it changes nothing else."""
         n, (row, column) = len(traverse.images), CALIBRATION_ENTRIES
         return RigCorrection(
             calibration_px=(calibration - traverse.calibration)[:, row, column],
@@ -54,28 +54,31 @@ class RigCorrection:
 
 @dataclass(frozen=True, kw_only=True)
 class Refined:
-    """One free entry of the rig, as the adjustment found it."""
+    """One free entry of the rig after the adjustment."""
 
     quantity: Quantity
     entry: str
     camera: str | None
-    """Name of the eye; None: of all eyes."""
+    """Name of the eye that the entry belongs to; None if it belongs to all eyes."""
     stop: str | None
-    """Id of the stop that has it for itself; None: of the whole traverse."""
+    """Id of the stop that the entry belongs to; None if it serves the whole traverse."""
     image: str | None
-    """Id of the image that has it for itself; None: of all images of the eye, or of the eye at the stop."""
+    """Id of the image that the entry belongs to; None if all images of the eye, or of the eye at the stop,
+    share it."""
     nominal: float | None
-    """What the rig says; 0 for entries of a pose, 1 for `focal`; None where those who share it differ."""
+    """Value in the rig: 0 for entries of a pose, 1 for `focal`; None if images that share the entry
+    differ."""
     change: float
+    """Estimated difference from the rig's value."""
     sigma: float
-    """Formal standard deviation, all else marginalised; NaN where a direction is free."""
+    """Formal standard deviation, everything else marginalised; NaN if a direction is free."""
     prior_sigma: float
-    """Of the prior about the rig's value; infinite where there was none."""
+    """Standard deviation of the prior; infinite if there was none."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class State:
-    """Values of everything that is estimated, in the order of the traverse's entries."""
+    """Values of all estimated quantities, in the order of the traverse's entries."""
 
     world_T_mast: tuple[gtsam.Pose3, ...]
     """Mast pose of each stop."""
@@ -88,12 +91,12 @@ class State:
     landmarks_m: FloatArray
     """(landmarks, 3) terrain points; a row of NaN where there is no usable point."""
     rig: RigCorrection | None = None
-    """How the rig differs from the traverse's; None: in nothing."""
+    """Corrections of the rig; None if the rig is the traverse's."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Seconds:
-    """Wall-clock time of each part."""
+    """Wall-clock seconds of each part of a run."""
 
     read: float = 0.0
     initialise: float = 0.0
@@ -114,18 +117,18 @@ def rms_px(residuals_px: FloatArray) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Incremental:
-    """What each update of a smoother took, in the order of the stops."""
+    """Effort of each update of a smoother, in the order of the stops."""
 
     seconds_per_stop: tuple[float, ...]
     cost_per_stop: tuple[float, ...]
-    """After each."""
+    """Cost after each update."""
     relinearised_per_stop: tuple[int, ...]
-    """Variables that moved to another point of linearisation."""
+    """Number of variables that were linearised anew."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solution:
-    """The adjusted traverse, with what it was before, how sure it is, and what went wrong."""
+    """An adjusted traverse: its states before and after, its uncertainties, and its warnings."""
 
     traverse: Traverse
     """The input, observations included."""
@@ -133,7 +136,7 @@ class Solution:
     landmarks: str
     converged: bool
     stop_reason: str
-    """Why the iterations ended, in words."""
+    """Reason why the iterations ended, in words."""
     iterations: int
     cost_history: tuple[float, ...]
     """Cost after each iteration of the final least-squares stage, its start first.
@@ -142,7 +145,7 @@ class Solution:
     cost_initial: float
     """Half the sum of squares of whitened residuals at the start, priors included."""
     cost_final: float
-    """The same at the end, over the same observations."""
+    """Cost at the end, over the same observations."""
     initial: State
     final: State
     landmark_track: IntArray
@@ -150,35 +153,40 @@ class Solution:
     used: BoolArray
     """(observations,) whether each observation took part in the final least-squares stage."""
     reason: tuple[str, ...]
-    """(observations,) why one was left out: "outlier", "single" (a track seen once), "behind"; "" if used."""
+    """(observations,) reason for leaving an observation out: "outlier", "single" (its track is seen once),
+    "behind" (its landmark lies behind the camera), "outside" (of its camera model's domain); "" if used."""
     residual_initial_px: FloatArray
     """(observations, 2) projected minus measured at the start, raw image pixels; NaN where undefined."""
     residual_final_px: FloatArray
-    """(observations, 2) the same at the end; for outliers too, where their landmark exists."""
+    """(observations, 2) residuals at the end, also of outliers whose landmark exists."""
     sigma_px: FloatArray
-    """(observations,) standard deviation each was weighted with in the end (or of its covariance)."""
+    """(observations,) standard deviation in the final weight; the root of the mean variance of
+    covariances."""
     stop_covariance: FloatArray
-    """(stops, 6, 6) rotation first, body frame, landmarks marginalised; formal. 0 for a held stop.
+    """(stops, 6, 6) formal covariance of each mast pose, rotation first, body frame, landmarks marginalised.
 
-    NaN, as the angles' sigmas, where the solution leaves a direction free; a warning says so."""
+    0 for a held stop; NaN, with a warning, if the solution leaves a direction free."""
     angle_sigma_rad: FloatArray
-    """(frames, 2) formal standard deviation of pan and tilt, landmarks marginalised."""
+    """(frames, 2) formal standard deviation of pan and tilt, landmarks marginalised; NaN as
+    `stop_covariance`."""
     covariance_px2: FloatArray | None = None
-    """(observations, 2, 2) covariance each was weighted with in the end, where the input has covariances."""
+    """(observations, 2, 2) covariance in the final weight; None if the input has no covariances."""
     landmark_covariance_m2: FloatArray | None = None
-    """(landmarks, 3, 3) of `final.landmarks_m`, all else marginalised; formal; where it was asked for."""
+    """(landmarks, 3, 3) formal covariance of `final.landmarks_m`, all else marginalised; None unless
+    requested."""
     mast_covariance: JointCovariance | None = field(default=None, repr=False)
-    """What `stop_covariance_between` works from; None where the solution leaves a direction free."""
+    """Square root of the joint covariance of all masts, for `stop_covariance_between`; None if a direction is
+    free."""
     came_back: BoolArray | None = None
-    """(observations,) whether each took part in the end after it had been set aside; None: not followed."""
+    """(observations,) whether an observation is used after it had been set aside; None if not recorded."""
     refined: tuple[Refined, ...] = ()
-    """Entries of the rig that were free (`Sharing`), in the order of quantity and owner."""
+    """Free entries of the rig (`Sharing`), ordered by quantity and owner."""
     method: str = "joint"
-    """How it was solved."""
+    """Name of the method (`SolveOptions.method`)."""
     cross_validation: CrossValidation | None = None
-    """What solutions from halves of the tracks say of the sigmas; where it was asked for."""
+    """Cross-validation of the sigmas; None unless requested."""
     incremental: "Incremental | None" = None
-    """How it came about, where it was followed stop by stop."""
+    """Effort of each update, if the solution was made stop by stop; else None."""
     warnings: tuple[str, ...] = ()
     seconds: Seconds = field(default_factory=Seconds)
 
@@ -194,18 +202,19 @@ class Solution:
 
     @cached_property
     def rig(self) -> Rig:
-        """The rig as adjusted: its tilt axis, and each eye's calibration and mount.
+        """The adjusted rig: its tilt axis, and the calibration and mount of each eye.
 
-        Only what serves the whole traverse: what stops or images have for themselves (`final.rig` has it) is
-        left as the input has it. Nothing was free: the input's own.
+        It has only corrections that serve the whole traverse. Corrections of single stops or images are in
+        `final.rig`. If nothing was free, it is the rig of the input.
         """
-        rig, found, t = self.traverse.rig, self.final.rig, self.traverse
-        if found is None:
+        rig, correction, t = self.traverse.rig, self.final.rig, self.traverse
+        if correction is None:
             return rig
         eyes = []
         for i, eye in enumerate(rig.eyes):
-            own = t.image_eye == i
-            calibration, mount = _common(found.calibration_px[own]), _common(found.mount[own])
+            of_eye = t.image_eye == i
+            calibration = _common(correction.calibration_px[of_eye])
+            mount = _common(correction.mount[of_eye])
             camera, head_T_camera = eye.camera, eye.head_T_camera
             if calibration.any():
                 fx, fy, skew, cx, cy = calibration
@@ -214,19 +223,19 @@ class Solution:
             if mount.any():
                 head_T_camera = _corrected(head_T_camera, mount)
             eyes.append(replace(eye, camera=camera, head_T_camera=head_T_camera))
-        axis = _common(found.pan_T_tilt)
+        axis = _common(correction.pan_T_tilt)
         pan_T_tilt = _corrected(rig.pan_T_tilt, axis) if axis.any() else rig.pan_T_tilt
         return replace(rig, eyes=tuple(eyes), pan_T_tilt=pan_T_tilt)
 
     @property
     def calibration(self) -> FloatArray:
-        """(images, 3, 3) K of each image's camera as adjusted, upper-triangular, without distortion."""
-        found = self.final.rig
-        return self.traverse.calibration if found is None else found.calibration(self.traverse)
+        """(images, 3, 3) adjusted calibration matrix K, upper-triangular, without distortion."""
+        correction = self.final.rig
+        return self.traverse.calibration if correction is None else correction.calibration(self.traverse)
 
     @cached_property
     def landmark_row(self) -> IntArray:
-        """(observations,) row in the landmarks of what each observation saw; -1 where there is none."""
+        """(observations,) row of the landmark of each observation; -1 if it does not exist."""
         observations, n = self.traverse.observations, len(self.landmark_track)
         if observations is None or n == 0:
             return np.full(len(self.used), -1)
@@ -237,9 +246,9 @@ class Solution:
 
     @cached_property
     def image_cameras(self) -> tuple[Camera, ...]:
-        """Each image's camera as adjusted, distortion included, in its own frame.
+        """Adjusted camera of each image, distortion included, in the camera's own frame.
 
-        One object for all images of the same eye and calibration; the rig's own where nothing moved.
+        Images of the same eye and calibration share one object; it is the rig's own if nothing changed.
         """
         t, K, made = self.traverse, self.calibration, dict[tuple[int, bytes], Camera]()
         moved = np.any(t.calibration != K, axis=(1, 2))
@@ -262,7 +271,7 @@ class Solution:
 
     @property
     def correction_rad(self) -> FloatArray:
-        """(frames, 2) how far pan and tilt moved from the telemetry."""
+        """(frames, 2) adjusted pan and tilt less those of telemetry, radians."""
         return self.final.pan_tilt_rad - self.traverse.pan_tilt_rad
 
     def stop_covariance_between(self, stop_a: str, stop_b: str) -> FloatArray:
@@ -292,16 +301,16 @@ class Solution:
         return ids.index(stop)
 
     def with_seconds(self, **seconds: float) -> "Solution":
-        """The same solution with some wall-clock times filled in."""
+        """The same solution with some wall-clock seconds replaced."""
         return replace(self, seconds=replace(self.seconds, **seconds))
 
-    def with_cross_validation(self, found: CrossValidation) -> "Solution":
-        """The same solution with a cross-validation of it."""
-        return replace(self, cross_validation=found)
+    def with_cross_validation(self, cross_validation: CrossValidation) -> "Solution":
+        """The same solution with its cross-validation."""
+        return replace(self, cross_validation=cross_validation)
 
 
 def _common(corrections: FloatArray) -> FloatArray:
-    """The correction that all rows (n, m) are, (m,); 0 where they differ."""
+    """The common value (m,) of all rows (n, m); 0 if rows differ."""
     same = len(corrections) > 0 and bool(np.all(corrections == corrections[0]))
     return corrections[0] if same else np.zeros(corrections.shape[1])
 

@@ -37,11 +37,11 @@ class Stop:
 
     id: str
     world_T_mast: gtsam.Pose3
-    """As odometry or localisation gives it; the centre of the prior."""
+    """Pose of the mast in the world as odometry or localisation gives it; the mean of the prior."""
     sigma_rotation_rad: float
-    """Standard deviation of each rotation component of the prior; 0: held."""
+    """Standard deviation of the prior for each rotation component, radians; 0 holds the rotation."""
     sigma_translation_m: float
-    """Standard deviation of each translation component of the prior; 0: held."""
+    """Standard deviation of the prior for each coordinate, metres; 0 holds the position."""
 
     @property
     def sigmas(self) -> FloatArray:
@@ -57,13 +57,13 @@ class Frame:
     stop: str
     """Id of the stop."""
     pan_rad: float
-    """As telemetry gives it; positive anticlockwise seen from above."""
+    """Pan angle as telemetry gives it, radians; positive anticlockwise seen from above."""
     tilt_rad: float
-    """As telemetry gives it; positive upwards."""
+    """Tilt angle as telemetry gives it, radians; positive upwards."""
     sigma_pan_rad: float
-    """Standard deviation of the prior; 0: held."""
+    """Standard deviation of the pan prior; 0 holds the pan."""
     sigma_tilt_rad: float
-    """Standard deviation of the prior; 0: held."""
+    """Standard deviation of the tilt prior; 0 holds the tilt."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,20 +83,21 @@ class Image:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Observations:
-    """Pixels at which images see tracks, as columns of equal length n."""
+    """Pixels at which images see tracks: n observations as columns of equal length."""
 
     image: IntArray
     """(n,) row in the traverse's images."""
     track: IntArray
-    """(n,) number of the terrain point, 0 or above; numbers may leave gaps."""
+    """(n,) number of the track, 0 or above; not every number need occur."""
     uv_px: FloatArray
-    """(n, 2) pixel, centre of the top-left one at (0, 0)."""
+    """(n, 2) measured pixel (u, v); the centre of the top-left pixel is (0, 0)."""
     sigma_px: FloatArray
-    """(n,) standard deviation of each coordinate; with covariances, the root of their mean variance."""
+    """(n,) standard deviation of each coordinate, pixels; with covariances, the root of their mean
+    variance."""
     covariance_px2: FloatArray | None = None
-    """(n, 2, 2) covariance of (u, v) of each, symmetric and positive definite; None: sigma_px^2 I."""
+    """(n, 2, 2) covariance of (u, v), symmetric and positive definite; None means sigma_px^2 I."""
     origin: Literal["given", "images"] = "given"
-    """"images" where this package measured them: then their noise is a guess that the solve rescales."""
+    """"images" if this package measured the pixels: their sigmas are guesses, which a solve rescales."""
 
     def __len__(self) -> int:
         """Number of observations."""
@@ -104,11 +105,11 @@ class Observations:
 
     @property
     def noise(self) -> PixelNoise:
-        """By what the observations are weighted."""
+        """Noise of the observations, which decides their weight."""
         return PixelNoise(sigma_px=self.sigma_px, covariance_px2=self.covariance_px2)
 
     def with_covariance(self, covariance_px2: FloatArray) -> "Observations":
-        """The same observations with a covariance (n, 2, 2) each, and the sigmas that go with them."""
+        """The same observations with other covariances (n, 2, 2), and the sigmas that belong to them."""
         return replace(self, covariance_px2=covariance_px2, sigma_px=mean_sigma_px(covariance_px2))
 
     def select(self, rows: BoolArray | IntArray) -> "Observations":
@@ -126,7 +127,7 @@ class Observations:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Traverse:
-    """Everything known before the adjustment. Constructing one checks that it hangs together.
+    """Everything known before the adjustment; the constructor checks that all entries fit together.
 
     Raises InputError naming the entry for duplicate ids, unknown stops, frames or cameras, numbers
     that are not finite, negative sigmas, and observations out of range.
@@ -138,15 +139,15 @@ class Traverse:
     frames: tuple[Frame, ...]
     images: tuple[Image, ...]
     observations: Observations | None = None
-    """None: to be found in the image files."""
+    """Measured pixels; None if they are still to be measured in the image files."""
     sharing: Sharing | None = None
-    """What of the rig is free, and who shares it, where a solve's options do not say; None: nothing said."""
+    """Numbers of the rig to estimate, unless the options of a solve say otherwise; None if unstated."""
     folder: Path | None = None
-    """Where image files are relative to; None for a traverse made in memory."""
+    """Folder that paths of image files are relative to; None for a traverse made in memory."""
     warnings: tuple[str, ...] = field(default=())
-    """What a reader noticed and the user should know."""
+    """Sentences about the input that a reader of it wrote for the user."""
     matching: Matching | None = None
-    """What became of all that was found in the images; None for observations from elsewhere."""
+    """Statistics of the search for observations in images; None for observations from elsewhere."""
 
     def __post_init__(self) -> None:
         """Check ids, references and ranges."""
@@ -207,7 +208,7 @@ class Traverse:
 
     @cached_property
     def calibration(self) -> FloatArray:
-        """(images, 3, 3) K of each image's camera as the rig has it, upper-triangular, without distortion."""
+        """(images, 3, 3) calibration matrix K of each image in the rig, upper-triangular, no distortion."""
         return np.array([p.calibration_matrix for p in self.rig.pinholes])[self.image_eye]
 
     @cached_property
@@ -220,9 +221,9 @@ class Traverse:
         world_T_mast: Sequence[gtsam.Pose3] | None = None,
         pan_tilt_rad: FloatArray | None = None,
     ) -> tuple[FloatArray, FloatArray]:
-        """World poses of all images by the mast chain: rotations (images, 3, 3), centres (images, 3).
+        """`world_R_camera` (images, 3, 3) and centres (images, 3), metres, of all images by the mast chain.
 
-        Default: at the stops and angles that telemetry gives.
+        `world_T_mast` (one a stop) and `pan_tilt_rad` (frames, 2) default to telemetry.
         """
         poses = world_T_mast if world_T_mast is not None else [s.world_T_mast for s in self.stops]
         angles = pan_tilt_rad if pan_tilt_rad is not None else self.pan_tilt_rad
@@ -233,7 +234,7 @@ class Traverse:
     def with_observations(
         self, observations: Observations, warnings: Sequence[str] = (), *, matching: Matching | None = None
     ) -> "Traverse":
-        """The same traverse with other observations, and perhaps more warnings."""
+        """The same traverse with other observations, further warnings, and statistics of matching."""
         warnings = (*self.warnings, *warnings)
         return replace(self, observations=observations, warnings=warnings, matching=matching)
 
@@ -315,7 +316,7 @@ def _require_covariances(covariance_px2: FloatArray) -> None:
     name, c = "covariance_px2", covariance_px2
     _require_rows(name, "finite numbers", ~np.isfinite(c).all(axis=(1, 2)), c)
     _require_rows(name, "variances above 0", ~((c[:, 0, 0] > 0) & (c[:, 1, 1] > 0)), c)
-    with np.errstate(over="ignore"):  # what overflows is refused
+    with np.errstate(over="ignore"):  # a matrix that overflows fails the tests below
         scaled = c / np.maximum(c[:, 0, 0], c[:, 1, 1])[:, None, None]
         skewed = ~(np.abs(scaled[:, 0, 1] - scaled[:, 1, 0]) <= _ASYMMETRY)
         determinant = scaled[:, 0, 0] * scaled[:, 1, 1] - scaled[:, 1, 0] ** 2

@@ -1,4 +1,4 @@
-"""What the user should know about a traverse before believing its solution."""
+"""Warnings of images, frames and stops that observations do not connect."""
 
 from collections.abc import Sequence
 
@@ -15,10 +15,10 @@ _NAMED = 6
 
 
 def components(n_members: int, member: IntArray, landmark: IntArray) -> tuple[int, IntArray]:
-    """Groups of members (images, frames or stops) joined by common landmarks.
+    """Connected groups of members (images, frames or stops); common landmarks connect members.
 
-    `member` and `landmark` (n,) are the observations. Returns the number of groups, and the group of each
-    member (members,).
+    `member` and `landmark` (n,) are the rows of each observation. Returns the number of groups, and the group
+    of each member (members,).
     """
     n_landmarks = int(landmark.max()) + 1 if len(landmark) else 0
     n = n_members + n_landmarks
@@ -42,7 +42,7 @@ def connection_warnings(traverse: Traverse, used: BoolArray) -> list[str]:
             "only telemetry tells where they point"
         )
 
-    # Eyes of one frame hang together by the rig, so groups are of frames.
+    # The rig connects the eyes of a frame, so groups consist of frames.
     frame_of = traverse.image_frame
     n, group = components(len(traverse.frames), frame_of[image], track)
     seen = np.bincount(frame_of[image], minlength=len(traverse.frames)) > 0
@@ -72,7 +72,7 @@ def connection_warnings(traverse: Traverse, used: BoolArray) -> list[str]:
 
 
 def listed(names: Sequence[str], what: str) -> str:
-    """How many, and which, of these the first few: "2 tracks (4, 7)"."""
+    """Number of names and the first few of them, for example "2 tracks (4, 7)"."""
     return f"{_number(names, what)} ({_names(names)})"
 
 

@@ -1,4 +1,4 @@
-"""How to solve."""
+"""Options of a solve."""
 
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -16,40 +16,42 @@ Method = Literal["joint", "alternation"]
 
 @dataclass(frozen=True, kw_only=True)
 class SolveOptions(StopRule):
-    """How to solve, and when the final least squares ends (see StopRule).
+    """Options of a solve, with the criteria that end its final least squares (StopRule).
 
-    Where noise is rescaled or pixels are carried anew, a few such least squares follow each other, each with
-    the whole number of iterations.
+    If noise is rescaled or pixels are carried anew, several least-squares fits follow each other, and each
+    may take `max_iterations`.
     """
 
     model: Model = "mast"
     landmarks: Literal["eliminated", "explicit"] = "eliminated"
-    """How landmarks are treated: eliminated from every linearisation, or as variables of the graph, which is
-    slow and serves for checking."""
+    """Treatment of landmarks: "eliminated" from every linearisation, or "explicit" variables of the graph,
+    which is slow and serves as a check."""
     method: Method = "joint"
-    """How the final least squares is solved: all at once, or what stops share and what they do not in turn
-    (the thesis's own way; it needs eliminated landmarks and something shared that is free)."""
+    """Method of the final least squares: "joint" solves for everything at once; "alternation" solves in turn
+    for quantities that stops share and for the others (the thesis's own way; it needs eliminated landmarks
+    and a free quantity that stops share)."""
     loss: LossName = "huber"
-    """Robust loss while outliers are sought. The final estimate is always least squares over the
-    observations that were kept; "none" keeps all of them."""
+    """Robust loss of the search for outliers; "none" skips the search and keeps all observations. The final
+    estimate is always least squares over the kept observations."""
     tie: Tie | None = None
     """"hard": camera poses are computed from mast, pan and tilt (model "mast" only); "soft": they are
     variables that a sigma holds near there. Default: hard for "mast", soft for the others."""
     flex: Flex | None = None
-    """That sigma; default: the model's own (graph.DEFAULT_FLEX)."""
+    """Sigma of a soft tie; default: the model's own (graph.DEFAULT_FLEX)."""
     sharing: Sharing | None = None
-    """What of the rig is free, and who shares it; default: what the traverse says, or else nothing but the
-    radii of the model "circle"."""
+    """Free numbers of the rig, and images that share them; default: the traverse's own, or else nothing but
+    the radii of the model "circle"."""
     normalise: bool = True
-    """Whether model `projective` works on conditioned matrices (thesis 5.2). Without, on those of pixels and
-    metres, to compare: the optimum is the same."""
+    """Whether the model "projective" uses conditioned matrices (thesis 5.2); False serves as a comparison,
+    with the same optimum."""
     outlier_sigma: float = 4.0
-    """An observation goes where noise would take it less often than a Gaussian beyond this many sigmas."""
+    """Threshold for outliers: a residual is rejected if noise exceeds it as rarely as a Gaussian exceeds this
+    many sigmas."""
     rescale_noise: bool | None = None
-    """Whether observation sigmas are multiplied by what residuals say; default: where this package measured
-    the observations itself and their sigmas are guesses."""
+    """Whether residuals rescale the sigmas of observations; default: only for observations that this package
+    measured, since their sigmas are guesses."""
     landmark_covariances: bool = False
-    """Whether the solution gets the covariance of each terrain point."""
+    """Whether the solution has the covariance of each terrain point."""
 
     def __post_init__(self) -> None:
         """Check the choices."""
@@ -87,10 +89,10 @@ class SolveOptions(StopRule):
 
     @property
     def firm_tie(self) -> Tie:
-        """The tie, the model's own where none was asked for."""
+        """The tie that is used: the given one, or the model's own."""
         return self.tie or ("hard" if self.model == "mast" else "soft")
 
     @property
     def firm_flex(self) -> Flex:
-        """The flex of a soft tie."""
+        """The flex that is used for a soft tie: the given one, or the model's own."""
         return self.flex or DEFAULT_FLEX[self.model]

@@ -1,8 +1,8 @@
-"""Which observations to believe: data snooping with cameras held, one observation at a time.
+"""Data snooping: observations that their landmark contradicts are rejected, with cameras held.
 
-Each residual is compared with what noise alone makes of it, given that the landmark follows its own
-observations (Baarda 1968). A track loses only its worst observation at a time and is triangulated again;
-rejected observations that fit again come back.
+Each residual is compared with the covariance that noise alone gives it; the covariance takes into account
+that the landmark follows its own observations (Baarda 1968). A track loses its worst observation only, is
+triangulated again, and so on. A rejected observation that fits again is accepted again.
 """
 
 from dataclasses import dataclass
@@ -37,9 +37,9 @@ class Snooping:
     accepted: BoolArray
     """(n,)"""
     scale: float
-    """Robust estimate of the noise in units of the given sigmas."""
+    """Robust estimate of the noise, in units of the given sigmas."""
     behind: BoolArray
-    """(n,) whether the landmark is behind the camera."""
+    """(n,) whether the landmark lies behind the camera."""
 
 
 def snoop(
@@ -52,12 +52,14 @@ def snoop(
     min_scale: float,
     scale: float | None = None,
 ) -> Snooping:
-    """Reject and re-admit observations with all cameras held.
+    """Observations to accept, and where their landmarks then are, with all cameras held.
 
-    `accepted` (n,) is where to start. An observation goes when its test exceeds the chi-square quantile
-    that a Gaussian exceeds beyond `cutoff_sigma`, in units of a robust scale that is at least `min_scale`, or
-    of `scale` where these are not all, but those that look wrong.
-    Of a track with two observations that disagree both go, for nothing tells which is wrong.
+    `accepted` (n,) are the observations to start from. An observation is rejected if its test exceeds the
+    chi-square quantile whose tail is that of a Gaussian beyond `cutoff_sigma`. Tests are in units of the
+    noise scale: `scale` where it is given, else a robust estimate that is at least `min_scale`. Give `scale`
+    where the landmarks are only a suspect part of all, so that the estimate would be too large. If two
+    observations are all that a track has and they disagree, both are rejected, since nothing tells which is
+    wrong.
     """
     seen, n, n_landmarks = seen_by(measurements, views), len(measurements.image), measurements.n_landmarks
     begin, starts = measurements.begin, measurements.starts
@@ -68,7 +70,7 @@ def snoop(
     residual, b, cofactor = np.empty((n, 2)), np.empty((n, 2, 3)), np.empty((n, 2, 2))
     test, freedom, in_front = np.empty(n), np.empty(n, dtype=np.int64), np.empty(n, dtype=bool)
     lost, changed = np.empty(n_landmarks, dtype=bool), np.empty(n_landmarks, dtype=bool)
-    tail = erfc(cutoff_sigma / np.sqrt(2.0))  # of a Gaussian beyond the cutoff, on either side
+    tail = erfc(cutoff_sigma / np.sqrt(2.0))  # share of a Gaussian beyond the cutoff, on both sides
     limit = np.array([np.inf, chdtri(1, tail), chdtri(2, tail)])
     known, scale = scale, min_scale if scale is None else scale
     which = np.arange(n_landmarks)
@@ -122,14 +124,14 @@ def snoop(
 
 
 def _revived(accepted: BoolArray, measurements: Measurements) -> BoolArray:
-    """Give landmarks that lost their observations all of them back, to be judged anew."""
+    """Accepted observations (n,), with all observations of landmarks that have fewer than two accepted."""
     k = measurements.landmark
     few = np.bincount(k, accepted, minlength=measurements.n_landmarks) < 2
     return np.asarray(accepted | few[k])
 
 
 def _robust_scale(test: FloatArray, dof: IntArray) -> float:
-    """Noise scale from the median of the tests, each over the median that noise of scale 1 would give."""
+    """Noise scale: root of the median of the tests, each divided by its median under noise of scale 1."""
     expected = np.array([np.nan, chdtri(1, 0.5), chdtri(2, 0.5)])
     ratio = test[dof > 0] / expected[dof[dof > 0]]
     return float(np.sqrt(np.median(ratio))) if len(ratio) else 0.0

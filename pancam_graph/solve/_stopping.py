@@ -1,4 +1,4 @@
-"""When the iterations of a solve end."""
+"""Criteria that end the iterations of a solve."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -14,36 +14,37 @@ _WHOLE = "max_iterations"
 
 @dataclass(frozen=True, kw_only=True)
 class StopRule:
-    """The five criteria of Levenberg-Marquardt in bundle adjustment; the first that is met ends it.
+    """Five criteria of Levenberg-Marquardt in bundle adjustment; the first one met ends it.
 
-    f is the cost: half the squares of all whitened residuals, priors and ties included. x are the variables
-    of the graph: those of the cameras, and landmarks only where they are explicit. A criterion of 0 is not
-    used. Whatever is used, it also ends where no step lowers the cost, however much it is damped.
+    The cost f is half the sum of squares of all whitened residuals, priors and ties included. The vector x
+    holds the variables of the graph: those of the cameras, and landmarks only if they are explicit. A
+    criterion of 0 is not used. Iterations also end if no step lowers the cost, however much it is damped.
 
-    Source: thesis 3.8; Lourakis and Argyros, SBA, ACM Transactions on Mathematical Software 36, 2009. Theirs
-    bounds the length of all residuals; here it is per observation, so that one number fits drives of all
-    lengths. Their decrease is that of the last step; here it is what is still to come.
+    Source: thesis 3.8; Lourakis and Argyros, SBA, ACM Transactions on Mathematical Software 36, 2009. SBA
+    bounds the length of all residuals together; here the bound is per observation, so that one number fits
+    drives of all lengths. SBA judges the decrease of the last step; here the decrease still to come counts.
 
     Raises InputError naming the criterion for a negative number or one that is not finite.
     """
 
     max_iterations: int = 100
-    """So many steps and no more; reaching it means not converged."""
+    """Largest number of steps; a solve that reaches it has not converged."""
     relative_decrease: float = 1e-7
-    """Further steps would lower f by no more than this share: the last one did, or the linearised system says
-    so of the next. Explicit landmarks: if the gains to come shrink as the last one did."""
+    """Largest share of f that further steps may still gain: the last step gained no more, or the linearised
+    system predicts no more of the next. With explicit landmarks, gains are extrapolated from the last two."""
     relative_step: float = 0.0
-    """The last step was no longer than this share of x before it: |dx| <= relative_step |x|.
+    """Largest length of the last step relative to x before it: |dx| <= relative_step |x|.
 
     Euclidean norms over all variables. Of a pose, dx is its tangent in the body frame (radians, metres), and
     x its rotation vector (radians) and translation (metres); of everything else the numbers themselves."""
     max_gradient: float = 0.0
-    """No component of f's gradient is larger, per radian and per metre of tangents; held ones do not count.
+    """Largest component of the gradient of f by tangents, per radian and per metre, without held components.
 
-    Where landmarks are eliminated it is that of f with each landmark at its best for the cameras, to first
-    order: the right-hand side s of the reduced system, and priors and ties. The start is judged, too."""
+    With eliminated landmarks it is the gradient of f with each landmark at its best place for the cameras, to
+    first order: the right-hand side s of the reduced system, plus priors and ties. The start is judged
+    too."""
     residual_sigmas: float = 1.4e-8
-    """The RMS of whitened residuals, sqrt(2 f / observations), is no larger: nothing is left but rounding."""
+    """Largest RMS of whitened residuals, sqrt(2 f / observations), at which only rounding is left."""
 
     def __post_init__(self) -> None:
         """Check ranges."""
@@ -57,21 +58,21 @@ class StopRule:
 
 
 def criteria(texts: Sequence[str]) -> dict[str, float]:
-    """Criteria by name from texts NAME=NUMBER, as a command line has them.
+    """Criteria by name from texts NAME=NUMBER of a command line.
 
-    Raises InputError for another form or name, for a name that stands twice, and for what is no number.
+    Raises InputError for another form, an unknown name, a repeated name, and a value that is not a number.
     """
     names = [field.name for field in fields(StopRule)]
-    found: dict[str, float] = {}
+    numbers: dict[str, float] = {}
     for text in texts:
         name, equals, number = text.partition("=")
         if not equals or name not in names:
             raise InputError(f"stop: expected NAME=NUMBER with one of {', '.join(names)}; found {text!r}")
-        if name in found:
+        if name in numbers:
             raise InputError(f"stop: {name}: expected each criterion once, found it twice")
         try:
-            found[name] = int(number) if name == _WHOLE else float(number)
+            numbers[name] = int(number) if name == _WHOLE else float(number)
         except ValueError as error:
             kind = "a whole number" if name == _WHOLE else "a number"
             raise InputError(f"stop: {name}: expected {kind}, found {number!r}") from error
-    return found
+    return numbers

@@ -1,4 +1,4 @@
-"""Cross-validation: a traverse solved again with halves of its tracks, for sigmas that are honest."""
+"""Cross-validation: a traverse solved again with halves of its tracks, to check its sigmas."""
 
 import time
 from collections.abc import Callable
@@ -40,7 +40,8 @@ __all__ = ["CrossValidation", "HalfScore", "Sigmas", "Spread", "cross_validate"]
 
 _FEWEST_TRACKS = 4
 _RELATIVE_DECREASE = 1e-13
-"""Steps along what telemetry decides may be a thousandth of its sigma: iterations may not stop before."""
+"""Stop criterion of the fits: steps of quantities that telemetry determines may be as small as a thousandth
+of their sigma, and iterations must not end before them."""
 _T = TypeVar("_T", bound=np.generic)
 _HalfName = Literal["first", "second", "upper", "lower"]
 _NAMES: dict[Splitting, tuple[_HalfName, _HalfName]] = {
@@ -58,15 +59,16 @@ def cross_validate(
     seed: int = 0,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> CrossValidation:
-    """Solve halves of a traverse's tracks and compare: `halvings` times by lot, once by image halves.
+    """Solve halves of a traverse's tracks and compare them: `halvings` times by lot, once by image halves.
 
-    Halved are the tracks that the solution used, with the sigmas that it ended with; nothing is screened
-    again. Drawn by lot, of two tracks that join the same frames one goes to each half. A track is of the
-    upper half where its observations lie above the middle of their images in the mean. Every half is
-    adjusted with all priors, from where the whole adjustment ended; formal covariances are all taken there.
+    The tracks are those that the solution used, with the sigmas that it ended with; nothing is screened
+    again. By lot, one of every two tracks that connect the same frames goes to each half. A track belongs to
+    the upper half if the mean position of its observations is above the middle of their images. Every half is
+    adjusted with all priors, from the optimum of the whole; formal covariances are all taken at that optimum.
 
-    `solution` is that of the traverse with the options; default: it is solved first. `progress` is told what
-    is done, how many of it, and of how many. Deterministic: the same arguments give the same numbers.
+    `solution` is the solution of the traverse with the options; default: the traverse is solved first.
+    `progress` is told the name of a step, its number, and the number of steps. Deterministic: the same
+    arguments give the same numbers.
 
     A frame or stop that a half does not see or cuts off from its group, and a half that cannot be solved or
     does not converge, give NaN and a warning. Raises InputError for a solution of another traverse or model,
@@ -119,7 +121,7 @@ def cross_validate(
 
 
 def _require_solution_of(traverse: Traverse, options: SolveOptions, solution: Solution) -> None:
-    """Raise InputError unless a solution is of the traverse and of the model."""
+    """Raise InputError unless a solution belongs to the traverse and has the model of the options."""
     other, expected = solution.traverse, "solution: expected one of this traverse"
     for what in ("stops", "frames", "images"):
         if [e.id for e in getattr(other, what)] != [e.id for e in getattr(traverse, what)]:
@@ -139,9 +141,9 @@ def _require_solution_of(traverse: Traverse, options: SolveOptions, solution: So
 
 
 class _Whole:
-    """The adjustment of everything that a solution used: what halves are compared with.
+    """The fit of all observations that a solution used, with which halves are compared.
 
-    All quantities stand in one vector: pan and tilt of each frame, of each pair, six numbers of each stop.
+    One vector holds all quantities: pan and tilt of each frame, of each pair, and six numbers of each stop.
     """
 
     def __init__(self, solution: Solution, options: SolveOptions) -> None:
@@ -187,13 +189,13 @@ class _Whole:
         return 2 * len(self.traverse.frames) + 2 * len(self.pairs) + 6 * len(self.traverse.stops)
 
     def groups(self, problem: Problem) -> tuple[Groups, Groups]:
-        """Frames and stops, as a problem's tracks join them."""
+        """Groups of frames and of stops that a problem's tracks connect."""
         t = self.traverse
         frames = Groups.of(problem, t.image_frame, len(t.frames))
         return frames, Groups.of(problem, t.image_stop, len(t.stops))
 
     def part(self, landmarks: BoolArray) -> Problem:
-        """The problem as covariances are taken from it, with no landmarks but some (landmarks,)."""
+        """The problem that covariances are taken from, reduced to some landmarks (landmarks,)."""
         p = self.regular
         return replace(p, accepted=p.accepted & landmarks[p.measurements.landmark])
 
@@ -208,7 +210,7 @@ class _Whole:
         )
 
     def step(self, state: State) -> FloatArray:
-        """The step (quantities,) from here to another state."""
+        """Step (quantities,) from this optimum to another state."""
         angles = wrap_angle(state.pan_tilt_rad - self.state.pan_tilt_rad)
         masts = zip(self.state.world_T_mast, state.world_T_mast, strict=True)
         stops = np.array([here.localCoordinates(there) for here, there in masts])
@@ -221,22 +223,23 @@ def _vector(pointing: NDArray[_T], relative: NDArray[_T], stops: NDArray[_T]) ->
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Verdict:
-    """What a half says of the whole."""
+    """Step and sigmas of a half, compared with the whole."""
 
     failure: str
-    """What it does not say, and why; "" if it says all."""
+    """Sentence about what the half does not determine; "" if it determines everything."""
     step: FloatArray
-    """(quantities,) from the whole solution to the half's; NaN where the half loses what it is of"""
+    """(quantities,) step from the whole solution to the half's; NaN for frames and stops that the half
+    loses."""
     sigma: FloatArray
-    """(quantities,) formal, of the half; NaN as the step"""
+    """(quantities,) formal sigma of the half; NaN as the step."""
     lost_frames: BoolArray
-    """(frames,) that the half does not see, or cuts off"""
+    """(frames,) frames that the half does not see, or cuts off."""
     lost_stops: BoolArray
-    """(stops,)"""
+    """(stops,) stops that the half does not see, or cuts off."""
 
 
 class _Half:
-    """The adjustment of half of the tracks, with all priors."""
+    """The fit of half of the tracks, with all priors."""
 
     def __init__(self, whole: _Whole, name: _HalfName, landmarks: BoolArray) -> None:
         self.name, self.landmarks = name, landmarks
@@ -316,11 +319,11 @@ def _sigmas(whole: _Whole, verdicts: _Verdicts) -> tuple[Sigmas, Sigmas, Sigmas]
 
 
 def _score(whole: _Whole, splitting: Splitting, number: int, own: _Half, other: _Half) -> HalfScore:
-    """Tracks of a half, placed with its own cameras and with those of the other half.
+    """Score of the tracks of a half, placed with its own cameras and with those of the other half.
 
-    Whitened residuals after triangulation with cameras that are off by e have the expected square
-    redundancy + trace(S cov(e)), S the landmarks' system. Cameras that were adjusted to the same tracks
-    follow their noise, so that the trace is subtracted.
+    The squared whitened residuals after triangulation with cameras of error e have the expectation
+    redundancy + trace(S cov(e)), where S is the landmarks' reduced system. Cameras that were adjusted to the
+    same tracks follow their noise, so that the trace is then subtracted.
     """
     tracks, p, q = int((own.landmarks & whole.problem.present).sum()), own.problem, other.problem
     scored, n, px = 0, 0, [np.nan] * 4
@@ -361,7 +364,7 @@ def _score(whole: _Whole, splitting: Splitting, number: int, own: _Half, other: 
 
 
 def _warnings(traverse: Traverse, verdicts: _Verdicts) -> list[str]:
-    """What halves could not judge."""
+    """Warnings of halves that failed, and of frames and stops that halves lost."""
     warnings = []
     for splitting, pairs in verdicts.items():
         for number, pair in enumerate(pairs, start=1):

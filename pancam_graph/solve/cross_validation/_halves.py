@@ -1,4 +1,4 @@
-"""Tracks in two halves: drawn by lot, or by image halves; and what a half does not see or cuts off."""
+"""Halves of the tracks, by lot or by image halves; and frames or stops that a half does not connect."""
 
 from dataclasses import dataclass
 
@@ -16,9 +16,9 @@ __all__ = ["Groups", "neighbours", "random_half", "upper_half"]
 
 
 def random_half(traverse: Traverse, measurements: Measurements, lots: np.random.Generator) -> BoolArray:
-    """(landmarks,) by lot one of every two landmarks that join the same frames.
+    """(landmarks,) True for one half, drawn by lot: one of every two landmarks that connect the same frames.
 
-    So the halves are alike in strength everywhere, and no frame is lost that need not be.
+    Both halves are then equally strong everywhere, and no frame is lost without need.
     """
     n, frame = measurements.n_landmarks, traverse.image_frame[measurements.image]
     first, last = (side.reduceat(frame, measurements.starts) for side in (np.minimum, np.maximum))
@@ -30,10 +30,10 @@ def random_half(traverse: Traverse, measurements: Measurements, lots: np.random.
 
 
 def upper_half(traverse: Traverse, measurements: Measurements) -> BoolArray:
-    """(landmarks,) whether observations lie above the middle of their images, in the mean of each landmark.
+    """(landmarks,) whether the mean observation of a landmark lies above the middle of the image.
 
-    A landmark may be low in one image and high in another, as between the rows of a panorama; its tie is
-    kept whole, for a half of it would tie nothing.
+    A landmark may be low in one image and high in another, as between the rows of a panorama. All its
+    observations go to one half, since half of a tie connects nothing.
     """
     assert traverse.observations is not None
     height = np.array([eye.camera.height_px for eye in traverse.rig.eyes])
@@ -44,16 +44,16 @@ def upper_half(traverse: Traverse, measurements: Measurements) -> BoolArray:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Groups:
-    """Members (frames or stops) in groups that tracks join."""
+    """Groups of members (frames or stops) that tracks connect."""
 
     seen: BoolArray
-    """(members,) whether a measurement that takes part is of it"""
+    """(members,) whether the member has a measurement that takes part."""
     group: IntArray
-    """(members,)"""
+    """(members,) number of each member's group."""
 
     @staticmethod
     def of(problem: Problem, member_of_image: IntArray, n_members: int) -> "Groups":
-        """Groups by the measurements of a problem that take part."""
+        """Groups that the measurements of a problem connect; measurements that take no part do not count."""
         m, kept = problem.measurements, problem.kept
         member = member_of_image[m.image[kept]]
         return Groups(
@@ -62,13 +62,13 @@ class Groups:
         )
 
     def lost_in(self, half: "Groups") -> BoolArray:
-        """(members,) what is seen here but not in a half, or cut off there from the most of its group."""
+        """(members,) members that a half does not see, or cuts off from the largest part of their group."""
         lost = self.seen & ~half.seen
         rows = np.flatnonzero(self.seen & half.seen)
         parts, part, size = np.unique(
             np.column_stack([self.group, half.group])[rows], axis=0, return_inverse=True, return_counts=True
         )
-        # The largest part of each group comes first; of equals, the one that was first.
+        # The largest part of each group sorts first; of equal parts, the earlier one.
         order = np.lexsort((-size, parts[:, 0]))
         first = np.unique(parts[order, 0], return_index=True)[1]
         largest = np.zeros(len(parts), dtype=bool)
@@ -77,22 +77,22 @@ class Groups:
         return np.asarray(lost)
 
     def joins(self, members: IntArray) -> BoolArray:
-        """(n,) whether members (n, k) are all seen and of one group."""
+        """(n,) whether all of the members (n, k) are seen and belong to one group."""
         group = np.where(self.seen, self.group, -1)[members]
         return np.asarray((group == group[:, :1]).all(axis=1) & (group[:, 0] >= 0))
 
     def joins_landmarks(self, measurements: Measurements, member_of_image: IntArray) -> BoolArray:
-        """(landmarks,) whether all that see a landmark are seen here and of one group."""
+        """(landmarks,) whether all members that see a landmark are seen here and belong to one group."""
         group = np.where(self.seen, self.group, -1)[member_of_image[measurements.image]]
         low, high = (side.reduceat(group, measurements.starts) for side in (np.minimum, np.maximum))
         return np.asarray((low == high) & (low >= 0))
 
 
 def neighbours(traverse: Traverse, problem: Problem) -> tuple[IntArray, IntArray]:
-    """Pairs of frames of one stop that share tracks (pairs, 2), and how many they share (pairs,).
+    """Pairs of frames of one stop that share tracks (pairs, 2), and the number of shared tracks (pairs,).
 
-    Those of a tree over each group of frames that has the most tracks in common: all relative pointing
-    within the group is made of them. By the first frame, then the second.
+    The pairs are the spanning tree of each connected group with the most shared tracks: all relative pointing
+    within a group follows from them. Ordered by the first frame, then by the second.
     """
     m, kept, n = problem.measurements, problem.kept, len(traverse.frames)
     frame = traverse.image_frame[m.image[kept]]
