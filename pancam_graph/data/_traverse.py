@@ -5,6 +5,7 @@ frame, a track one terrain point seen in several images.
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -237,6 +238,12 @@ class Traverse:
         """The same traverse with other observations, further warnings, and statistics of matching."""
         warnings = (*self.warnings, *warnings)
         return replace(self, observations=observations, warnings=warnings, matching=matching)
+
+    def with_warnings(self, warnings: Sequence[str]) -> "Traverse":
+        """The same traverse with more warnings; what its constructor has checked is not checked again."""
+        other = copy(self)
+        object.__setattr__(other, "warnings", (*self.warnings, *warnings))
+        return other
 
 
 def _require_unique(kind: str, ids: Sequence[str]) -> None:

@@ -1,6 +1,5 @@
 """The image files of a traverse with the user's masks, and what is odd about them."""
 
-import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +7,7 @@ from pathlib import Path
 from pancam_graph.base.errors import ImageError, InputError
 from pancam_graph.base.geometry import BoolArray
 from pancam_graph.data import Traverse
-from pancam_graph.io import GreyImage, left_out, mask_file, read_eye_content, read_mask
+from pancam_graph.io import GreyImage, left_out, mask_file, read_mask, read_picture, same_pictures
 
 __all__ = ["Pictures", "image_name", "listed", "read_pictures"]
 
@@ -38,42 +37,28 @@ def read_pictures(traverse: Traverse, progress: Callable[[int, int], None] | Non
     """
     if all(image.file is None for image in traverse.images):
         raise InputError(f"traverse {traverse.name}: expected observations or image files, found neither")
-    folder = traverse.folder or Path()
     images: list[GreyImage | None] = []
-    masks: list[BoolArray | None] = []
     coloured: list[str] = []
-    warnings: list[str] = []
     unusable: dict[int, ImageError] = {}
-    first_of: dict[bytes, int] = {}
-    mask_of: dict[tuple[Path, tuple[int, ...]], BoolArray] = {}
-    for row, (entry, eye) in enumerate(zip(traverse.images, traverse.image_eye, strict=True)):
-        image, mask = None, None
+    for row, entry in enumerate(traverse.images):
+        content = None
         try:
-            content = entry.file and read_eye_content(folder / entry.file, traverse.rig, int(eye))
+            content = read_picture(traverse, row) if entry.file else None
         except ImageError as error:
-            content, unusable[row] = None, error
-        if entry.file and content:
-            image = content.samples
-            if content.colour:
-                coloured.append(entry.file)
-            # Two pictures of one scene differ by their noise; two that are alike to the bit are one.
-            first = first_of.setdefault(hashlib.sha256(image.tobytes()).digest(), row)
-            if first != row and image.min() < image.max():
-                warnings.append(
-                    f"image {image_name(traverse, row)}: the same picture as image "
-                    f"{image_name(traverse, first)}; left out"
-                )
-                image = None
-            path = mask_file(traverse, row)
-            if image is not None and path is not None:
-                if (path, image.shape) not in mask_of:
-                    height, width = image.shape
-                    mask_of[path, image.shape] = read_mask(path, width, height, Path(entry.file).name)
-                mask = mask_of[path, image.shape]
-        images.append(image)
-        masks.append(mask)
+            unusable[row] = error
+        if entry.file and content and content.colour:
+            coloured.append(entry.file)
+        images.append(None if content is None else content.samples)
         if progress is not None:
             progress(row + 1, len(traverse.images))
+    same, warnings = same_pictures(traverse), list[str]()
+    for row, first in same.items():
+        images[row] = None
+        warnings.append(
+            f"image {image_name(traverse, row)}: the same picture as image "
+            f"{image_name(traverse, first)}; left out"
+        )
+    masks = _user_masks(traverse, images)
     if unusable and len(unusable) == sum(entry.file is not None for entry in traverse.images):
         raise next(iter(unusable.values()))
     warnings[:0] = left_out({traverse.images[row].id: error for row, error in unusable.items()})
@@ -81,10 +66,26 @@ def read_pictures(traverse: Traverse, progress: Callable[[int, int], None] | Non
         warnings.insert(0, f"images in colour, of which the luma is used: {listed(coloured)}")
     return Pictures(
         images=tuple(images),
-        user_masks=tuple(masks),
+        user_masks=masks,
         warnings=tuple(warnings),
         unusable=unusable,
     )
+
+
+def _user_masks(traverse: Traverse, images: Sequence[GreyImage | None]) -> tuple[BoolArray | None, ...]:
+    """The mask of each image that is used; a mask of many images is read once."""
+    read: dict[tuple[Path, tuple[int, ...]], BoolArray] = {}
+    masks: list[BoolArray | None] = []
+    for row, (entry, image) in enumerate(zip(traverse.images, images, strict=True)):
+        path = None if image is None else mask_file(traverse, row)
+        if image is None or path is None:
+            masks.append(None)
+            continue
+        if (path, image.shape) not in read:
+            height, width = image.shape
+            read[path, image.shape] = read_mask(path, width, height, Path(str(entry.file)).name)
+        masks.append(read[path, image.shape])
+    return tuple(masks)
 
 
 def image_name(traverse: Traverse, row: int) -> str:

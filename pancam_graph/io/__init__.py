@@ -11,9 +11,6 @@ from pancam_graph.io._entries import VERSION as VERSION
 from pancam_graph.io._entries import Entry as Entry
 from pancam_graph.io._entries import PoseEntry as PoseEntry
 from pancam_graph.io._image_files import GreyImage as GreyImage
-from pancam_graph.io._image_files import left_out as left_out
-from pancam_graph.io._image_files import read_eye_content as read_eye_content
-from pancam_graph.io._image_files import read_eye_image as read_eye_image
 from pancam_graph.io._image_files import read_image as read_image
 from pancam_graph.io._inputs import read_input as read_input
 from pancam_graph.io._json import prefixed as prefixed
@@ -25,6 +22,11 @@ from pancam_graph.io._json import validated as validated
 from pancam_graph.io._mask_files import mask_file as mask_file
 from pancam_graph.io._mask_files import read_mask as read_mask
 from pancam_graph.io._pds import read_pds as read_pds
+from pancam_graph.io._pictures import left_out as left_out
+from pancam_graph.io._pictures import picture_file as picture_file
+from pancam_graph.io._pictures import read_picture as read_picture
+from pancam_graph.io._pictures import readable_picture as readable_picture
+from pancam_graph.io._pictures import same_pictures as same_pictures
 from pancam_graph.io._schema import SharingEntry as SharingEntry
 from pancam_graph.io._schema import TraverseFile as TraverseFile
 from pancam_graph.io._traverse_json import read_traverse as read_traverse

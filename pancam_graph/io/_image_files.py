@@ -1,6 +1,5 @@
 """Image files as 2-D grey arrays: PDS .IMG through its label, anything else through OpenCV."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,22 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pancam_graph.base.errors import ImageError, InputError
-from pancam_graph.io._pds_label import ImageLayout, PdsLabel, read_label
-from pancam_graph.rigs import Rig
+from pancam_graph.base.errors import ImageError
+from pancam_graph.io._pds_samples import read_pds_image, read_samples
 
-__all__ = [
-    "GreyImage",
-    "ImageContent",
-    "left_out",
-    "read_eye_content",
-    "read_eye_image",
-    "read_image",
-]
+__all__ = ["GreyImage", "ImageContent", "read_content", "read_image"]
 
 GreyImage = NDArray[np.uint8] | NDArray[np.uint16]
 
-_NAMED = 5
 _GREY_WEIGHTS = np.array([0.299, 0.587, 0.114])
 """Red, green, blue to luma, ITU-R BT.601; what OpenCV uses for its own formats."""
 
@@ -41,15 +31,6 @@ class ImageContent:
     """The spacecraft that a PDS label names."""
 
 
-def left_out(errors: Mapping[str, ImageError]) -> list[str]:
-    """Warnings of images, by id, whose files cannot be used: one of each, and how many more there are."""
-    said = [f"image {name} is left out: {error}" for name, error in list(errors.items())[:_NAMED]]
-    more = len(errors) - _NAMED
-    return (
-        [*said, f"{more} more images are left out, whose files cannot be used either"] if more > 0 else said
-    )
-
-
 def read_image(path: Path) -> GreyImage:
     """Read an image as (rows, columns), 8 or 16 bits, grey.
 
@@ -60,10 +41,11 @@ def read_image(path: Path) -> GreyImage:
 
     Raises ImageError for a file that is missing, unreadable, truncated, or not of 8 or 16 bits.
     """
-    return _read_content(path).samples
+    return read_content(path).samples
 
 
-def _read_content(path: Path) -> ImageContent:
+def read_content(path: Path) -> ImageContent:
+    """Read an image as `read_image` does, and what else its file says."""
     if not path.is_file():
         raise ImageError(f"{path}: expected an image file, found {'a folder' if path.is_dir() else 'none'}")
     if path.suffix.lower() == ".img":
@@ -71,70 +53,18 @@ def _read_content(path: Path) -> ImageContent:
     return _read_with_opencv(path)
 
 
-def read_eye_image(path: Path, rig: Rig, eye: int) -> GreyImage:
-    """Read an image that an eye of a rig took; see `read_image`.
-
-    Raises ImageError as `read_image` does, and for an image of another size than the eye's camera: a rig
-    (most often a template) for another product, subframe or zoom.
-    """
-    return read_eye_content(path, rig, eye).samples
-
-
-def read_eye_content(path: Path, rig: Rig, eye: int) -> ImageContent:
-    """Read an image that an eye of a rig took, and what else its file says; raises as `read_eye_image`."""
-    content = _read_content(path)
-    name, camera, (height_px, width_px) = rig.eyes[eye].name, rig.eyes[eye].camera, content.samples.shape
-    if (width_px, height_px) != (camera.width_px, camera.height_px):
-        raise ImageError(
-            f"{path}: expected {camera.width_px} x {camera.height_px} pixels as of camera {name} "
-            f"of the rig {rig.name}, found {width_px} x {height_px}"
-        )
-    return content
-
-
 def _read_pds(path: Path) -> ImageContent:
-    try:
-        label = read_label(path)
-        layout = label.image_layout()
-    except ImageError:
-        raise
-    except InputError as error:
-        raise ImageError(str(error)) from error
-    layout.require_complete()
-    samples = _samples(layout)
-    samples = np.where(np.isin(samples, _no_data(label)), samples.dtype.type(0), samples)
-    host = label.top.items.get("INSTRUMENT_HOST_ID")
-    host = None if host is None else label.top.text("INSTRUMENT_HOST_ID").upper()
+    image = read_pds_image(path)
+    samples = read_samples(image)
     if samples.shape[0] == 1:
-        return ImageContent(samples=_unsigned(samples[0]), colour=False, host=host)
+        return ImageContent(samples=_unsigned(samples[0]), colour=False, host=image.host)
     if samples.shape[0] < 3:
         raise ImageError(f"{path}: BANDS: expected 1, or 3 for colour, found {samples.shape[0]}")
     colour = bool(np.any(samples[1:3] != samples[0]))
     grey = np.tensordot(_GREY_WEIGHTS, np.maximum(samples[:3], 0).astype(float), axes=1)
-    return ImageContent(samples=_unsigned(np.rint(grey).astype(samples.dtype)), colour=colour, host=host)
-
-
-def _no_data(label: PdsLabel) -> list[float]:
-    """Values that stand for missing samples; labels that write them in another way (16#...#) mean reals."""
-    image = label.group("IMAGE").items
-    entries = (image.get(key) for key in ("MISSING_CONSTANT", "INVALID_CONSTANT"))
-    values = [v for entry in entries for v in (entry if isinstance(entry, list | tuple) else [entry])]
-    return [float(v) for v in values if isinstance(v, int | float) and not isinstance(v, bool)]
-
-
-def _samples(layout: ImageLayout) -> NDArray[Any]:
-    """All samples as (bands, rows, columns)."""
-    size = layout.end_bytes - layout.offset_bytes
-    raw = np.fromfile(layout.file, dtype=np.uint8, count=size, offset=layout.offset_bytes)
-    lines = raw.reshape(-1, layout.line_bytes)
-    stop = layout.line_bytes - layout.line_suffix_bytes
-    values: NDArray[Any] = np.ascontiguousarray(lines[:, layout.line_prefix_bytes : stop]).view(layout.dtype)
-    height, width, bands = layout.height_px, layout.width_px, layout.bands
-    if layout.storage == "SAMPLE_INTERLEAVED":
-        return np.asarray(values.reshape(height, width, bands).transpose(2, 0, 1))
-    if layout.storage == "LINE_INTERLEAVED":
-        return np.asarray(values.reshape(height, bands, width).transpose(1, 0, 2))
-    return values.reshape(bands, height, width)
+    return ImageContent(
+        samples=_unsigned(np.rint(grey).astype(samples.dtype)), colour=colour, host=image.host
+    )
 
 
 def _unsigned(samples: NDArray[Any]) -> GreyImage:

@@ -28,9 +28,9 @@ import numpy as np
 from pancam_graph.base.errors import ImageError, InputError
 from pancam_graph.base.geometry import FloatArray, IntArray, wrap_angle
 from pancam_graph.data import Frame, Image, Stop, Traverse
-from pancam_graph.io._image_files import left_out
 from pancam_graph.io._input_format import InputFormat
 from pancam_graph.io._pds_image import PMA_GROUPS, LabelledImage, read_labelled_image
+from pancam_graph.io._pictures import left_out
 from pancam_graph.rigs import MER_MAST, MastKinematics, ReferenceSigma, RigFit, RigFitOptions, fit_rig
 
 __all__ = ["LOCALISATION_SIGMA", "PDS3", "SAME_POINTING_RAD", "LocalisationSigma", "read_pds"]

@@ -10,6 +10,7 @@ from pancam_graph.base.errors import CameraError, GeometryError, InputError
 from pancam_graph.base.geometry import Z_DOWN_R_Z_UP, FloatArray, pose_from_wxyz, rotation_from_wxyz
 from pancam_graph.cameras import CAHV, cahv_of_vectors
 from pancam_graph.io._pds_label import LabelGroup, PdsLabel, read_label
+from pancam_graph.io._pds_samples import image_of_label
 from pancam_graph.rigs import MARS2020_MAST, MER_MAST, MSL_MAST, MastKinematics
 
 __all__ = ["PMA_GROUPS", "LabelledImage", "read_labelled_image"]
@@ -64,7 +65,7 @@ def read_labelled_image(file: Path) -> LabelledImage:
         )
     mast = next(mast for prefix, mast in _HOSTS.items() if host.startswith(prefix))
     camera = label.group(*_CAMERA_GROUPS)
-    layout = label.image_layout()
+    layout = image_of_label(label).layout
     layout.require_complete()
     try:
         site_T_rover = _pose(label.group(*_ROVER_GROUPS), {"SITE_FRAME"})

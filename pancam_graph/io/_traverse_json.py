@@ -2,20 +2,19 @@
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import numpy as np
 
-from pancam_graph.base.errors import ImageError, InputError
+from pancam_graph.base.errors import ImageError, InputError, PancamGraphError
 from pancam_graph.base.whole_files import whole_file
-from pancam_graph.data import Frame, Image, Stop, Traverse
+from pancam_graph.data import Frame, Image, Observations, Stop, Traverse
 from pancam_graph.io._entries import TRAVERSE_FORMAT, VERSION, PoseEntry
-from pancam_graph.io._image_files import left_out, read_eye_content
 from pancam_graph.io._input_format import InputFormat
 from pancam_graph.io._json import prefixed, read_json, refused_by_schema, short, validated
 from pancam_graph.io._mask_files import mask_file, read_mask
 from pancam_graph.io._observations import observations_npz, read_observations
+from pancam_graph.io._pictures import left_out, read_picture
 from pancam_graph.io._schema import (
     FrameEntry,
     ImageEntry,
@@ -29,6 +28,8 @@ __all__ = ["TRAVERSE_FOLDER", "read_traverse", "traverse_entries", "traverse_of"
 
 _TRAVERSE_JSON = "traverse.json"
 _OBSERVATIONS = "observations.npz"
+_IN_OBSERVATIONS = "observations: "
+"""Beginning of what `Traverse` says about observations."""
 
 
 def read_traverse(folder: Path | str) -> Traverse:
@@ -49,9 +50,7 @@ def read_traverse(folder: Path | str) -> Traverse:
         raise InputError(f"{folder}: expected a traverse folder with {_TRAVERSE_JSON}, found {found}")
     path = folder / _TRAVERSE_JSON
     entries = validated(TraverseFile, read_json(path, TRAVERSE_FORMAT, VERSION), path)
-    # Absurdly large numbers overflow; the constructors refuse what that leaves, in one line and not two.
-    with prefixed(path), np.errstate(all="ignore"):
-        traverse = traverse_of(entries, folder)
+    with prefixed(path):
         files = [
             None if i.file is None else _inside(folder, i.file, f"images[{row}].file")
             for row, i in enumerate(entries.images)
@@ -66,17 +65,25 @@ def read_traverse(folder: Path | str) -> Traverse:
         source = None
         if entries.observations is not None:
             source = _inside(folder, entries.observations, "observations")
-    if source is not None:
-        observations = read_observations(source)
-        try:
-            traverse = traverse.with_observations(observations)
-        except InputError as error:
-            raise InputError(f"{source}: {str(error).removeprefix('observations: ')}") from error
+    observations = None if source is None else read_observations(source)
+    traverse = _checked(entries, path, observations, source)
     unusable = _unusable_images(files, traverse)
     # Where observations are to be found in images, that warns of them.
-    return (
-        traverse if source is None else replace(traverse, warnings=(*traverse.warnings, *left_out(unusable)))
-    )
+    return traverse if source is None else traverse.with_warnings(left_out(unusable))
+
+
+def _checked(
+    entries: TraverseFile, path: Path, observations: Observations | None, source: Path | None
+) -> Traverse:
+    """The traverse of a file. Raises InputError naming the file at fault: itself, or that of observations."""
+    try:
+        # Absurdly large numbers overflow; the constructors refuse what that leaves, in one line and not two.
+        with np.errstate(all="ignore"):
+            return traverse_of(entries, path.parent, observations)
+    except PancamGraphError as error:
+        in_observations = source is not None and str(error).startswith(_IN_OBSERVATIONS)
+        with prefixed(source if in_observations else path):
+            raise type(error)(str(error).removeprefix(_IN_OBSERVATIONS if in_observations else "")) from error
 
 
 def write_traverse(traverse: Traverse, folder: Path | str, *, overwrite: bool = False) -> None:
@@ -115,8 +122,8 @@ def write_traverse(traverse: Traverse, folder: Path | str, *, overwrite: bool = 
         raise InputError(f"{folder}: expected a folder to write to, found: {error}") from error
 
 
-def traverse_of(entries: TraverseFile, folder: Path) -> Traverse:
-    """The traverse that a file's entries say, without observations."""
+def traverse_of(entries: TraverseFile, folder: Path, observations: Observations | None = None) -> Traverse:
+    """The traverse that a file's entries say. Raises InputError as `Traverse` does."""
     stops = tuple(
         Stop(
             id=s.id,
@@ -132,6 +139,7 @@ def traverse_of(entries: TraverseFile, folder: Path) -> Traverse:
         stops=stops,
         frames=tuple(Frame(**f.model_dump()) for f in entries.frames),
         images=tuple(Image(**i.model_dump()) for i in entries.images),
+        observations=observations,
         sharing=None if entries.sharing is None else entries.sharing.sharing(),
         folder=folder,
     )
@@ -206,8 +214,7 @@ def _unusable_images(files: list[Path | None], traverse: Traverse) -> dict[str, 
     for row, file in enumerate(files):
         if file is None:
             continue
-        eye = int(traverse.image_eye[row])
-        camera = traverse.rig.eyes[eye].camera
+        camera = traverse.rig.eyes[int(traverse.image_eye[row])].camera
         mask = mask_file(traverse, row)
         try:
             # One mask most often serves many images.
@@ -217,7 +224,7 @@ def _unusable_images(files: list[Path | None], traverse: Traverse) -> dict[str, 
         except ImageError as error:
             raise _at(traverse, row, error) from error
         try:
-            content = read_eye_content(file, traverse.rig, eye)
+            content = read_picture(traverse, row)
         except ImageError as error:
             unusable[row] = error
             continue

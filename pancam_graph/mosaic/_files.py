@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from pancam_graph.base.errors import InputError
 from pancam_graph.data import Solution
-from pancam_graph.io import MOSAIC_FORMAT, VERSION
+from pancam_graph.io import MOSAIC_FORMAT, VERSION, same_pictures
 from pancam_graph.mosaic._draw import close_ups, comparison, with_axes
 from pancam_graph.mosaic._make import Mosaic, StopGround, StopMosaics, make_mosaics, stop_ground
 from pancam_graph.mosaic._options import MosaicOptions
-from pancam_graph.mosaic._placed import POINTINGS, Pointing, copies
+from pancam_graph.mosaic._placed import POINTINGS, Pointing
 from pancam_graph.mosaic._projections import Cylinder
 from pancam_graph.mosaic._seam_error import CASES, Case
 
@@ -80,7 +80,7 @@ def write_mosaics(
     blinks: list[Blink] = []
     lines, warnings = [], []
     ground: tuple[int, StopGround] | None = None
-    twice = copies(traverse)
+    twice = same_pictures(traverse)
     spent = 0
     for n, (stop, eye) in enumerate(pairs):
         stop_id, camera = traverse.stops[stop].id, traverse.rig.eyes[eye].name

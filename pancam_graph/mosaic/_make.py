@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.data import Solution
+from pancam_graph.io import same_pictures
 from pancam_graph.mosaic._blend import blend, choose_look
 from pancam_graph.mosaic._evening import Evening
 from pancam_graph.mosaic._options import MosaicOptions
@@ -17,7 +18,6 @@ from pancam_graph.mosaic._placed import (
     PlacedImage,
     Pointing,
     View,
-    copies,
     placed_images,
     view_from_stop,
 )
@@ -77,11 +77,11 @@ class StopGround:
     surfaces: dict[Pointing, Surface]
     """What the landmarks of each pointing span."""
     twice: Mapping[int, int]
-    """Rows of images that are copies of others, and of which."""
+    """Rows of images whose picture is the same as another's, and of which."""
 
 
 def stop_ground(solution: Solution, stop: int, twice: Mapping[int, int] | None = None) -> StopGround:
-    """Origin, views and surfaces of a stop, by row; `twice` is what `copies` gives, where it is at hand.
+    """Origin, views and surfaces of a stop, by row; `twice` is what `same_pictures` gives, if it is known.
 
     Raises InputError where no camera has a pose.
     """
@@ -93,7 +93,7 @@ def stop_ground(solution: Solution, stop: int, twice: Mapping[int, int] | None =
         raise InputError(f"mosaic: stop {name}: expected a camera with a pose, found none")
     origin_m = centres.mean(axis=0)
     surfaces = {p: surface_of_stop(solution, stop, origin_m, v) for p, v in views.items()}
-    twice = copies(solution.traverse) if twice is None else twice
+    twice = same_pictures(solution.traverse) if twice is None else twice
     return StopGround(origin_m=origin_m, views=views, surfaces=surfaces, twice=twice)
 
 

@@ -1,9 +1,7 @@
 """The images of one eye at one stop, where telemetry and where the adjustment puts them."""
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -11,9 +9,9 @@ import numpy as np
 from pancam_graph.base.errors import ImageError
 from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.cameras import Camera
-from pancam_graph.data import Solution, Traverse
+from pancam_graph.data import Solution
 from pancam_graph.images import usable_mask
-from pancam_graph.io import GreyImage, mask_file, read_eye_image, read_mask
+from pancam_graph.io import GreyImage, mask_file, read_mask, read_picture
 
 __all__ = [
     "POINTINGS",
@@ -21,7 +19,6 @@ __all__ = [
     "Pointing",
     "Station",
     "View",
-    "copies",
     "placed_images",
     "view_from_stop",
 ]
@@ -93,36 +90,15 @@ def view_from_stop(solution: Solution, stop: int, pointing: Pointing) -> View:
     )
 
 
-def copies(traverse: Traverse) -> dict[int, int]:
-    """Rows of images whose file is the same, to the byte, as that of an image before, and that image's row.
-
-    The front end leaves out the same ones.
-    """
-    sizes: dict[int, list[tuple[int, Path]]] = {}
-    for row, image in enumerate(traverse.images):
-        path = (traverse.folder or Path()) / (image.file or "")
-        if image.file is not None and path.is_file():
-            sizes.setdefault(path.stat().st_size, []).append((row, path))
-    found: dict[int, int] = {}
-    for alike in sizes.values():
-        first: dict[bytes, int] = {}
-        for row, path in alike if len(alike) > 1 else ():
-            before = first.setdefault(hashlib.sha256(path.read_bytes()).digest(), row)
-            if before != row:
-                found[row] = before
-    return found
-
-
 def placed_images(
     solution: Solution, stop: int, eye: int, views: dict[Pointing, View], twice: Mapping[int, int]
 ) -> tuple[list[PlacedImage], list[str]]:
     """The images that an eye took at a stop, and a warning for each that cannot be had.
 
-    `twice` is what `copies` gives: one picture cannot be of two places.
+    `twice` is what `same_pictures` gives: one picture cannot be of two places.
     Where the rig was adjusted, its calibration belongs to the refined pointing only.
     """
     traverse = solution.traverse
-    folder = traverse.folder or Path()
     images, warnings = [], []
     for row in np.flatnonzero((traverse.image_stop == stop) & (traverse.image_eye == eye)).tolist():
         entry = traverse.images[row]
@@ -141,7 +117,7 @@ def placed_images(
             warnings.append(f"mosaic: image {entry.id} is left out: its camera has no pose")
             continue
         try:
-            grey = read_eye_image(folder / entry.file, traverse.rig, eye)
+            grey = read_picture(traverse, row).samples
             mask = mask_file(traverse, row)
             wanted = np.ones(grey.shape, dtype=bool)
             if mask is not None:

@@ -2,16 +2,13 @@
 
 import base64
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from pancam_graph.base.errors import PancamGraphError
 from pancam_graph.base.geometry import FloatArray, IntArray
-from pancam_graph.data import Solution, rms_px
+from pancam_graph.data import Solution, Traverse, rms_px
+from pancam_graph.io import readable_picture
 from pancam_graph.report._numbers import Json, fixed, lengths, round_factor, rounded, thinned
 
 __all__ = ["ImageResiduals", "choose_images", "image_residuals", "magnification", "picture", "vector_panels"]
@@ -83,18 +80,12 @@ def magnification(residuals_px: FloatArray, width_px: int) -> float:
     return round_factor(0.05 * width_px / long) if long > 1e-4 else 1.0
 
 
-def picture(path: Path) -> str | None:
-    """A small contrast-stretched JPEG of an image file as a data URI; None if it cannot be read."""
-    # Imported when needed: the package io saves solutions and calls the report itself.
-    from pancam_graph.io import read_image  # noqa: PLC0415
-
-    try:
-        pixels: NDArray[Any] = read_image(path)
-    except (PancamGraphError, OSError):
+def picture(traverse: Traverse, row: int) -> str | None:
+    """A small contrast-stretched JPEG of an image as a data URI; None if its file cannot be read."""
+    samples = readable_picture(traverse, row)
+    if samples is None:
         return None
-    grey = np.asarray(pixels, dtype=np.float32)
-    if grey.ndim == 3:
-        grey = grey.mean(axis=2)
+    grey = np.asarray(samples, dtype=np.float32)
     shrink = min(1.0, _PICTURE_SIDE_PX / max(grey.shape))
     if shrink < 1:
         size = (max(1, round(grey.shape[1] * shrink)), max(1, round(grey.shape[0] * shrink)))
@@ -120,8 +111,8 @@ def vector_panels(solution: Solution, table: list[ImageResiduals], rows_of: list
         image, entry, rows = traverse.images[row], table[row], rows_of[row]
         camera = traverse.rig.eyes[int(traverse.image_eye[row])].camera
         source = None
-        if image.file is not None and traverse.folder is not None and spent < _PICTURE_BUDGET:
-            source = picture(traverse.folder / image.file)
+        if spent < _PICTURE_BUDGET:
+            source = picture(traverse, row)
             spent += len(source or "")
         rows = rows[thinned(len(rows), _MAX_VECTORS)]
         used = solution.used[rows]

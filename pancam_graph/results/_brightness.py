@@ -1,18 +1,16 @@
 """How bright images and landmarks are: one scale to 8 bits for all images of a traverse."""
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pancam_graph.base.errors import ImageError
 from pancam_graph.base.geometry import FloatArray
-from pancam_graph.data import Solution, Traverse
-from pancam_graph.io import GreyImage, read_eye_image
+from pancam_graph.data import Solution
+from pancam_graph.io import GreyImage, readable_picture
 
-__all__ = ["Brightness", "brightness_of", "image_path", "readable_image"]
+__all__ = ["Brightness", "brightness_of"]
 
 _WHITE_PERCENT = 99.5
 _WHITE_8_BIT = 255.0
@@ -33,26 +31,6 @@ class Brightness:
         return np.clip(np.rint(samples * factor), 0, 255).astype(np.uint8)
 
 
-def image_path(traverse: Traverse, image: int) -> Path | None:
-    """Where the file of an image is; None if it has none."""
-    file = traverse.images[image].file
-    return None if file is None or traverse.folder is None else traverse.folder / file
-
-
-def readable_image(traverse: Traverse, image: int) -> GreyImage | None:
-    """An image's samples; None without a file, or with one that cannot be read any more.
-
-    Reading the traverse has refused broken files: one that broke since must not cost the results of a solve.
-    """
-    path = image_path(traverse, image)
-    if path is None:
-        return None
-    try:
-        return read_eye_image(path, traverse.rig, int(traverse.image_eye[image]))
-    except (ImageError, OSError):
-        return None
-
-
 def brightness_of(solution: Solution) -> Brightness:
     """White, and the grey of each landmark: the mean over its used observations, samples interpolated."""
     traverse, observations = solution.traverse, solution.traverse.observations
@@ -62,7 +40,7 @@ def brightness_of(solution: Solution) -> Brightness:
     row = solution.landmark_row
     used = solution.used & (row >= 0)
     for i in range(len(traverse.images)):
-        image = readable_image(traverse, i)
+        image = readable_picture(traverse, i)
         if image is None:
             continue
         seen, deep = True, int(image.dtype != np.uint8)

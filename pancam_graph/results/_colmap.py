@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from pancam_graph.base.geometry import FloatArray, wxyz_from_rotation
 from pancam_graph.cameras import lens_of, straightening_map
 from pancam_graph.data import Solution, rms_px
-from pancam_graph.results._brightness import Brightness, brightness_of, readable_image
+from pancam_graph.io import readable_picture
+from pancam_graph.results._brightness import Brightness, brightness_of
 from pancam_graph.results._colmap_scene import (
     Placed,
     RigGroup,
@@ -221,7 +222,7 @@ def _write_images(
     previous, lookup = None, None
     # By camera: its lookup is made once and forgotten after its last image.
     for i in sorted(numbers.of_image, key=lambda i: (numbers.of_image[i], i)):
-        image, s = readable_image(solution.traverse, i), straight[i]
+        image, s = readable_picture(solution.traverse, i), straight[i]
         if image is None or s is None:
             continue
         if s is not previous:

@@ -1,5 +1,6 @@
 """Image files: PDS sample types and layouts, ordinary formats, and everything that may be wrong."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from pancam_graph.base.errors import ImageError
-from pancam_graph.io import read_image
+from pancam_graph.data import Traverse
+from pancam_graph.io import read_image, same_pictures
+from pancam_graph.io._pds_label import PdsLabel, read_label
+from support import io_samples
 from support.pds_files import pds_file
 
 RAMP = np.arange(12).reshape(3, 4) * 300 - 600  # negative in places, above 8 bits in places
@@ -206,3 +210,64 @@ def test_opencv_stays_quiet_about_broken_files(tmp_path: Path, capfd: pytest.Cap
     with pytest.raises(ImageError):
         read_image(file)
     assert capfd.readouterr().err == ""
+
+
+def pictured(folder: Path, *files: str) -> Traverse:
+    """A traverse whose first images are of one eye and have these files."""
+    sample = io_samples.traverse(folder=folder)
+    images = [image for image in sample.images if image.camera == "pinhole"]
+    named = tuple(replace(image, file=name) for image, name in zip(images, files, strict=False))
+    return replace(sample, images=(*named, *images[len(named) :]), observations=None)
+
+
+def grey(seed: int) -> NDArray[np.uint16]:
+    return np.random.default_rng(seed).integers(0, 4000, (48, 64), dtype=np.uint16)
+
+
+def save(path: Path, samples: NDArray[Any]) -> None:
+    path.write_bytes(cv2.imencode(path.suffix, samples)[1].tobytes())
+
+
+def test_pictures_are_the_same_by_their_samples_and_not_by_their_bytes(tmp_path: Path) -> None:
+    save(tmp_path / "a.png", grey(1))
+    save(tmp_path / "b.tif", grey(1))  # other bytes, the same samples
+    save(tmp_path / "c.png", grey(2))
+    save(tmp_path / "d.png", grey(1))
+    traverse = pictured(tmp_path, "a.png", "b.tif", "c.png", "d.png")
+    assert same_pictures(traverse) == {1: 0, 3: 0}
+    save(tmp_path / "a.png", grey(3))  # a file that changes is looked at again
+    assert same_pictures(traverse) == {3: 1}
+
+
+def test_black_pictures_and_files_that_cannot_be_read_are_the_same_as_no_other(tmp_path: Path) -> None:
+    for name in ("a.png", "b.png"):
+        save(tmp_path / name, np.zeros((48, 64), np.uint8))
+    for name in ("c.png", "d.png"):
+        (tmp_path / name).write_bytes(b"nothing")
+    assert same_pictures(pictured(tmp_path, "a.png", "b.png", "c.png", "d.png")) == {}
+
+
+def test_samples_of_another_depth_are_another_picture(tmp_path: Path) -> None:
+    few = grey(1) // 32
+    save(tmp_path / "a.png", few.astype(np.uint8))
+    save(tmp_path / "b.png", few)
+    assert same_pictures(pictured(tmp_path, "a.png", "b.png")) == {}
+
+
+def test_the_label_of_a_file_is_parsed_once_for_as_long_as_it_is_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parsed: list[Path] = []
+
+    def counted(file: Path) -> PdsLabel:
+        parsed.append(file)
+        return read_label(file)
+
+    monkeypatch.setattr("pancam_graph.io._pds_samples.read_label", counted)
+    file = pds_file(tmp_path / "a.IMG", np.maximum(RAMP, 0).astype(">i2").tobytes())
+    for _ in range(3):
+        np.testing.assert_array_equal(read_image(file), np.maximum(RAMP, 0))
+    assert parsed == [file]
+    pds_file(file, np.arange(8).astype(">i2").tobytes(), size=(2, 4))
+    np.testing.assert_array_equal(read_image(file), np.arange(8).reshape(2, 4))
+    assert parsed == [file, file]

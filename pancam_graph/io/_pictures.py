@@ -1,0 +1,105 @@
+"""Pictures of a traverse: the one way from an image's row to its samples, and when two are the same."""
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from pancam_graph.base.errors import ImageError
+from pancam_graph.data import Traverse
+from pancam_graph.io._file_memory import FileMemory
+from pancam_graph.io._image_files import GreyImage, ImageContent, read_content
+
+__all__ = [
+    "left_out",
+    "picture_file",
+    "read_picture",
+    "readable_picture",
+    "same_pictures",
+]
+
+_NAMED = 5
+_KEYS = FileMemory[bytes]()
+"""Keys (`_key`) of files that were decoded, so that equal pictures are told without decoding again."""
+
+
+def picture_file(traverse: Traverse, row: int) -> Path | None:
+    """Where the file of an image is; None if it has none."""
+    file = traverse.images[row].file
+    return None if file is None else (traverse.folder or Path()) / file
+
+
+def read_picture(traverse: Traverse, row: int) -> ImageContent:
+    """Decode the file of an image; see `read_image`.
+
+    Raises ImageError as `read_image` does, for an image without a file, and for one of another size than its
+    camera's: a rig (most often a template) for another product, subframe or zoom.
+    """
+    path, eye = picture_file(traverse, row), traverse.rig.eyes[int(traverse.image_eye[row])]
+    if path is None:
+        raise ImageError(f"image {traverse.images[row].id}: expected an image file, found none")
+    content = read_content(path)
+    camera, (height_px, width_px) = eye.camera, content.samples.shape
+    if (width_px, height_px) != (camera.width_px, camera.height_px):
+        raise ImageError(
+            f"{path}: expected {camera.width_px} x {camera.height_px} pixels as of camera {eye.name} "
+            f"of the rig {traverse.rig.name}, found {width_px} x {height_px}"
+        )
+    if _KEYS.recall(path) is None:
+        _KEYS.keep(path, _key(content.samples))
+    return content
+
+
+def readable_picture(traverse: Traverse, row: int) -> GreyImage | None:
+    """The samples of an image; None without a file, or with one that cannot be read any more.
+
+    Reading the traverse has refused broken files: one that broke since must not cost the results of a solve.
+    """
+    try:
+        return read_picture(traverse, row).samples
+    except (ImageError, OSError):
+        return None
+
+
+def _key(samples: GreyImage) -> bytes:
+    """A digest that pictures of one size and depth share if they are alike in every sample.
+
+    Empty for a picture of a single grey, which is the same as no other.
+    """
+    if samples.min() == samples.max():
+        return b""
+    digest = hashlib.sha256(f"{samples.dtype.str} {samples.shape} ".encode())
+    digest.update(np.ascontiguousarray(samples).data)
+    return digest.digest()
+
+
+def same_pictures(traverse: Traverse) -> dict[int, int]:
+    """Rows of images whose picture is the same as that of an image before, and the first such row.
+
+    Pictures are the same if they have one size and depth and are alike in every sample: two pictures of one
+    scene differ by their noise. Pictures of a single grey say nothing and are not told to be the same. Files
+    that were decoded before and have not changed are not decoded again; files that cannot be read are the
+    same as no other.
+    """
+    first: dict[bytes, int] = {}
+    same: dict[int, int] = {}
+    for row in range(len(traverse.images)):
+        path = picture_file(traverse, row)
+        if path is None:
+            continue
+        key = _KEYS.recall(path)
+        if key is None and readable_picture(traverse, row) is not None:
+            key = _KEYS.recall(path)
+        if key and first.setdefault(key, row) != row:
+            same[row] = first[key]
+    return same
+
+
+def left_out(errors: Mapping[str, ImageError]) -> list[str]:
+    """Warnings of images, by id, whose files cannot be used: one of each, and how many more there are."""
+    named = [f"image {name} is left out: {error}" for name, error in list(errors.items())[:_NAMED]]
+    more = len(errors) - _NAMED
+    if more > 0:
+        named.append(f"{more} more images are left out, whose files cannot be used either")
+    return named
