@@ -38,10 +38,10 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, **_: object) -> str:
-    """Links to the pages at the top of the repository lead to those of the site."""
+    """Links to the pages at the top of the repository lead to those of the site; source files have none."""
     for source, page in TOP_PAGES.items():
         markdown = markdown.replace(f"](../{source}", f"]({page}")
-    return markdown
+    return re.sub(r"\[([^\]]+)\]\(\.\./[\w/.]+\.(?:py|json)\)", r"\1", markdown)
 
 
 def _linked_from_docs(text: str) -> str:
