@@ -21,8 +21,7 @@ import tomllib
 project = tomllib.load(open("pyproject.toml", "rb"))["project"]
 for requirement in project["dependencies"] + project["optional-dependencies"]["test"]:
     print(requirement.replace(">=", "=="))
-' > "$1/lowest.txt"
-    install_into "$1" "[test]" --constraint "$1/lowest.txt"
+' > "$1/lowest.txt" && install_into "$1" "[test]" --constraint "$1/lowest.txt"
 }
 
 table=""

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-TOOLS = ("bash", "cat", "cksum", "cp", "dirname", "grep", "head", "mkdir", "rm", "sed", "sort", "tail")
+TOOLS = ("bash", "cat", "cksum", "cp", "dirname", "grep", "head", "mkdir", "rm", "sed", "sort", "tail", "tee")
 
 # A stub answers `-c CODE` by running the code in the real interpreter, which is told to be another version.
 # `-m venv` puts the stub itself into the new environment; everything else is only noted.
@@ -25,6 +25,7 @@ $code" "$@" ;;
         case "$2 $3" in
             "venv --clear") rm -r -f "$4" && mkdir -p "$4/bin" && cp "$0" "$4/bin/python" ;;
             "pip install") {pip} ;;
+            "pytest "*) {pytest} ;;
         esac ;;
     *) echo "{dotted} $*" >> "{log}" ;;
 esac
@@ -43,7 +44,7 @@ class Checkout:
         (self.folder / ".ci").mkdir()
         self.path.mkdir()
         self.home.mkdir()
-        for name in ("environment.sh", "demo.sh", "test.sh"):
+        for name in ("environment.sh", "demo.sh", "test.sh", "test_all_pythons.sh"):
             shutil.copy(ROOT / "scripts" / name, self.folder / "scripts")
         shutil.copy(ROOT / "pyproject.toml", self.folder)
         shutil.copy(ROOT / ".ci/requirements.lock", self.folder / ".ci")
@@ -53,18 +54,35 @@ class Checkout:
             (self.path / tool).symlink_to(real)
 
     def stub(
-        self, where: str, dotted: str, *, venv: bool = True, implementation: str = "", pip: str = ":"
+        self,
+        where: str,
+        dotted: str,
+        *,
+        venv: bool = True,
+        implementation: str = "",
+        pip: str = ":",
+        pytest: str = ":",
     ) -> Path:
-        """An interpreter of a version: `where` is a name on the PATH or a path below the home folder."""
+        """An interpreter of a version: `where` is a name on the PATH or a path below the home folder.
+
+        `pip` and `pytest` are the shell's commands that it runs in their place.
+        """
         also = "" if venv else "sys.modules['ensurepip'] = None; "
         if implementation:
             also += f"sys.implementation.name = '{implementation}'"
         path = (self.home if "/" in where else self.path) / where
         path.parent.mkdir(parents=True, exist_ok=True)
         version = tuple(int(part) for part in dotted.split("."))
-        path.write_text(
-            STUB.format(real=sys.executable, version=version, also=also, dotted=dotted, log=self.log, pip=pip)
+        text = STUB.format(
+            real=sys.executable,
+            version=version,
+            also=also,
+            dotted=dotted,
+            log=self.log,
+            pip=pip,
+            pytest=pytest,
         )
+        path.write_text(text)
         path.chmod(0o755)
         return path
 
@@ -73,10 +91,10 @@ class Checkout:
         (self.path / where).write_text("#!/bin/sh\necho 'command not found' >&2\nexit 127\n")
         (self.path / where).chmod(0o755)
 
-    def run(self, script: str = "demo.sh") -> subprocess.CompletedProcess[str]:
+    def run(self, script: str = "demo.sh", **environment: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
             ["bash", str(self.folder / "scripts" / script)],
-            env={"PATH": str(self.path), "HOME": str(self.home)},
+            env={"PATH": str(self.path), "HOME": str(self.home), **environment},
             text=True,
             capture_output=True,
             check=False,
@@ -255,3 +273,34 @@ def test_a_failed_installation_is_said_and_tried_again(checkout: Checkout) -> No
             "could not install pancam_graph into .venv: see pip's message above",
         ]
         assert checkout.installations == attempt
+
+
+def test_every_version_that_is_found_has_its_row(checkout: Checkout) -> None:
+    checkout.stub("python3.13", "3.13.1", pytest="echo 7 passed")
+    checkout.stub("python3.12", "3.12.1", pytest="echo 1 failed, 6 passed; exit 1")
+    checkout.stub("python3.11", "3.11.7", pytest="echo 5 passed")
+    done = checkout.run("test_all_pythons.sh")
+    assert done.returncode == 1
+    assert done.stdout.rpartition("\n\n")[2].splitlines() == [
+        "3.14          no interpreter found",
+        "3.13          7 passed",
+        "3.12          1 failed, 6 passed",
+        "3.11          5 passed",
+        "3.11-lowest   5 passed",
+    ]
+    lowest = (checkout.folder / ".venvs/3.11-lowest/lowest.txt").read_text().splitlines()
+    assert "gtsam==4.3" in lowest
+    assert all(re.fullmatch(r"[\w.-]+==[\d.]+", line) for line in lowest)
+    options = [call.partition("--editable ")[2] for call in checkout.calls if "pip install" in call]
+    assert options == [
+        *[".[test] --upgrade --upgrade-strategy eager"] * 3,
+        ".[test] --constraint .venvs/3.11-lowest/lowest.txt",
+    ]
+
+
+def test_a_version_that_cannot_be_installed_fails_and_the_next_is_tried(checkout: Checkout) -> None:
+    checkout.stub("python3.13", "3.13.1", pip="exit 1")
+    checkout.stub("python3.12", "3.12.1", pytest="echo 7 passed")
+    done = checkout.run("test_all_pythons.sh", PYTHONS="3.13 3.12")
+    assert done.returncode == 1
+    assert done.stdout.endswith("\n\n3.13          could not be installed\n3.12          7 passed\n")
