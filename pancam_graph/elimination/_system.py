@@ -82,7 +82,7 @@ class Room(local):
 
 _Wave = list[_Chunk]
 _Systems = list[tuple[FloatArray, FloatArray]]
-"""(S, s) of each chunk of a wave, over the columns of its block; S in tiles, see kernel.gather."""
+"""(S, s) of each chunk of a wave, over the columns of its block; S in tiles, see kernel.add_to_panel."""
 
 
 class LandmarkSystem:
@@ -262,7 +262,7 @@ class LandmarkSystem:
                         if first <= g < last:
                             rows = int(block.begin[i]), int(block.begin[i + 1])
                             panel = self._panels.panel[g]
-                            kernel.gather(S, s, *rows, block.row, block.panel_column[i], panel)
+                            kernel.add_to_panel(S, s, *rows, block.row, block.panel_column[i], panel)
 
             in_parallel(eliminated, len(wave), grain=1)
             n_groups, n_entries = self.linkage.n_groups, sum(len(S) for S, _ in systems)
@@ -360,7 +360,7 @@ class LandmarkSystem:
 
         def work(begin: int, end: int) -> None:
             which = np.arange(begin, end)
-            kernel.costs(
+            kernel.landmark_costs(
                 self.sights,
                 bearings,
                 which,
@@ -432,7 +432,9 @@ class LandmarkSystem:
 
     def _take_if_better(self, strays: IntArray, vector: FloatArray, bearings: kernel.Bearings) -> None:
         cost, loss = np.empty(len(strays)), self.loss
-        kernel.costs(self.sights, bearings, strays, vector, self.origin_m, loss.kind, loss.width, cost)
+        kernel.landmark_costs(
+            self.sights, bearings, strays, vector, self.origin_m, loss.kind, loss.width, cost
+        )
         better = cost < self._moved_cost[strays]
         self.regained += float(np.sum((self._moved_cost[strays] - cost)[better]))
         self._moved[strays[better]], self._moved_cost[strays[better]] = vector[better], cost[better]
@@ -492,7 +494,9 @@ class LandmarkSystem:
                 for h, b, columns in zip(block.groups, block.begin, own, strict=False):
                     wanted = np.ix_(block.row[a + rows], block.row[b + columns])
                     joint[np.ix_(a + rows, b + columns)] = covariance.block(g, h)[wanted]
-            kernel.spread(self.sights, self.reduced, self.vector, joint, chunk.begin, chunk.end, out)
+            kernel.point_covariances(
+                self.sights, self.reduced, self.vector, joint, chunk.begin, chunk.end, out
+            )
         return self._given(out)
 
     @property

@@ -7,11 +7,11 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from pancam_graph.base.compiled import entry
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.images._features import DESCRIPTOR_NORM, Features
 from pancam_graph.images._options import FrontEndOptions
 from pancam_graph.images._pairs import Segments
-from pancam_graph.landmarks import compiled
 
 __all__ = ["Matches", "beyond_chance", "match_in_windows"]
 
@@ -105,7 +105,7 @@ def _gridded(uv_px: FloatArray) -> tuple[FloatArray, IntArray, IntArray, IntArra
     return corner, shape, order, np.searchsorted(cell[order], np.arange(shape[0] * shape[1] + 1))
 
 
-@compiled
+@entry
 def _search(
     rows: IntArray,
     windows: tuple[FloatArray, FloatArray, FloatArray, FloatArray],

@@ -10,8 +10,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from pancam_graph.base.compiled import entry, part
 from pancam_graph.base.geometry import FloatArray, IntArray
-from pancam_graph.landmarks import compiled
 
 __all__ = ["HALF_WIDTH_PX", "MAX_REACH_PX", "Coefficients", "align_patches"]
 
@@ -31,7 +31,7 @@ _MAX_AFFINE_STEP = 0.1
 _SAME_PEAK_PX = 2
 
 
-@compiled
+@part
 def _at(coefficients: Coefficients, u: float, v: float) -> float:
     """Brightness at a pixel, of the nearest one on the image."""
     height, width = coefficients.shape
@@ -56,7 +56,7 @@ def _at(coefficients: Coefficients, u: float, v: float) -> float:
     return value
 
 
-@compiled
+@part
 def _standardise(patch: FloatArray, weight: FloatArray) -> float:
     """Take out a patch's weighted mean and standard deviation; returns the latter."""
     mean = np.sum(patch * weight)
@@ -66,7 +66,7 @@ def _standardise(patch: FloatArray, weight: FloatArray) -> float:
     return spread
 
 
-@compiled
+@entry
 def align_patches(
     first: int,
     last: int,

@@ -16,4 +16,3 @@ from pancam_graph.landmarks._losses import SQUARED as SQUARED
 from pancam_graph.landmarks._losses import Loss as Loss
 from pancam_graph.landmarks._losses import LossName as LossName
 from pancam_graph.landmarks._losses import loss_of as loss_of
-from pancam_graph.landmarks.kernel import compiled as compiled

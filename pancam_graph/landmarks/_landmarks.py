@@ -174,7 +174,7 @@ def rays_of(measurements: Measurements, views: CameraViews) -> tuple[FloatArray,
     calibration = as_floats(views.calibration, (n_images, 3, 3))
     rotation = as_floats(views.world_R_camera, (n_images, 3, 3))
     in_parallel(
-        lambda first, last: kernel.rays(
+        lambda first, last: kernel.ray_directions(
             seen.image, seen.uv_px, calibration, rotation, first, last, direction
         ),
         len(direction),

@@ -62,7 +62,8 @@ def _trace(
     out = _Traced(np.empty(n), np.empty(n), np.empty(n), np.empty(n, dtype=np.int64))
     below = np.full(n, -1) if below is None else below
     rays = (origin_m, np.ascontiguousarray(direction), pixel_rad, below)
-    _rays.trace(scene, deck, *rays, *(over or (rays[1], out.ground_m)), lit, *out)
+    helpers = over or (rays[1], out.ground_m)
+    _rays.trace(scene, deck, *rays, *helpers, lit, out.light, out.distance_m, out.ground_m, out.edge)
     return out
 
 

@@ -92,7 +92,7 @@ def snoop(
         over_landmarks(kernel.evaluate, which, seen, vector, origin, residual, b, in_front)
         over_landmarks(kernel.free_derivatives, which, begin, vector, b)
         over_landmarks(kernel.cofactors, which, begin, b, weight, cofactor)
-        over_landmarks(kernel.tests, which, begin, residual, cofactor, test, freedom)
+        over_landmarks(kernel.residual_tests, which, begin, residual, cofactor, test, freedom)
         if sweep == 0 and known is None:
             counts = (weight > 0) & in_front
             scale = max(min_scale, _robust_scale(test[counts], freedom[counts]))

@@ -1,10 +1,8 @@
 """Elimination against dense linear algebra: order, square root, covariances; chains with calibrations."""
 
 from itertools import combinations, combinations_with_replacement, pairwise
-from typing import Any
 
 import gtsam
-import numba
 import numpy as np
 import pytest
 
@@ -22,7 +20,7 @@ from pancam_graph.elimination import (
     pattern,
     relative_pose_covariance,
 )
-from pancam_graph.landmarks import CameraViews, LossName, kernel, loss_of
+from pancam_graph.landmarks import CameraViews, LossName, loss_of
 from support.elimination_reference import assert_systems_agree, dense_of, true_cost, whole
 from support.landmark_scenes import measure, random_points, random_views, unit
 
@@ -435,29 +433,6 @@ def test_landmarks_come_back_in_the_order_they_were_given_in() -> None:
     system = LandmarkSystem(rigged.linkage, rigged.m, rigged.landmarks)
     assert not np.array_equal(system.landmark_row, np.arange(len(system.landmark_row)))
     assert np.array_equal(system.landmarks().vector, rigged.landmarks.vector)
-
-
-@pytest.mark.parametrize("pairs", [(0, 1, 2), (1, 4), (3,)])
-def test_the_innermost_loop_in_vectors_is_the_plain_one(pairs: tuple[int, ...]) -> None:
-    """`subtract_row` as compiled, and what stands for it where nothing is."""
-    rng = np.random.default_rng(3)
-    pair, n_pairs = np.array(pairs), 5
-    arms, tiles = rng.normal(size=6 * len(pair)), rng.normal(size=4 * n_pairs**2)
-    plain, arms_of = tiles.copy(), arms.reshape(-1, 3, 2)
-    S = tiles.reshape(n_pairs, n_pairs, 2, 2).copy()
-
-    def loop(tiles: FloatArray, arms: FloatArray, pair: IntArray, n_pairs: int) -> None:
-        for p in range(len(pair)):
-            kernel.subtract_row(tiles, pair[p] * n_pairs, arms, p, len(pair), pair)
-
-    in_vectors: Any = numba.njit(loop)  # the decorator's types know only functions of nothing
-    in_vectors(tiles, arms, pair, n_pairs)
-    for p in range(len(pair)):
-        kernel.subtract_row_plainly(plain, pair[p] * n_pairs, arms, p, len(pair), pair)
-        for q in range(p, len(pair)):
-            S[pair[p], pair[q]] -= arms_of[p].T @ arms_of[q]
-    assert tiles == pytest.approx(S.ravel(), abs=1e-14)
-    assert plain == pytest.approx(S.ravel(), abs=1e-14)
 
 
 @pytest.mark.parametrize("name", GRAPHS)

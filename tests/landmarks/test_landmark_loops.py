@@ -23,6 +23,7 @@ from pancam_graph.landmarks import (
     triangulate,
 )
 from pancam_graph.landmarks._landmarks import evaluate, free_derivatives, residual_cofactor
+from pancam_graph.landmarks.kernel._symmetric import diagonalise
 from pancam_graph.solve import snoop
 from pancam_graph.solve._rejection import Snooping
 from support import landmark_reference as reference
@@ -34,7 +35,7 @@ from support.landmark_scenes import measure, random_points, random_views, unit, 
 def eigen(a: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Eigenvalues in ascending order, and eigenvectors."""
     a, turn = a.copy(), np.empty_like(a)
-    kernel.eigen(a, turn)
+    diagonalise(a, turn)
     order = np.argsort(np.diag(a))
     return np.diag(a)[order], turn[:, order]
 
@@ -417,7 +418,7 @@ def test_loops_are_compiled_once_whatever_arrays_come() -> None:
         kernel.evaluate,
         kernel.refine,
         kernel.cofactors,
-        kernel.tests,
+        kernel.residual_tests,
         kernel.reject,
     ]
     assert [len(loop.signatures) for loop in compiled] == [1] * len(compiled)

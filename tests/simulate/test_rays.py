@@ -1,11 +1,7 @@
 """What rays meet: the ground that heights describe, pebbles on it, and the shadows of both."""
 
-import importlib
 import math
-import os
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import gtsam
@@ -15,7 +11,6 @@ import pytest
 from pancam_graph.base.geometry import FloatArray
 from pancam_graph.simulate import RenderOptions, _rays
 from pancam_graph.simulate import _scene as scene_module
-from pancam_graph.simulate._rays._compiling import _digest
 from pancam_graph.simulate._rays._world import SHADE, Scene
 from pancam_graph.simulate._render import _trace
 from pancam_graph.simulate._scene import make_deck, make_scene
@@ -139,33 +134,3 @@ def light_from_above(scene: Scene, xy_m: FloatArray) -> FloatArray:
     above = np.column_stack([xy_m, _rays.heights(scene, xy_m) + 1.0])
     down = np.tile([0.0, 0.0, -1.0], (len(xy_m), 1))
     return _trace(scene, NO_DECK, above, down, np.full(len(xy_m), PIXEL_RAD)).light
-
-
-def test_a_change_in_any_file_of_the_kernels_changes_the_digest(tmp_path: Path) -> None:
-    (tmp_path / "a.py").write_text("x = 1")
-    (tmp_path / "b.py").write_text("y = 1")
-    before = _digest(tmp_path)
-    assert _digest(tmp_path) == before
-    (tmp_path / "b.py").write_text("y = 2")
-    assert _digest(tmp_path) != before
-
-
-@pytest.mark.skipif(bool(os.environ.get("NUMBA_DISABLE_JIT")), reason="nothing is compiled")
-def test_what_is_on_disk_is_told_apart_by_what_a_kernel_closes_over(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "kernel_that_closes.py").write_text(
-        "from pancam_graph.landmarks.kernel import compiled\n"
-        "def make(sources):\n"
-        "    @compiled\n"
-        "    def f(x):\n"
-        "        return -x if sources < 0 else x\n"
-        "    return f\n"
-    )
-    monkeypatch.syspath_prepend(tmp_path)
-    module = importlib.import_module("kernel_that_closes")
-    for sources, found in ((1, False), (1, True), (2, False)):
-        kernel = module.make(sources)
-        kernel(1.0)
-        assert bool(kernel.stats.cache_hits) == found
-    del sys.modules["kernel_that_closes"]

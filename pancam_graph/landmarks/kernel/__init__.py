@@ -1,39 +1,33 @@
-"""Compiled loops: whatever runs once per observation."""
+"""Compiled loops over observations and landmarks, on plain arrays.
 
-from pancam_graph.landmarks.kernel._kernel import BEHIND_COST as BEHIND_COST
-from pancam_graph.landmarks.kernel._kernel import CAUCHY as CAUCHY
-from pancam_graph.landmarks.kernel._kernel import HUBER as HUBER
-from pancam_graph.landmarks.kernel._kernel import NONE as NONE
-from pancam_graph.landmarks.kernel._kernel import SURPRISE as SURPRISE
-from pancam_graph.landmarks.kernel._kernel import SURPRISE_COST as SURPRISE_COST
-from pancam_graph.landmarks.kernel._kernel import WEAK_PRIOR as WEAK_PRIOR
-from pancam_graph.landmarks.kernel._kernel import Bearings as Bearings
-from pancam_graph.landmarks.kernel._kernel import Reduced as Reduced
-from pancam_graph.landmarks.kernel._kernel import Seen as Seen
-from pancam_graph.landmarks.kernel._kernel import Sights as Sights
-from pancam_graph.landmarks.kernel._kernel import arrange as arrange
-from pancam_graph.landmarks.kernel._kernel import cofactors as cofactors
-from pancam_graph.landmarks.kernel._kernel import compiled as compiled
-from pancam_graph.landmarks.kernel._kernel import costs as costs
-from pancam_graph.landmarks.kernel._kernel import eigen as eigen
-from pancam_graph.landmarks.kernel._kernel import eliminate_calibrations as eliminate_calibrations
-from pancam_graph.landmarks.kernel._kernel import eliminate_poses as eliminate_poses
-from pancam_graph.landmarks.kernel._kernel import evaluate as evaluate
-from pancam_graph.landmarks.kernel._kernel import follow as follow
-from pancam_graph.landmarks.kernel._kernel import free_derivatives as free_derivatives
-from pancam_graph.landmarks.kernel._kernel import gather as gather
-from pancam_graph.landmarks.kernel._kernel import loss_cost as loss_cost
-from pancam_graph.landmarks.kernel._kernel import loss_costs as loss_costs
-from pancam_graph.landmarks.kernel._kernel import loss_weight as loss_weight
-from pancam_graph.landmarks.kernel._kernel import loss_weights as loss_weights
-from pancam_graph.landmarks.kernel._kernel import must_compile as must_compile
-from pancam_graph.landmarks.kernel._kernel import rays as rays
-from pancam_graph.landmarks.kernel._kernel import refine as refine
-from pancam_graph.landmarks.kernel._kernel import reject as reject
-from pancam_graph.landmarks.kernel._kernel import residuals as residuals
-from pancam_graph.landmarks.kernel._kernel import smallest_information as smallest_information
-from pancam_graph.landmarks.kernel._kernel import spread as spread
-from pancam_graph.landmarks.kernel._kernel import subtract_row as subtract_row
-from pancam_graph.landmarks.kernel._kernel import subtract_row_plainly as subtract_row_plainly
-from pancam_graph.landmarks.kernel._kernel import tests as tests
-from pancam_graph.landmarks.kernel._kernel import triangulate as triangulate
+Everything else of the package works on whole arrays, or once per image, frame or stop.
+"""
+
+from pancam_graph.landmarks.kernel._eliminate import eliminate_calibrations as eliminate_calibrations
+from pancam_graph.landmarks.kernel._eliminate import eliminate_poses as eliminate_poses
+from pancam_graph.landmarks.kernel._eliminate import must_compile as must_compile
+from pancam_graph.landmarks.kernel._follow import follow as follow
+from pancam_graph.landmarks.kernel._follow import landmark_costs as landmark_costs
+from pancam_graph.landmarks.kernel._follow import point_covariances as point_covariances
+from pancam_graph.landmarks.kernel._loss import BEHIND_COST as BEHIND_COST
+from pancam_graph.landmarks.kernel._loss import CAUCHY as CAUCHY
+from pancam_graph.landmarks.kernel._loss import HUBER as HUBER
+from pancam_graph.landmarks.kernel._loss import NONE as NONE
+from pancam_graph.landmarks.kernel._loss import loss_costs as loss_costs
+from pancam_graph.landmarks.kernel._loss import loss_weights as loss_weights
+from pancam_graph.landmarks.kernel._observe import Seen as Seen
+from pancam_graph.landmarks.kernel._observe import evaluate as evaluate
+from pancam_graph.landmarks.kernel._observe import free_derivatives as free_derivatives
+from pancam_graph.landmarks.kernel._observe import ray_directions as ray_directions
+from pancam_graph.landmarks.kernel._observe import residuals as residuals
+from pancam_graph.landmarks.kernel._order import Bearings as Bearings
+from pancam_graph.landmarks.kernel._order import Reduced as Reduced
+from pancam_graph.landmarks.kernel._order import Sights as Sights
+from pancam_graph.landmarks.kernel._order import arrange as arrange
+from pancam_graph.landmarks.kernel._outliers import cofactors as cofactors
+from pancam_graph.landmarks.kernel._outliers import reject as reject
+from pancam_graph.landmarks.kernel._outliers import residual_tests as residual_tests
+from pancam_graph.landmarks.kernel._outliers import smallest_information as smallest_information
+from pancam_graph.landmarks.kernel._refine import refine as refine
+from pancam_graph.landmarks.kernel._tiles import add_to_panel as add_to_panel
+from pancam_graph.landmarks.kernel._triangulate import triangulate as triangulate

@@ -2,7 +2,7 @@
 
 import math
 
-from pancam_graph.simulate._rays._compiling import inlined, part
+from pancam_graph.base.compiled import uncounted
 from pancam_graph.simulate._rays._noise import hashed, noise
 from pancam_graph.simulate._rays._world import Deck, Grids
 
@@ -11,7 +11,7 @@ __all__ = ["RIM_M", "hit_deck", "panel"]
 RIM_M = 0.03
 
 
-@inlined
+@uncounted.inlined
 def hit_deck(
     deck: Deck, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, end: float
 ) -> tuple[float, int, float, float, float]:
@@ -42,7 +42,7 @@ def hit_deck(
     return best, plate, hit_x, hit_y, hit_rim
 
 
-@part
+@uncounted.part
 def panel(lattice: Grids, plate: int, x: float, y: float, rim: float, foot: float) -> float:
     """Albedo of a plate: dusty solar cells between bright connectors, within a plain rim."""
     if rim < RIM_M:

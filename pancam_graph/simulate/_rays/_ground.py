@@ -1,13 +1,11 @@
 """The ground: nested height fields, bilinear between nodes, and what they carry beside heights."""
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 
+from pancam_graph.base.compiled import entry, uncounted
 from pancam_graph.base.geometry import FloatArray
-from pancam_graph.landmarks import compiled
-from pancam_graph.simulate._rays._compiling import SOURCES, inlined
 from pancam_graph.simulate._rays._world import CHANNELS, Scene
 
 __all__ = ["NEAREST_M", "height_at", "heights", "level_at", "march", "march_start", "sample"]
@@ -17,7 +15,7 @@ _RIM = 1  # meshes at the border of a grid that are left to the next one
 _COARSEST = 5  # squaring with which a ray from the camera begins
 
 
-@inlined
+@uncounted.inlined
 def level_at(scene: Scene, x: float, y: float) -> int:
     """The finest grid that has ground around a place; the last one outside all."""
     out = len(scene.height_shape) - 1
@@ -31,7 +29,7 @@ def level_at(scene: Scene, x: float, y: float) -> int:
     return out
 
 
-@inlined
+@uncounted.inlined
 def height_at(scene: Scene, level: int, x: float, y: float) -> float:
     """Height of a grid at a place; nothing that means anything beside the grid."""
     a = (x - scene.frame_m[level, 0, 0]) / scene.frame_m[level, 0, 2]
@@ -46,25 +44,17 @@ def height_at(scene: Scene, level: int, x: float, y: float) -> float:
     return over
 
 
-def _heights(sources: int) -> Callable[[Scene, FloatArray], FloatArray]:
-    @compiled
-    def heights(scene: Scene, xy_m: FloatArray) -> FloatArray:
-        """Height of the ground (n,) at x and y (n, 2)."""
-        out = np.empty(len(xy_m))
-        if sources < 0:  # never: closed over for the cache's sake
-            return out
-        for i in range(len(xy_m)):
-            x, y = xy_m[i, 0], xy_m[i, 1]
-            out[i] = height_at(scene, level_at(scene, x, y), x, y)
-        return out
-
-    return heights
+@entry
+def heights(scene: Scene, xy_m: FloatArray) -> FloatArray:
+    """Height of the ground (n,) at x and y (n, 2)."""
+    out = np.empty(len(xy_m))
+    for i in range(len(xy_m)):
+        x, y = xy_m[i, 0], xy_m[i, 1]
+        out[i] = height_at(scene, level_at(scene, x, y), x, y)
+    return out
 
 
-heights = _heights(SOURCES)
-
-
-@inlined
+@uncounted.inlined
 def sample(
     scene: Scene, level: int, x: float, y: float, foot: float
 ) -> tuple[float, float, float, float, float]:
@@ -102,7 +92,7 @@ def sample(
     return c0, c1, c2, c3, c4
 
 
-@inlined
+@uncounted.inlined
 def march_start(
     scene: Scene, dx: float, dy: float, dz: float, ex: float, ey: float, ez: float, reached: float
 ) -> float:
@@ -118,7 +108,7 @@ def march_start(
     return max(NEAREST_M, reached * other / across)
 
 
-@inlined
+@uncounted.inlined
 def march(
     scene: Scene, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, start: float
 ) -> float:

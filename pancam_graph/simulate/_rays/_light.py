@@ -2,7 +2,7 @@
 
 import math
 
-from pancam_graph.simulate._rays._compiling import inlined, part
+from pancam_graph.base.compiled import uncounted
 from pancam_graph.simulate._rays._ground import sample
 from pancam_graph.simulate._rays._noise import hashed, noise, noise_in_space
 from pancam_graph.simulate._rays._world import Scene
@@ -15,7 +15,7 @@ _FINEST_M = 0.0008
 _AVERAGED = 4.0  # waves along a footprint of which nothing is left
 
 
-@inlined
+@uncounted.inlined
 def reflected(
     scene: Scene, nx: float, ny: float, nz: float, albedo: float, sunlit: float, sky: float
 ) -> float:
@@ -24,13 +24,13 @@ def reflected(
     return albedo * (sunlit * sun + sky * _SKYLIGHT * (0.6 + 0.4 * nz))
 
 
-@inlined
+@uncounted.inlined
 def sunlit(shade_m: float, z: float, foot: float) -> float:
     """How much of the sun is seen at a height where ground keeps it away up to `shade_m`."""
     return min(1.0, max(0.0, 0.5 - (shade_m - z) / (0.004 + 0.5 * foot)))
 
 
-@part
+@uncounted.part
 def _crack(x: float, y: float, key: int) -> tuple[float, float]:
     """Distance to the nearest joint of a pavement of unit slabs, and the slab's own shade in [-1, 1]."""
     i, j = math.floor(x), math.floor(y)
@@ -48,7 +48,7 @@ def _crack(x: float, y: float, key: int) -> tuple[float, float]:
     return 0.5 * (math.sqrt(second) - math.sqrt(first)), shade
 
 
-@inlined
+@uncounted.inlined
 def of_ground(
     scene: Scene,
     level: int,
@@ -112,7 +112,7 @@ def of_ground(
     return reflected(scene, -gx * norm, -gy * norm, norm, albedo, min(sun, lit), sky)
 
 
-@inlined
+@uncounted.inlined
 def of_stone(
     scene: Scene,
     number: int,
@@ -142,7 +142,7 @@ def of_stone(
     return reflected(scene, nx * norm, ny * norm, up, albedo, sun, sky * (0.75 + 0.25 * up))
 
 
-@inlined
+@uncounted.inlined
 def of_rock(
     scene: Scene,
     rock: int,
@@ -196,7 +196,7 @@ def of_rock(
     )
 
 
-@inlined
+@uncounted.inlined
 def of_sky(scene: Scene, dx: float, dy: float, dz: float) -> float:
     """Radiance of the dusty sky: brighter towards the horizon and around the sun."""
     up = max(0.0, dz)

@@ -1,13 +1,11 @@
 """Random detail that is a function of the place alone."""
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 
+from pancam_graph.base.compiled import entry, uncounted
 from pancam_graph.base.geometry import FloatArray
-from pancam_graph.landmarks import compiled
-from pancam_graph.simulate._rays._compiling import SOURCES, part
 from pancam_graph.simulate._rays._world import Grids
 
 __all__ = ["hashed", "make_lattice", "noise", "noise_in_space", "noises"]
@@ -21,7 +19,7 @@ def make_lattice(rng: np.random.Generator) -> Grids:
     return rng.uniform(-1, 1, (_SIDE, _SIDE, 2)).astype(np.float32)
 
 
-@part
+@uncounted.part
 def hashed(i: int, j: int, key: int) -> int:
     """32 random bits of a cell."""
     h = (i * 374761393 + j * 668265263 + key * 974711) & 0xFFFFFFFF
@@ -30,7 +28,7 @@ def hashed(i: int, j: int, key: int) -> int:
     return h ^ (h >> 16)
 
 
-@part
+@uncounted.part
 def noise(lattice: Grids, x: float, y: float, key: int) -> tuple[float, float, float]:
     """Gradient noise of unit wavelength (Perlin 2002), RMS about 0.25, and its derivatives by x and y."""
     i, j = math.floor(x), math.floor(y)
@@ -54,7 +52,7 @@ def noise(lattice: Grids, x: float, y: float, key: int) -> tuple[float, float, f
     )
 
 
-@part
+@uncounted.part
 def noise_in_space(x: float, y: float, z: float, key: int) -> tuple[float, float, float, float]:
     """Value noise of unit wavelength in [-1, 1], and its gradient."""
     i, j, k = math.floor(x), math.floor(y), math.floor(z)
@@ -74,33 +72,25 @@ def noise_in_space(x: float, y: float, z: float, key: int) -> tuple[float, float
     return value, gx, gy, gz
 
 
-def _noises(sources: int) -> Callable[[Grids, FloatArray, FloatArray, float, float, float, int], FloatArray]:
-    @compiled
-    def noises(
-        lattice: Grids,
-        x: FloatArray,
-        y: FloatArray,
-        longest_m: float,
-        shortest_m: float,
-        gain: float,
-        key: int,
-    ) -> FloatArray:
-        """Fractal noise at n places: octaves from the longest wavelength down, each `gain` of the one before.
+@entry
+def noises(
+    lattice: Grids,
+    x: FloatArray,
+    y: FloatArray,
+    longest_m: float,
+    shortest_m: float,
+    gain: float,
+    key: int,
+) -> FloatArray:
+    """Fractal noise at n places: octaves from the longest wavelength down, each `gain` of the one before.
 
-        Each octave is turned against the last, so that no lattice shows.
-        """
-        out = np.zeros(len(x))
-        if sources < 0:  # never: closed over for the cache's sake
-            return out
-        for n in range(len(x)):
-            length, size, px, py, k = longest_m, 1.0, x[n], y[n], key
-            while length >= shortest_m:
-                out[n] += size * noise(lattice, px / length, py / length, k)[0]
-                px, py = 0.8 * px - 0.6 * py + 17.3, 0.6 * px + 0.8 * py - 9.1
-                length, size, k = 0.5 * length, gain * size, k + 1
-        return out
-
-    return noises
-
-
-noises = _noises(SOURCES)
+    Each octave is turned against the last, so that no lattice shows.
+    """
+    out = np.zeros(len(x))
+    for n in range(len(x)):
+        length, size, px, py, k = longest_m, 1.0, x[n], y[n], key
+        while length >= shortest_m:
+            out[n] += size * noise(lattice, px / length, py / length, k)[0]
+            px, py = 0.8 * px - 0.6 * py + 17.3, 0.6 * px + 0.8 * py - 9.1
+            length, size, k = 0.5 * length, gain * size, k + 1
+    return out

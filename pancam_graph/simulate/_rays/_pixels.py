@@ -1,10 +1,9 @@
 """Rays to what they meet first, and the light that comes back from there."""
 
 import math
-from collections.abc import Callable
 
+from pancam_graph.base.compiled import uncounted
 from pancam_graph.base.geometry import FloatArray, IntArray
-from pancam_graph.simulate._rays._compiling import SOURCES, entry, inlined
 from pancam_graph.simulate._rays._deck import RIM_M, hit_deck, panel
 from pancam_graph.simulate._rays._ground import NEAREST_M, height_at, level_at, march, march_start, sample
 from pancam_graph.simulate._rays._light import of_ground, of_rock, of_sky, of_stone, reflected, sunlit
@@ -18,7 +17,7 @@ _FACES = 64  # more than a form has
 _DECK_REACH_M = 8.0
 
 
-@inlined
+@uncounted.inlined
 def _trace(
     scene: Scene,
     deck: Deck,
@@ -110,57 +109,49 @@ def _trace(
     return light, t, key, ground
 
 
-def _tracing(sources: int) -> Callable[..., None]:
-    @entry
-    def trace(
-        scene: Scene,
-        deck: Deck,
-        origin_m: FloatArray,
-        direction: FloatArray,
-        pixel_rad: FloatArray,
-        below: IntArray,
-        below_direction: FloatArray,
-        below_m: FloatArray,
-        lit: bool,
-        light: FloatArray,
-        distance_m: FloatArray,
-        ground_m: FloatArray,
-        edge: IntArray,
-    ) -> None:
-        """Follow rays (n, 3) in the world, of pixels `pixel_rad` (n,) wide, from the last to the first.
+@uncounted.entry
+def trace(
+    scene: Scene,
+    deck: Deck,
+    origin_m: FloatArray,
+    direction: FloatArray,
+    pixel_rad: FloatArray,
+    below: IntArray,
+    below_direction: FloatArray,
+    below_m: FloatArray,
+    lit: bool,
+    light: FloatArray,
+    distance_m: FloatArray,
+    ground_m: FloatArray,
+    edge: IntArray,
+) -> None:
+    """Follow rays (n, 3) in the world, of pixels `pixel_rad` (n,) wide, from the last to the first.
 
-        `origin_m` has one row, or n. Where `below` (n,) is not negative it tells the row of `below_direction`
-        and `below_m` that has another ray from the same place, and the distance at which that met the ground:
-        a ray over it begins there. Of rays of no width nothing is asked. Written are the radiance (if `lit`),
-        the distance of what is met first (infinite in the sky), that of the ground alone, and a number that
-        changes where the picture has an edge (-2 for rays of no width).
-        """
-        if sources < 0:  # never: closed over for the cache's sake
-            return
-        for i in range(len(direction) - 1, -1, -1):
-            if not pixel_rad[i] > 0:
-                light[i], distance_m[i], ground_m[i], edge[i] = 0.0, math.inf, 0.0, -2
-                continue
-            dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
-            o, n, start = min(i, len(origin_m) - 1), below[i], NEAREST_M
-            if n >= 0 and below_m[n] > 0:
-                bx, by, bz = below_direction[n, 0], below_direction[n, 1], below_direction[n, 2]
-                start = march_start(scene, dx, dy, dz, bx, by, bz, below_m[n])
-            light[i], distance_m[i], edge[i], ground_m[i] = _trace(
-                scene,
-                deck,
-                origin_m[o, 0],
-                origin_m[o, 1],
-                origin_m[o, 2],
-                dx,
-                dy,
-                dz,
-                pixel_rad[i],
-                start,
-                lit,
-            )
-
-    return trace
-
-
-trace = _tracing(SOURCES)
+    `origin_m` has one row, or n. Where `below` (n,) is not negative it tells the row of `below_direction`
+    and `below_m` that has another ray from the same place, and the distance at which that met the ground:
+    a ray over it begins there. Of rays of no width nothing is asked. Written are the radiance (if `lit`),
+    the distance of what is met first (infinite in the sky), that of the ground alone, and a number that
+    changes where the picture has an edge (-2 for rays of no width).
+    """
+    for i in range(len(direction) - 1, -1, -1):
+        if not pixel_rad[i] > 0:
+            light[i], distance_m[i], ground_m[i], edge[i] = 0.0, math.inf, 0.0, -2
+            continue
+        dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
+        o, n, start = min(i, len(origin_m) - 1), below[i], NEAREST_M
+        if n >= 0 and below_m[n] > 0:
+            bx, by, bz = below_direction[n, 0], below_direction[n, 1], below_direction[n, 2]
+            start = march_start(scene, dx, dy, dz, bx, by, bz, below_m[n])
+        light[i], distance_m[i], edge[i], ground_m[i] = _trace(
+            scene,
+            deck,
+            origin_m[o, 0],
+            origin_m[o, 1],
+            origin_m[o, 2],
+            dx,
+            dy,
+            dz,
+            pixel_rad[i],
+            start,
+            lit,
+        )

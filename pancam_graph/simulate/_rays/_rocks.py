@@ -2,8 +2,8 @@
 
 import math
 
+from pancam_graph.base.compiled import uncounted
 from pancam_graph.base.geometry import FloatArray
-from pancam_graph.simulate._rays._compiling import inlined, part
 from pancam_graph.simulate._rays._world import Scene
 
 __all__ = ["BLOCK", "DIM_FOOT", "hit_rocks", "rock_shade", "through_form"]
@@ -14,7 +14,7 @@ DIM_FOOT = 1.6
 """How far around a rock, in its radii, it hides some of the sky."""
 
 
-@part
+@uncounted.part
 def through_form(
     forms: FloatArray,
     form: int,
@@ -51,7 +51,7 @@ def through_form(
     return (enter if enter < leave else math.inf), leave, face
 
 
-@part
+@uncounted.part
 def _cut(
     rocks: FloatArray,
     forms: FloatArray,
@@ -75,7 +75,7 @@ def _cut(
     return (enter if enter > 1e-6 else math.inf), face
 
 
-@inlined
+@uncounted.inlined
 def hit_rocks(
     scene: Scene, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, far: float
 ) -> tuple[float, int, int]:
@@ -131,7 +131,7 @@ def hit_rocks(
     return best, rock, face
 
 
-@inlined
+@uncounted.inlined
 def rock_shade(scene: Scene, x: float, y: float, z: float, but: int) -> tuple[bool, float]:
     """Whether a rock but that one hides the sun, and the share of the sky's light that rocks leave."""
     wide, deep = scene.cell_shape

@@ -6,7 +6,7 @@ small fragments on Mars follow within a factor of two. They are forms like rocks
 
 import math
 
-from pancam_graph.simulate._rays._compiling import inlined, part
+from pancam_graph.base.compiled import uncounted
 from pancam_graph.simulate._rays._ground import height_at, level_at
 from pancam_graph.simulate._rays._noise import hashed, noise
 from pancam_graph.simulate._rays._rocks import through_form
@@ -25,7 +25,7 @@ TALLEST_M = _TALL * _CELL_M
 _BYTE = 1 / 255.0
 
 
-@part
+@uncounted.part
 def _place(i: int, j: int, cell: float, key: int) -> tuple[float, float, float, float]:
     """Centre of what may be a cell's stone, its radius (none: no stone), and how unlikely it is there."""
     h = hashed(i, j, key)
@@ -39,7 +39,7 @@ def _place(i: int, j: int, cell: float, key: int) -> tuple[float, float, float, 
     )
 
 
-@part
+@uncounted.part
 def _stone(
     lattice: Grids, i: int, j: int, x: float, y: float, chance: float, radius: float, key: int
 ) -> tuple[float, float, float, float, float, float, int]:
@@ -54,7 +54,7 @@ def _stone(
     return along, across, up, math.cos(angle), math.sin(angle), depth, g
 
 
-@inlined
+@uncounted.inlined
 def hit_stones(
     scene: Scene,
     ox: float,
@@ -124,7 +124,7 @@ def hit_stones(
     return best, cover, nx * norm, ny * norm, nz * norm, size, number
 
 
-@inlined
+@uncounted.inlined
 def stone_shade(scene: Scene, x: float, y: float, z: float, pixel_m: float) -> tuple[float, float]:
     """The share of the sun, and that of the sky, that stones leave to a place on the ground."""
     sun, sky = 1.0, 1.0

@@ -1,0 +1,116 @@
+"""Linear triangulation."""
+
+import numpy as np
+
+from pancam_graph.base.compiled import entry, part
+from pancam_graph.base.geometry import FloatArray, IntArray
+from pancam_graph.landmarks.kernel._symmetric import diagonalise
+
+__all__ = ["triangulate"]
+
+_NO_BASELINE_M = 1e-9
+
+
+@part
+def _triangulate(
+    centre_m: FloatArray,
+    direction: FloatArray,
+    weight: FloatArray,
+    form: FloatArray,
+    turn: FloatArray,
+    arm: FloatArray,
+    vector: FloatArray,
+    origin_m: FloatArray,
+) -> None:
+    """One landmark (4,) and its origin (3,) from its rays (m, 3); see `landmarks.triangulate`."""
+    n = len(weight)
+    total = 0.0
+    for i in range(n):
+        total += weight[i]
+    alike = not total > 0
+    if alike:
+        total = float(n)
+    for k in range(3):
+        origin_m[k] = 0.0
+        for i in range(n):
+            origin_m[k] += (1.0 if alike else weight[i]) * centre_m[i, k]
+        origin_m[k] /= total
+    squares = 0.0
+    for i in range(n):
+        squares += (1.0 if alike else weight[i]) * _arm(centre_m[i], direction[i], origin_m, arm)
+    baseline = np.sqrt(squares / total)
+    parallax = baseline > _NO_BASELINE_M
+    if not parallax:
+        baseline = 1.0
+    for again in range(2):
+        form[:] = 0.0
+        for i in range(n):
+            square = _arm(centre_m[i], direction[i], origin_m, arm)
+            d = direction[i]
+            own = 1.0 if alike else weight[i]
+            if again:
+                range_squared = 0.0
+                for k in range(3):
+                    towards = vector[k] - vector[3] * (centre_m[i, k] - origin_m[k])
+                    range_squared += towards * towards
+                own /= max(range_squared, 1e-12)
+            for p in range(3):
+                form[p, p] += own
+                for q in range(p + 1):
+                    form[p, q] -= own * d[p] * d[q]
+                if parallax:
+                    form[3, p] -= own * arm[p] / baseline
+            form[3, 3] += own * (square / (baseline * baseline) if parallax else 1.0)
+        for p in range(3):
+            for q in range(p + 1, 4):
+                form[p, q] = form[q, p]
+        diagonalise(form, turn)
+        least = 0
+        for k in range(1, 4):
+            if form[k, k] < form[least, least]:
+                least = k
+        norm = 0.0
+        for k in range(4):
+            vector[k] = turn[k, least] / (baseline if k == 3 else 1.0)
+            norm += vector[k] * vector[k]
+        for k in range(4):
+            vector[k] /= np.sqrt(norm)
+    ahead = 0.0
+    for i in range(n):
+        along = 0.0
+        for k in range(3):
+            along += direction[i, k] * (vector[k] - vector[3] * (centre_m[i, k] - origin_m[k]))
+        ahead += (1.0 if alike else weight[i]) * np.sign(along)
+    if ahead < 0:
+        for k in range(4):
+            vector[k] = -vector[k]
+
+
+@part
+def _arm(centre_m: FloatArray, direction: FloatArray, origin_m: FloatArray, arm: FloatArray) -> float:
+    """What of the way from the origin to a ray's centre is across the ray, to `arm` (3,); its square."""
+    along, square = 0.0, 0.0
+    for k in range(3):
+        arm[k] = centre_m[k] - origin_m[k]
+        along += arm[k] * direction[k]
+    for k in range(3):
+        arm[k] -= along * direction[k]
+        square += arm[k] * arm[k]
+    return square
+
+
+@entry
+def triangulate(
+    which: IntArray,
+    begin: IntArray,
+    centre_m: FloatArray,
+    direction: FloatArray,
+    weight: FloatArray,
+    vector: FloatArray,
+    origin_m: FloatArray,
+) -> None:
+    """Landmarks (landmarks, 4) and their origins (landmarks, 3) from rays (n, 3)."""
+    form, turn, arm = np.empty((4, 4)), np.empty((4, 4)), np.empty(3)
+    for j in which:
+        own = slice(begin[j], begin[j + 1])
+        _triangulate(centre_m[own], direction[own], weight[own], form, turn, arm, vector[j], origin_m[j])
