@@ -7,6 +7,7 @@ import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from io import BytesIO
 from pathlib import Path
 from threading import Lock
@@ -15,7 +16,6 @@ from typing import Any
 import cv2
 import gtsam
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from pancam_graph.base.whole_files import whole_file
@@ -33,9 +33,10 @@ Arrays = dict[str, NDArray[Any]]
 class Cache:
     """Named arrays by kind and key. A key is a digest of everything that the arrays depend on.
 
-    So nothing here can be out of date: what depends on a changed image, rig, option, on another version of
-    the code, of OpenCV, NumPy or SciPy, or on another kind of processor is asked for by another key. Files
-    that cannot be read are logged and made anew. Any number of threads may ask, each for keys of its own.
+    Nothing in the cache can therefore be out of date: after a change of an image, of the rig, of an option,
+    of a module that makes the arrays, of a library's version or of the kind of processor, they are asked for
+    by another key. Files that cannot be read are logged and made anew. Several threads may ask at once, each
+    for other keys.
     """
 
     def __init__(self, folder: Path | None) -> None:
@@ -51,11 +52,11 @@ class Cache:
             return dict(make())
         path = self._folder / f"{kind}-{key[:40]}{_SUFFIX}"
         self._used.add(path)
-        found = _read(path, key)
-        if found is None:
-            found = dict(make())
-            self._write(path, key, found)
-        return found
+        arrays = _read(path, key)
+        if arrays is None:
+            arrays = dict(make())
+            self._write(path, key, arrays)
+        return arrays
 
     def forget_others(self) -> None:
         """Delete files of ours that nobody asked for since this object was made."""
@@ -95,11 +96,11 @@ def _read(path: Path, key: str) -> Arrays | None:
 
 
 def digest(*parts: Any) -> str:
-    """A digest of values of any depth, and of the code: hexadecimal, 64 characters.
+    """A digest of values of any depth, of the libraries' versions and of the kind of processor: 64 digits.
 
     Takes arrays, numbers, text, None, poses, dataclasses, and lists and dictionaries of them; all bits count.
     """
-    running = hashlib.sha256(_code().encode())
+    running = hashlib.sha256(_machine().encode())
     _feed(running, parts)
     return running.hexdigest()
 
@@ -137,13 +138,14 @@ def _feed(running: Any, value: Any) -> None:
 
 
 @cache
-def _code() -> str:
-    """A digest of this package's modules, of the libraries' versions and of what the processor can do."""
-    running = hashlib.sha256()
-    root = Path(__file__).resolve().parents[1]
-    for path in sorted(root.rglob("*.py")):
-        running.update(f"{path.relative_to(root).as_posix()}\n".encode())
-        running.update(path.read_bytes())
-    versions = [cv2.__version__, np.__version__, scipy.__version__, cv2.getCPUFeaturesLine()]
-    running.update(json.dumps(versions).encode())
-    return running.hexdigest()
+def _machine() -> str:
+    """The versions of the libraries that steps run through, and what the processor can do."""
+    versions = {name: _version(name) for name in ("gtsam", "numba", "numpy", "scipy")}
+    return json.dumps([versions, cv2.__version__, cv2.getCPUFeaturesLine()])
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:  # built from source, without a record of its version
+        return "unknown"

@@ -1,14 +1,23 @@
-"""The steps of the front end, each done when first asked for, or taken from the cache."""
+"""The steps of the front end, each done when first asked for, or taken from the cache.
+
+The key of what a step keeps is a digest of its inputs and of the sources of all modules that it runs through,
+so that an edit makes anew what it may change, and what follows from that.
+
+A step is a cached property, which two threads must not ask for at once: before a step shares its work among
+threads, it takes the steps that it needs into local names.
+"""
 
 import logging
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.base.sources import source_digest
 from pancam_graph.base.threads import in_order
 from pancam_graph.data import Observations, StopMatching, Traverse
 from pancam_graph.images._alignment import Ties
@@ -27,7 +36,7 @@ from pancam_graph.images._splines import Splines
 from pancam_graph.images._terrain import terrain_arrays, terrain_from
 from pancam_graph.solve import solve
 
-__all__ = ["Progress", "Steps"]
+__all__ = ["Progress", "Steps", "step_key"]
 
 _LOG = logging.getLogger(__name__)
 _WORLD_UP = np.array([0.0, 0.0, 1.0])
@@ -42,6 +51,22 @@ _WHY = {
 }
 
 Progress = Callable[[str, int, int], None]
+
+
+_CALLS: dict[str, tuple[Callable[..., Any], ...]] = {
+    "mask": (elevation_rad, mask_image, find_rover),
+    "features": (find_features,),
+    "matches": (overlapping_pairs, match_pair),
+    "refined": (Splines, refine_tracks),
+    "terrain": (solve, terrain_arrays),
+    "ties": (Splines, terrain_from, on_terrain, StopMatcher),
+}
+"""What each step that keeps something calls: its key depends on all modules that these run through."""
+
+
+def step_key(kind: str, *inputs: Any) -> str:
+    """The key of a step with these inputs. Of this module and the cache's, only their own text counts."""
+    return digest(kind, source_digest(*_CALLS[kind], alone=(__name__, digest.__module__)), *inputs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,9 +88,13 @@ class Steps:
 
     @cached_property
     def picture_keys(self) -> list[str]:
-        """Digest of each image, its user's mask, and how it was taken; with the options."""
+        """Digest of each image, its user's mask, and how it was taken; with the options and the rig.
+
+        The rig counts with the sources of its lenses, which steps call without importing them.
+        """
         traverse, pictures = self.traverse, self.pictures
-        rig, options = digest(traverse.rig), digest(self.options)
+        lenses = source_digest(*(type(eye.camera) for eye in traverse.rig.eyes))
+        rig, options = digest(lenses, traverse.rig), digest(self.options)
         return [
             digest(rig, options, image, mask, entry.camera, traverse.frames[frame], traverse.stops[stop])
             for image, mask, entry, frame, stop in zip(
@@ -90,9 +119,9 @@ class Steps:
         return pairs, [(a, b) for a, b in np.argwhere(np.triu(placed, 1)).tolist()]
 
     def _overlapping(self, stops: BoolArray) -> list[PairGeometry]:
-        there = [image is not None for image in self.pictures.images]
-        found = overlapping_pairs(self.traverse, self.options, partial(self.tell, "overlaps"), stops=stops)
-        return [pair for pair in found if there[pair.a] and there[pair.b]]
+        usable = [image is not None for image in self.pictures.images]
+        pairs = overlapping_pairs(self.traverse, self.options, partial(self.tell, "overlaps"), stops=stops)
+        return [pair for pair in pairs if usable[pair.a] and usable[pair.b]]
 
     @property
     def pairs(self) -> list[PairGeometry]:
@@ -104,19 +133,20 @@ class Steps:
 
     @cached_property
     def masks(self) -> list[ImageMask | None]:
-        there = np.array([image is not None for image in self.pictures.images])
-        self.picture_keys  # noqa: B018  made here, by one thread
+        usable = np.array([image is not None for image in self.pictures.images])
+        keys = self.picture_keys
         return in_order(
-            lambda i: self._mask(i, there) if there[i] else None,
-            range(len(there)),
-            lambda i, _: self.tell("masks", i + 1, len(there)),
+            lambda row: self._mask(row, usable, keys) if usable[row] else None,
+            range(len(usable)),
+            lambda row, _: self.tell("masks", row + 1, len(usable)),
         )
 
-    def _mask(self, row: int, there: BoolArray) -> ImageMask:
+    def _mask(self, row: int, usable: BoolArray, picture_keys: list[str]) -> ImageMask:
+        """Mask of an image; `usable` (images,) says which images have a picture."""
         image = self.pictures.images[row]
-        assert image is not None  # it is there
+        assert image is not None  # it is usable
         automatic = self.options.masks == "automatic"
-        partners = rover_partners(self.traverse, row, available=there) if automatic else []
+        partners = rover_partners(self.traverse, row, available=usable) if automatic else []
 
         def make() -> Arrays:
             elevation = elevation_rad(self.traverse, row)
@@ -125,7 +155,7 @@ class Steps:
             packed = zlib.compress(mask.with_rover(rover).reasons.tobytes(), 1)
             return {"reasons": np.frombuffer(packed, dtype=np.uint8)}
 
-        key = digest("mask", [self.picture_keys[i] for i in (row, *partners)])
+        key = step_key("mask", [picture_keys[i] for i in (row, *partners)])
         packed = self.cache.recall("mask", key, make)["reasons"]
         reasons = np.frombuffer(zlib.decompress(packed.tobytes()), dtype=np.uint8)
         return ImageMask(reasons=reasons.reshape(image.shape))
@@ -142,74 +172,78 @@ class Steps:
     @cached_property
     def feature_keys(self) -> list[str]:
         """Digest of all that each image's features depend on."""
-        sums = zip(self.picture_keys, self.masks, self.wanted, strict=True)
         return [
-            digest("features", key, None if mask is None else mask.usable(between_stops=False), wanted)
-            for key, mask, wanted in sums
+            step_key(
+                "features",
+                picture_key,
+                None if mask is None else mask.usable(between_stops=False),
+                wanted,
+            )
+            for picture_key, mask, wanted in zip(self.picture_keys, self.masks, self.wanted, strict=True)
         ]
 
     @cached_property
     def features(self) -> list[Features]:
         """Of every image where it overlaps others; none for an image without a file."""
         world_R_camera, _ = self.traverse.camera_poses()
-        self.feature_keys  # noqa: B018  made here, by one thread
+        keys, masks, all_wanted = self.feature_keys, self.masks, self.wanted
 
         def find(i: int) -> Features:
-            image, mask = self.pictures.images[i], self.masks[i]
+            image, mask = self.pictures.images[i], masks[i]
             if image is None or mask is None:
                 return Features.none()
             camera = self.traverse.rig.eyes[int(self.traverse.image_eye[i])].camera
             usable, up = mask.usable(between_stops=False), world_R_camera[i].T @ _WORLD_UP
 
             def make() -> Arrays:
-                return vars(find_features(image, self.wanted[i], camera, up, self.options, usable=usable))
+                return vars(find_features(image, all_wanted[i], camera, up, self.options, usable=usable))
 
-            return Features(**self.cache.recall("features", self.feature_keys[i], make))
+            return Features(**self.cache.recall("features", keys[i], make))
 
-        def tell(i: int, found: Features) -> None:
-            _LOG.info("%s: %d features", self.traverse.images[i].id, len(found))
-            self.tell("features", i + 1, len(self.wanted))
+        def tell(i: int, features: Features) -> None:
+            _LOG.info("%s: %d features", self.traverse.images[i].id, len(features))
+            self.tell("features", i + 1, len(all_wanted))
 
-        return in_order(find, range(len(self.wanted)), tell)
+        return in_order(find, range(len(all_wanted)), tell)
 
     @cached_property
     def _off_rover(self) -> list[IntArray]:
         """Rows of each image's features that may be matched with those of other stops."""
         rows = []
-        for found, mask in zip(self.features, self.masks, strict=True):
-            keep = np.zeros(len(found), dtype=bool)
+        for features, mask in zip(self.features, self.masks, strict=True):
+            keep = np.zeros(len(features), dtype=bool)
             if mask is not None:
-                keep = pixels_at(mask.usable(between_stops=True), found.uv_px)
+                keep = pixels_at(mask.usable(between_stops=True), features.uv_px)
             rows.append(np.flatnonzero(keep))
         return rows
 
     @cached_property
     def matches(self) -> list[PairMatches]:
         """Verified matches of each pair; those of two stops without the rover."""
-        if any(not pair.same_stop for pair in self.pairs):
-            self._off_rover  # noqa: B018  made here, by one thread
-        self.features  # noqa: B018  the same
+        pairs, features, keys = self.pairs, self.features, self.feature_keys
+        linking = any(not pair.same_stop for pair in pairs)
+        off_rover = self._off_rover if linking else []
 
-        def tell(k: int, found: PairMatches) -> None:
-            pair = self.pairs[k]
+        def match(pair: PairGeometry) -> PairMatches:
+            a, b = features[pair.a], features[pair.b]
+            rows = None if pair.same_stop else (off_rover[pair.a], off_rover[pair.b])
+
+            def make() -> Arrays:
+                if rows is None:
+                    return match_pair(pair, a, b, self.options).arrays()
+                selected = match_pair(pair, a.select(rows[0]), b.select(rows[1]), self.options).arrays()
+                return {**selected, "a": rows[0][selected["a"]], "b": rows[1][selected["b"]]}
+
+            key = step_key("matches", keys[pair.a], keys[pair.b], rows)
+            return PairMatches.of_arrays(self.cache.recall("matches", key, make))
+
+        def tell(k: int, matched: PairMatches) -> None:
+            pair = pairs[k]
             names = self.traverse.images[pair.a].id, self.traverse.images[pair.b].id
-            _LOG.info("%s, %s: %d matches %s", *names, len(found.matches), found.refusal.text)
-            self.tell("matches", k + 1, len(self.pairs))
+            _LOG.info("%s, %s: %d matches %s", *names, len(matched.matches), matched.refusal.text)
+            self.tell("matches", k + 1, len(pairs))
 
-        return in_order(self._matches, self.pairs, tell)
-
-    def _matches(self, pair: PairGeometry) -> PairMatches:
-        a, b = self.features[pair.a], self.features[pair.b]
-        rows = None if pair.same_stop else (self._off_rover[pair.a], self._off_rover[pair.b])
-
-        def make() -> Arrays:
-            if rows is None:
-                return match_pair(pair, a, b, self.options).arrays()
-            found = match_pair(pair, a.select(rows[0]), b.select(rows[1]), self.options).arrays()
-            return {**found, "a": rows[0][found["a"]], "b": rows[1][found["b"]]}
-
-        key = digest("matches", self.feature_keys[pair.a], self.feature_keys[pair.b], rows)
-        return PairMatches.of_arrays(self.cache.recall("matches", key, make))
+        return in_order(match, pairs, tell)
 
     @cached_property
     def _spline(self) -> Splines:
@@ -224,27 +258,28 @@ class Steps:
         first = np.searchsorted(track, track)
         firsts = np.unique(image[first])
         rows_of = [np.flatnonzero(image[first] == origin) for origin in firsts]
+        spline, picture_keys = self._spline, self.picture_keys
 
         def refine(rows: IntArray) -> Arrays:
             columns = image[rows], track[rows], uv_px[rows]
 
             def make() -> Arrays:
-                moved, good = refine_tracks(self.traverse, self._spline, *columns, self.options)
+                moved, good = refine_tracks(self.traverse, spline, *columns, self.options)
                 return {"uv_px": moved, "refined": good}
 
-            pictures = [self.picture_keys[i] for i in np.unique(image[rows])]
-            return self.cache.recall("refined", digest("refined", pictures, columns), make)
+            pictures = [picture_keys[i] for i in np.unique(image[rows])]
+            key = step_key("refined", pictures, columns)
+            return self.cache.recall("refined", key, make)
 
-        self._spline  # noqa: B018  made here, by one thread
         parts = in_order(refine, rows_of, lambda k, _: self.tell("refinement", k + 1, len(firsts)))
-        found, refined = uv_px.copy(), np.zeros(len(image), dtype=bool)
+        fitted_px, refined = uv_px.copy(), np.zeros(len(image), dtype=bool)
         for rows, part in zip(rows_of, parts, strict=True):
-            found[rows], refined[rows] = part["uv_px"], part["refined"]
-        clear = self._clear(image, track, found) & self._clear(image, track, uv_px)
+            fitted_px[rows], refined[rows] = part["uv_px"], part["refined"]
+        clear = self._clear(image, track, fitted_px) & self._clear(image, track, uv_px)
         moved = refined & clear & clear[first] & (first != np.arange(len(first)))
         good = moved.copy()
         good[first[moved]] = True  # it stays where it was found: the others fit to it
-        return np.where(moved[:, None], found, uv_px), good
+        return np.where(moved[:, None], fitted_px, uv_px), good
 
     def tied(self, observations: Observations, feature: IntArray) -> tuple[Observations, list[StopMatching]]:
         """Observations within stops with what pairs of stops see of each other's terrain added.
@@ -267,7 +302,8 @@ class Steps:
             return {**terrain_arrays(solution), "unit": np.array(unit)}
 
         columns = observations.image, observations.track, observations.uv_px, observations.sigma_px, feature
-        key = digest("terrain", self.picture_keys, self.mask_keys, self.traverse.stops, columns)
+        inputs = self.picture_keys, self.mask_keys, self.traverse.stops, columns
+        key = step_key("terrain", *inputs)
         placed = self.cache.recall("terrain", key, place)
         unit = float(placed.pop("unit"))
         terrain = terrain_from(traverse, **placed)
@@ -283,18 +319,19 @@ class Steps:
 
         def tie(stops: tuple[int, int]) -> StopTies:
             make = partial(_as_arrays, matcher, stops)
-            return StopTies.of_arrays(self.cache.recall("ties", digest("ties", key, stops), make))
+            tie_key = step_key("ties", key, stops)
+            return StopTies.of_arrays(self.cache.recall("ties", tie_key, make))
 
-        def tell(k: int, found: StopTies) -> None:
-            report = found.report
+        def tell(k: int, tied: StopTies) -> None:
+            report = tied.report
             names = self.traverse.stops[report.a].id, self.traverse.stops[report.b].id
             _LOG.info("%s in %s: %d ties, noise %.2f px", *names, report.kept, report.noise_px)
             self.tell("ties between stops", k + 1, len(directed))
 
         directed = [d for a, b in self.stop_pairs for d in ((a, b), (b, a))]
-        found = in_order(tie, directed, tell)
-        ties = Ties.concatenate([f.ties for f in found])
-        return joined(observations, terrain, ties, unit * ties.sigma_px), [f.report for f in found]
+        stop_ties = in_order(tie, directed, tell)
+        ties = Ties.concatenate([each.ties for each in stop_ties])
+        return joined(observations, terrain, ties, unit * ties.sigma_px), [each.report for each in stop_ties]
 
     def _clear(self, image: IntArray, track: IntArray, uv_px: FloatArray) -> BoolArray:
         """Whether no pixel is left out within a patch around each observation."""
@@ -336,8 +373,8 @@ class Steps:
                 return f" ({share:.0%} of it {text})"
         if not any(row in {pair.a, pair.b} for pair in self.pairs):
             return " (it overlaps no other image by pointing)"
-        found = len(self.features[row].uv_px)
-        return f" (none of its {found} features was found in another image)"
+        n_features = len(self.features[row].uv_px)
+        return f" (none of its {n_features} features was found in another image)"
 
 
 def _as_arrays(matcher: StopMatcher, stops: tuple[int, int]) -> Arrays:

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 from pancam_graph import Traverse
+from pancam_graph.base import sources
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.whole_files import whole_folder
 from pancam_graph.images import FrontEndOptions, cache_folder, find_observations, is_cache
 from pancam_graph.images._cache import Cache, digest
 from pancam_graph.images._cache_folder import begin_cache
-from pancam_graph.images._steps import Steps
+from pancam_graph.images._steps import Steps, step_key
 from pancam_graph.results import check_out
 from support.image_scenes import QUICK, SIZE_PX, as_bytes, found_in, make_traverse
 from support.pictures import read_picture
@@ -107,11 +108,66 @@ def test_options_rig_pointing_and_masks_are_seen(scene: Traverse) -> None:
         assert [a == b for a, b in zip(keys(other, options), before, strict=True)] == alike
 
 
-def test_another_version_of_the_code_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_version_of_a_library_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     before = digest("features", 1.0)
     assert digest("features", 1.0) == before
-    monkeypatch.setattr("pancam_graph.images._cache._code", lambda: "another")
+    monkeypatch.setattr("pancam_graph.images._cache._machine", lambda: "another")
     assert digest("features", 1.0) != before
+
+
+KINDS = ("mask", "features", "matches", "refined", "terrain", "ties")
+
+
+@pytest.mark.parametrize(
+    ("edited", "stale"),
+    [
+        ("factors.mast", {"terrain"}),
+        ("landmarks.kernel._eliminate", {"terrain"}),
+        ("images._features", {"features", "matches", "ties"}),
+        ("images._sky", {"mask", "ties"}),
+        ("images._patches", {"refined", "ties"}),
+        ("rigs._rig", {"mask", "matches", "refined", "terrain", "ties"}),
+        ("report._style", set()),
+        ("results._residuals_csv", set()),
+        ("images._steps", set(KINDS)),
+    ],
+)
+def test_an_edit_makes_those_steps_stale_that_run_through_it(
+    monkeypatch: pytest.MonkeyPatch, edited: str, stale: set[str]
+) -> None:
+    """Of the steps' own sources; by their inputs, more steps follow from a stale one."""
+    before = {kind: step_key(kind) for kind in KINDS}
+    name = f"pancam_graph.{edited}"
+    file, text = sources.source_of(name)
+    assert text
+    read = sources.source_of
+    monkeypatch.setattr(
+        sources, "source_of", lambda module: (file, f"{text}# edited\n") if module == name else read(module)
+    )
+    sources._digest.cache_clear()
+    try:
+        after = {kind: step_key(kind) for kind in KINDS}
+    finally:
+        sources._digest.cache_clear()
+    assert {kind for kind in KINDS if before[kind] != after[kind]} == stale
+
+
+def test_an_edit_of_a_lens_makes_anew_what_images_through_it_show(
+    scene: Traverse, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = Steps(scene, QUICK, None, Cache(None)).picture_keys
+    lens = type(scene.rig.eyes[0].camera).__module__
+    file, text = sources.source_of(lens)
+    read = sources.source_of
+    monkeypatch.setattr(
+        sources, "source_of", lambda module: (file, f"{text}# edited\n") if module == lens else read(module)
+    )
+    sources._digest.cache_clear()
+    try:
+        after = Steps(scene, QUICK, None, Cache(None)).picture_keys
+    finally:
+        sources._digest.cache_clear()
+    assert not set(before) & set(after)
 
 
 def test_a_digest_sees_every_bit_and_every_boundary() -> None:

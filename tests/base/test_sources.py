@@ -1,0 +1,70 @@
+"""Which modules of a package a function runs through."""
+
+import importlib
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import FunctionType
+
+import pytest
+
+from pancam_graph.base.sources import modules_behind, source_digest
+
+FILES = {
+    "__init__": "from housed.unused import thing\n",
+    "used": "def value():\n    from .late import late\n    return late\n",
+    "late": "late = 1\n",
+    "unused": "thing = 2\n",
+    "room/__init__": "from housed.room._a import a as a\nfrom housed.room import _b\nb = _b.b\n",
+    "room/_a": "import json\na = 3\n",
+    "room/_b": "b = 4\n",
+    "by_door": "from housed.room import a\ndef run():\n    return a\n",
+    "made_by_door": "from housed.room import b\n",
+    "by_module": "from housed import used as other, room\nimport housed.late\n",
+}
+
+
+@pytest.fixture
+def housed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A package of these files."""
+    (tmp_path / "housed" / "room").mkdir(parents=True)
+    for name, text in FILES.items():
+        (tmp_path / "housed" / f"{name}.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield
+    for name in [name for name in sys.modules if name.partition(".")[0] == "housed"]:
+        del sys.modules[name]
+
+
+@pytest.mark.usefixtures("housed")
+@pytest.mark.parametrize(
+    ("module", "behind"),
+    [
+        ("used", {"used", "late"}),
+        ("by_door", {"by_door", "room._a"}),
+        ("made_by_door", {"made_by_door", "room", "room._a", "room._b"}),
+        ("by_module", {"by_module", "used", "late", "room", "room._a", "room._b"}),
+    ],
+)
+def test_imports_lead_through_doors_to_the_modules_that_make_the_names(module: str, behind: set[str]) -> None:
+    assert modules_behind(frozenset([f"housed.{module}"])) == {f"housed.{name}" for name in behind}
+
+
+@pytest.mark.usefixtures("housed")
+def test_a_digest_of_functions_is_that_of_their_modules() -> None:
+    by_door, used = (importlib.import_module(f"housed.{name}") for name in ("by_door", "used"))
+    digests = [source_digest(by_door.run), source_digest(used.value), source_digest(by_door.run, used.value)]
+    assert len(set(digests)) == 3
+    assert source_digest(used.value, by_door.run) == digests[2]
+    assert source_digest(used.value, alone=["housed.by_door"]) not in digests
+
+
+def test_a_function_without_a_source_file_does_no_harm() -> None:
+    made = FunctionType(compile("1", "nowhere", "eval"), {"__name__": "nowhere"})
+    assert len(source_digest(made)) == 64
+
+
+def test_what_the_link_or_the_wheel_calls_factors_is_found() -> None:
+    behind = modules_behind(frozenset(["pancam_graph.solve._solve"]))
+    assert "pancam_graph.factors.mast" in behind
+    assert "pancam_graph.report._style" not in behind
