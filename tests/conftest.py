@@ -1,11 +1,36 @@
-"""Fixtures that several test modules share."""
+"""Fixtures that several test modules share, and the option --shuffle."""
 
 import os
+import random
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add --shuffle SEED, so that a run can show that no test depends on another."""
+    parser.addoption("--shuffle", type=int, metavar="SEED", help="run the tests in an order drawn from SEED")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Draw the order of modules, and of tests within each; a module's fixtures are still made once.
+
+    Every process of pytest-xdist collects in the same order, as it must, because the seed is the same.
+    """
+    seed = config.getoption("--shuffle")
+    if seed is None:
+        return
+    of_module: dict[Path, list[pytest.Item]] = {}
+    for item in items:
+        of_module.setdefault(item.path, []).append(item)
+    order = random.Random(seed)
+    modules = list(of_module.values())
+    order.shuffle(modules)
+    for module in modules:
+        order.shuffle(module)
+    items[:] = [item for module in modules for item in module]
 
 
 def shared(name: str) -> Path:

@@ -1,9 +1,11 @@
 """The smoother as a rover uses it: stop by stop, late, out of order, wrong, and after a restart."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import gtsam
 import numpy as np
 import pytest
 
@@ -40,25 +42,12 @@ _LOOP = SimulationOptions(
 Parts = tuple[Stop, list[Frame], list[Image], Observations]
 
 
-def parts_of(traverse: Traverse, order: Sequence[int] | None = None) -> Iterator[Parts]:
-    """The traverse, stop by stop."""
-    assert traverse.observations is not None
-    for s in order if order is not None else range(len(traverse.stops)):
-        rows = np.flatnonzero(traverse.image_stop == s)
-        own = traverse.observations.select(np.isin(traverse.observations.image, rows))
-        yield (
-            traverse.stops[s],
-            [f for f in traverse.frames if f.stop == traverse.stops[s].id],
-            [traverse.images[i] for i in rows],
-            replace(own, image=np.searchsorted(rows, own.image)),
-        )
-
-
 def driven(
     traverse: Traverse, smoother: TraverseSmoother, order: Sequence[int] | None = None
 ) -> list[Update]:
     """What the smoother says at each stop."""
-    return [smoother.add_stop(*part) for part in parts_of(traverse, order)]
+    parts = list(stops_of(traverse))
+    return [smoother.add_stop(*parts[i]) for i in (range(len(parts)) if order is None else order)]
 
 
 def less(part: Parts, rows: IntArray) -> Parts:
@@ -82,6 +71,69 @@ def batch(small: Simulation) -> Solution:
 def loop() -> Simulation:
     """Twelve stops and back."""
     return simulate(mer_navcam(), _LOOP, seed=2)
+
+
+def test_every_entry_of_a_traverse_is_in_one_stop(small: Simulation) -> None:
+    t, parts = small.traverse, list(stops_of(small.traverse))
+    assert t.observations is not None
+    assert tuple(stop for stop, *_ in parts) == t.stops
+    for stop, frames, images, observations in parts:
+        assert {frame.stop for frame in frames} == {stop.id}
+        assert {image.frame for image in images} == {frame.id for frame in frames}
+        assert observations.image.min() == 0
+        assert observations.image.max() < len(images)
+    assert sorted(f.id for _, frames, _, _ in parts for f in frames) == sorted(f.id for f in t.frames)
+    assert sorted(i.id for _, _, images, _ in parts for i in images) == sorted(i.id for i in t.images)
+    seen = [
+        (images[image].id, track, u, v)
+        for _, _, images, o in parts
+        for image, track, (u, v) in zip(o.image.tolist(), o.track.tolist(), o.uv_px.tolist(), strict=True)
+    ]
+    given = zip(
+        t.observations.image.tolist(),
+        t.observations.track.tolist(),
+        t.observations.uv_px.tolist(),
+        strict=True,
+    )
+    assert sorted(seen) == sorted((t.images[image].id, track, u, v) for image, track, (u, v) in given)
+
+
+def test_images_of_a_stop_are_counted_from_0_in_their_order() -> None:
+    """Frames and images of two stops in turns, observations in no order."""
+    place: dict[str, Any] = {
+        "world_T_mast": gtsam.Pose3(),
+        "sigma_rotation_rad": 0.01,
+        "sigma_translation_m": 0.1,
+    }
+    angles: dict[str, Any] = {"pan_rad": 0.0, "tilt_rad": 0.0, "sigma_pan_rad": 1e-3, "sigma_tilt_rad": 1e-3}
+    traverse = Traverse(
+        name="in turns",
+        rig=mer_navcam(),
+        stops=tuple(Stop(id=name, **place) for name in ("one", "two")),
+        frames=tuple(Frame(id=f"f{i}", stop=stop, **angles) for i, stop in enumerate(("two", "one", "two"))),
+        images=(
+            Image(id="a", frame="f2", camera="left"),
+            Image(id="b", frame="f1", camera="left"),
+            Image(id="c", frame="f0", camera="left"),
+            Image(id="d", frame="f1", camera="right"),
+        ),
+        observations=Observations(
+            image=np.array([3, 2, 0, 1, 2]),
+            track=np.array([7, 7, 7, 5, 5]),
+            uv_px=np.arange(10.0).reshape(5, 2),
+            sigma_px=np.full(5, 0.5),
+        ),
+    )
+    (one, frames_1, images_1, observations_1), (two, frames_2, images_2, observations_2) = stops_of(traverse)
+    assert (one.id, two.id) == ("one", "two")
+    assert [f.id for f in frames_1] == ["f1"]
+    assert [f.id for f in frames_2] == ["f0", "f2"]
+    assert [i.id for i in images_1] == ["b", "d"]
+    assert [i.id for i in images_2] == ["a", "c"]
+    assert observations_1.image.tolist() == [1, 0]
+    assert observations_1.track.tolist() == [7, 5]
+    assert observations_2.image.tolist() == [1, 0, 1]
+    assert observations_2.uv_px.tolist() == [[2.0, 3.0], [4.0, 5.0], [8.0, 9.0]]
 
 
 def require_batch(smoother: TraverseSmoother, batch: Solution) -> None:
@@ -170,7 +222,7 @@ def test_the_number_of_threads_changes_no_bit(
 def test_observations_may_come_late(small: Simulation, batch: Solution) -> None:
     smoother, late = TraverseSmoother(small.traverse.rig), []
     first_image = 0
-    for part in parts_of(small.traverse):
+    for part in stops_of(small.traverse):
         rows = np.arange(0, len(part[3]), 3)
         smoother.add_stop(*less(part, rows))
         taken = part[3].select(rows)
@@ -230,7 +282,7 @@ def test_wrong_observations_are_rejected_as_they_come(small: Simulation, batch: 
 
 def test_it_goes_on_after_a_restart(small: Simulation, batch: Solution, tmp_path: Path) -> None:
     t, path = small.traverse, tmp_path / "drive.npz"
-    parts = list(parts_of(t))
+    parts = list(stops_of(t))
     smoother = TraverseSmoother(t.rig)
     for part in parts[:2]:
         smoother.add_stop(*part)
@@ -249,7 +301,7 @@ def test_a_saved_state_of_another_kind_is_refused(small: Simulation, tmp_path: P
     smoother = TraverseSmoother(small.traverse.rig)
     with pytest.raises(InputError, match="at least one stop"):
         smoother.save(path)
-    smoother.add_stop(*next(parts_of(small.traverse)))
+    smoother.add_stop(*next(stops_of(small.traverse)))
     smoother.save(path)
     whole = path.read_bytes()
     with np.load(path) as archive:
@@ -272,7 +324,7 @@ def test_a_saved_state_of_another_kind_is_refused(small: Simulation, tmp_path: P
 
 def test_bad_input_changes_nothing(small: Simulation) -> None:
     t = small.traverse
-    parts = list(parts_of(t))
+    parts = list(stops_of(t))
     smoother = TraverseSmoother(t.rig)
     smoother.add_stop(*parts[0])
     smoother.add_stop(*parts[1])
@@ -303,7 +355,7 @@ def test_bad_input_changes_nothing(small: Simulation) -> None:
 
 
 def test_a_stop_without_a_connection_keeps_its_odometry(small: Simulation) -> None:
-    parts = list(parts_of(small.traverse))
+    parts = list(stops_of(small.traverse))
     smoother = TraverseSmoother(small.traverse.rig, SmootherOptions(telemetry="odometry"))
     smoother.add_stop(*parts[0])
     alone = replace(parts[1][3], track=parts[1][3].track + 10**6)
@@ -316,7 +368,7 @@ def test_a_stop_without_a_connection_keeps_its_odometry(small: Simulation) -> No
 
 
 def test_a_track_number_used_for_two_places_is_found(small: Simulation) -> None:
-    parts = list(parts_of(small.traverse))
+    parts = list(stops_of(small.traverse))
     smoother = TraverseSmoother(small.traverse.rig)
     smoother.add_stop(*parts[0])
     smoother.add_stop(*parts[1])
@@ -333,7 +385,7 @@ def test_a_track_number_used_for_two_places_is_found(small: Simulation) -> None:
 
 def closing(loop: Simulation) -> tuple[TraverseSmoother, list[Parts], list[IntArray]]:
     """The drive but for what closes the loop: rows of each stop that see what stops half a drive ago saw."""
-    parts = list(parts_of(loop.traverse))
+    parts = list(stops_of(loop.traverse))
     held_back = []
     early = set(np.concatenate([p[3].track for p in parts[:3]]).tolist())
     smoother = TraverseSmoother(loop.traverse.rig, SmootherOptions(telemetry="odometry"))
