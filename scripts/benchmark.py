@@ -1,8 +1,8 @@
 """Measure the solver against its peers on simulated drives, and against the committed baseline.
 
-Every engine solves each case in a process of its own. Prints a table for the README; writes all figures as
-JSON. Absolute times move between machines and hours; ratios within one run are what counts, and what
-scripts/benchmark_baseline.json keeps.
+Every engine solves each case in a new process. Prints a table for the README; writes all figures as
+JSON. Absolute times change between machines and hours. Only ratios within one run are compared; the file
+scripts/benchmark_baseline.json keeps them.
 
 Exit status: 0 as good as the baseline; 1 final costs differ, an engine failed, the time grows faster than
 the drive or a ratio got worse; 2 bad input.

@@ -1,8 +1,8 @@
-"""Measure the way from image files to a solution: where the time goes, memory, and images a minute.
+"""Measure the way from image files to a solution: time of each step, memory, and images a minute.
 
-TRAVERSE is a folder of a traverse with image files. Where there is none, it is rendered first, in a process
-of its own: MER Navcam stereo panoramas of 20 images of 1024 x 1024 each, ten stops 7 m apart, so 200 images.
-Nothing is taken from a cache.
+TRAVERSE is a folder of a traverse with image files. If it does not exist, it is rendered first, in another
+process: MER Navcam stereo panoramas of 20 images of 1024 x 1024 each, ten stops 7 m apart, so 200 images.
+No cache is used.
 
 Exit status: 0 solved; 1 not converged; 2 bad input.
 """
@@ -47,9 +47,9 @@ def main() -> int:
     with progress.shown("reading"), tempfile.TemporaryDirectory(prefix="pancam-graph-benchmark-") as out:
         traverse = read_input(a.traverse)
         steps.done("traverse")
-        found = find_observations(traverse, progress=tell)
+        matched = find_observations(traverse, progress=tell)
         steps.done("tracks")
-        solution = solve(found, on_iteration=progress.iteration)
+        solution = solve(matched, on_iteration=progress.iteration)
         steps.done("solve")
         write_results(solution, Path(out) / "out")
         steps.done("results and report")

@@ -1,8 +1,8 @@
 """Measure the smoother stop by stop on simulated drives, against one batch of all stops by Ceres Solver.
 
-A stop should take less than a tenth of that batch, and the end should be the batch's answer. Prints a table
-of the slowest stop of each drive (the first drive of a process, and the fastest of the warm ones), and what
-cost, poses and sigmas are off; writes all figures as JSON.
+A stop should take less than a tenth of that batch, and the last estimate should be that of the batch. Prints
+a table of the slowest stop of each drive (the first drive of a process, and the fastest of the warm ones),
+and of the differences in cost, poses and sigmas; writes all figures as JSON.
 
 Exit status: 0; 1 an engine failed; 2 bad input.
 """
@@ -20,7 +20,7 @@ from pancam_graph.base.errors import InputError
 from pancam_graph.cli import ScriptParser, run, show_log
 
 _ENGINE = "eliminated"
-"""Whose compiled code the smoother uses."""
+"""The engine whose compiled code the smoother uses."""
 
 
 def main() -> int:

@@ -1,7 +1,8 @@
 """Run the experiments of the thesis and write results.json, figures (PNG, SVG) and results.md into OUT.
 
-Simulated clusters and traverses over 50 seeds in two processes, and Opportunity's panorama where ../shared
-has it. Same options, same numbers. Figures need matplotlib: pip install -e '.[thesis]'.
+Simulated clusters and traverses are solved over 50 seeds in two processes; so is Opportunity's panorama if
+../shared has its images. The same options give the same numbers. Figures need matplotlib:
+pip install -e '.[thesis]'.
 
 Exit status: 0 written, 2 bad input (nothing is written).
 """
@@ -37,8 +38,8 @@ def main() -> int:
     chosen, progress = plan(seeds=seeds, quick=a.quick, families=a.only), Progress()
     with progress.shown("running the experiments"):
         samples = run_tasks(chosen.tasks, processes=a.processes, progress=progress.counted)
-    found = write_results(samples, chosen.left_out, a.out)
-    for verdict in found:
+    verdicts = write_results(samples, chosen.left_out, a.out)
+    for verdict in verdicts:
         print(f"{'holds' if verdict.holds else 'does not hold everywhere'}: {verdict.expectation}")
     print(f"{a.out}: results.md, results.json, figures")
     return 0

@@ -1,4 +1,4 @@
-"""The traverses that are solved: drives with known truth, from the package's own simulator."""
+"""Cases of the benchmark: drives with known truth, made by the package's simulator."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,17 +17,18 @@ _START_ERROR_M = 0.1
 """How far from the truth, per axis, landmarks start for engines that cannot triangulate."""
 
 GROWTH = ("long10", "long80")
-"""Two drives of one kind, eight times apart: time per observation and iteration must hardly differ."""
+"""Two drives that differ in length alone, by a factor of 8: the time per observation and iteration must
+hardly differ."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """One traverse, and who solves it how often."""
+    """A simulated traverse, the engines that solve it, and how often they do."""
 
     name: str
     options: SimulationOptions
     engines: tuple[str, ...]
-    """Names of engines that solve it unless others are asked for."""
+    """Names of the engines that solve it unless the user names others."""
     repeats: int
     """Warm solves, of which the fastest counts."""
     seed: int = 0
@@ -35,7 +36,7 @@ class Case:
 
 @dataclass(frozen=True, kw_only=True)
 class Size:
-    """How large a case turned out."""
+    """Counts of a simulated case."""
 
     stops: int
     images: int
@@ -47,7 +48,7 @@ class Size:
 
 @dataclass(frozen=True, kw_only=True)
 class Files:
-    """Where a case was written."""
+    """Files of a case."""
 
     traverse: Path
     """Folder with traverse.json."""
@@ -61,8 +62,8 @@ def _degrees(*tilts: float) -> tuple[float, ...]:
     return tuple(np.deg2rad(tilts).tolist())
 
 
-# Navcam all around. A track may be seen from any side and from up to eight times nearer, so that as many
-# stops see it as the reach allows: what makes long drives hard.
+# Navcam all around. A track may be seen from any side and from up to eight times nearer, so that it is
+# seen by as many stops as the reach allows. This is what makes long drives hard to solve.
 _ALL_AROUND = SimulationOptions(pans=18, noise_px=0.5, min_views=3, max_turn_rad=np.pi, max_zoom=8.0)
 _SMALL = replace(
     _ALL_AROUND, stops=3, tilts_rad=_degrees(-9), points_per_image=35, detection=0.35, reach_m=40.0

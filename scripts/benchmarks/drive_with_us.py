@@ -1,6 +1,6 @@
-"""Follow a traverse folder stop by stop, and say what each stop took and how far the end is from the batch.
+"""Follow a traverse folder stop by stop; print the time of each stop and the difference from the batch.
 
-Prints JSON. Run in a process of its own.
+Prints JSON. It is run in a new process.
 """
 
 import argparse
@@ -54,10 +54,10 @@ def _against_batch(smoother: TraverseSmoother, batch_cost: float) -> dict[str, f
     for i, stop in enumerate(t.stops):
         batch = np.sqrt(np.diag(same.stop_covariance[i]))
         free = batch > 0
-        found = same.final.world_T_mast[i].localCoordinates(estimate.world_T_mast[i])
-        off.append(np.max(np.abs(found[free]) / batch[free], initial=0.0))
-        own = np.sqrt(np.diag(smoother.covariance(stop.id)))
-        sigma_off.append(np.max(np.abs(own[free] / batch[free] - 1), initial=0.0))
+        difference = same.final.world_T_mast[i].localCoordinates(estimate.world_T_mast[i])
+        off.append(np.max(np.abs(difference[free]) / batch[free], initial=0.0))
+        sigma = np.sqrt(np.diag(smoother.covariance(stop.id)))
+        sigma_off.append(np.max(np.abs(sigma[free] / batch[free] - 1), initial=0.0))
     return {
         "cost": smoother.cost,
         "cost_off": smoother.cost / batch_cost - 1,

@@ -1,4 +1,4 @@
-"""Who solves: the engines, whether each can run here, and the processes that measure them."""
+"""Engines of the benchmark: whether each can run here, and the processes in which they are measured."""
 
 import importlib.util
 import json
@@ -26,10 +26,10 @@ __all__ = [
 ]
 
 THREADS = 2
-"""Of Ceres and COLMAP. Ours are as many as the machine has for BLAS, and what the solver itself chooses."""
+"""Threads of Ceres and COLMAP. This package takes as many as BLAS and its own solver choose."""
 
 _SLOWS_BLAS = ("OPENBLAS_CORETYPE", "OPENBLAS_L2_SIZE")
-"""Variables that hold OpenBLAS back where they are set; no engine runs with them."""
+"""Environment variables that slow OpenBLAS; they are removed for every engine."""
 _SCRIPTS = Path(__file__).resolve().parents[1]
 _CERES_HEADER = "ceres/ceres.h"
 _INCLUDE = (Path("/usr/include"), Path("/usr/local/include"))
@@ -38,10 +38,10 @@ _EIGEN = "eigen3"
 
 @dataclass(frozen=True, kw_only=True)
 class Measured:
-    """What an engine took for one case."""
+    """Time, memory and result of an engine on one case."""
 
     seconds: tuple[float, ...]
-    """Wall-clock time of the solve alone, warm, each repeat."""
+    """Wall-clock seconds of each warm solve alone."""
     iterations: int
     cost_final: float
     """Half the sum of squared whitened residuals, priors included."""
@@ -49,9 +49,9 @@ class Measured:
     """Peak of the process that read the problem and solved it once, megabytes."""
     rms_px: float | None = None
     first_s: float | None = None
-    """First solve of a process, preparation and loading of compiled code included."""
+    """Seconds of the first solve of a process, with preparation and loading of compiled code."""
     initialise_s: float | None = None
-    """Preparation before the solve, warm: triangulation and what else is not counted in `seconds`."""
+    """Seconds of preparation before a warm solve: triangulation and what `seconds` does not count."""
     read_s: float | None = None
     detail: str = ""
 
@@ -68,26 +68,26 @@ class Measured:
 
 @dataclass(frozen=True, kw_only=True)
 class NotRun:
-    """Why there are no figures."""
+    """The reason why an engine has no figures for a case."""
 
     reason: str
     failed: bool
-    """True where the engine was there and did not do it; False where it is not installed."""
+    """True if the engine ran and failed; False if it is not installed or was not asked for."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Setting:
-    """What processes of the engines need to know."""
+    """Programs, folders and variables for the processes of the engines."""
 
     ceres: Path | NotRun
     """The compiled Ceres program."""
     numba_cache: Path
-    """Where compiled code is kept, a folder per engine; empty before the first solve ever."""
+    """Folder of compiled code, a subfolder per engine; empty before the first solve ever."""
     environment: Mapping[str, str] = field(default_factory=lambda: dict(os.environ))
-    """Variables that the engines' processes start from."""
+    """Environment variables of the starting process."""
 
     def child_environment(self, engine: str) -> dict[str, str]:
-        """Variables of an engine's processes."""
+        """Environment variables for the processes of an engine."""
         kept = {k: v for k, v in self.environment.items() if k not in _SLOWS_BLAS}
         paths = [str(_SCRIPTS), *filter(None, [kept.get("PYTHONPATH")])]
         return {
@@ -103,11 +103,11 @@ class Engine:
 
     name: str
     title: str
-    """For the table."""
+    """Name in the table."""
     command: Callable[[Files, Setting, int], list[str] | NotRun]
-    """Module of this package and its arguments, for a case, a setting and a number of repeats."""
+    """Makes the command (module of this package, arguments) of a case, a setting and a number of repeats."""
     compiles: bool = False
-    """Whether its first solve ever compiles code that all later ones find on disk."""
+    """Whether its first solve ever compiles code that later ones load from disk."""
     same_problem: bool = True
     """Whether its final cost must be that of the others."""
 
@@ -156,14 +156,14 @@ ENGINES = {
 
 
 def measure(engine: Engine, files: Files, setting: Setting, repeats: int) -> Measured | NotRun:
-    """Solve a case in a process of its own."""
+    """Solve a case in a new process."""
     command = engine.command(files, setting, repeats)
     if isinstance(command, NotRun):
         return command
-    found = run_module(command, setting.child_environment(engine.name))
-    if isinstance(found, NotRun):
-        return found
-    return Measured(**{**found, "seconds": tuple(found["seconds"])})
+    figures = run_module(command, setting.child_environment(engine.name))
+    if isinstance(figures, NotRun):
+        return figures
+    return Measured(**{**figures, "seconds": tuple(figures["seconds"])})
 
 
 def solve_first_ever(engine: Engine, files: Files, setting: Setting) -> float | NotRun:
@@ -174,14 +174,14 @@ def solve_first_ever(engine: Engine, files: Files, setting: Setting) -> float | 
     cache = setting.numba_cache / engine.name
     if cache.exists() and any(cache.iterdir()):
         raise ValueError(f"{cache}: expected an empty folder for compiled code, found files")
-    found = measure(engine, files, setting, 1)
-    if isinstance(found, NotRun):
-        return found
-    return found.first_s if found.first_s is not None else NotRun(reason="not measured", failed=False)
+    measured = measure(engine, files, setting, 1)
+    if isinstance(measured, NotRun):
+        return measured
+    return measured.first_s if measured.first_s is not None else NotRun(reason="not measured", failed=False)
 
 
 def run_module(command: list[str], environment: dict[str, str]) -> dict[str, Any] | NotRun:
-    """What a module of this package prints, run with its arguments in a process of its own."""
+    """JSON that a module of this package prints when it runs with its arguments in a new process."""
     done = subprocess.run(
         [sys.executable, "-m", *command],
         env=environment,
@@ -197,7 +197,7 @@ def run_module(command: list[str], environment: dict[str, str]) -> dict[str, Any
 
 
 def ceres_program(given: Path | None, source: Path | None, folder: Path) -> Path | NotRun:
-    """The Ceres program: as given, or compiled from `source` into `folder`, or why there is none."""
+    """Path of the Ceres program, given or compiled from `source` into `folder`; else why there is none."""
     if given is not None:
         if given.is_file() and os.access(given, os.X_OK):
             return given.resolve()

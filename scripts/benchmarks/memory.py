@@ -1,4 +1,4 @@
-"""How much memory a process took at most."""
+"""Peak memory of a process."""
 
 import resource
 import sys
@@ -10,7 +10,7 @@ __all__ = ["peak_memory_mb"]
 def peak_memory_mb() -> float:
     """Largest resident memory of this process so far, megabytes (1e6 bytes).
 
-    On Linux from the address space itself: ru_maxrss would count the process that started this one, too.
+    On Linux it is read from /proc: ru_maxrss would also count the process that started this one.
     """
     status = Path("/proc/self/status")
     if status.exists():

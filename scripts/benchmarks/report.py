@@ -1,4 +1,4 @@
-"""What was found: ratios between engines, whether they are as good as the baseline, a table, a file."""
+"""Report of a benchmark: ratios between engines, their comparison with the baseline, a table, a file."""
 
 import importlib.metadata
 import json
@@ -23,24 +23,24 @@ __all__ = [
 ]
 
 COST_TOLERANCE = 1e-4
-"""Relative difference of final costs between engines that solve the same problem."""
+"""Largest relative difference of final costs between engines that solve the same problem."""
 GROWTH_LIMIT = 1.3
-"""Of the time per observation and iteration, from the shorter to the longer drive of GROWTH."""
+"""Largest growth of the time per observation and iteration from the shorter to the longer drive of GROWTH."""
 
 _FORMAT, _VERSION = "pancam-graph/benchmark-baseline", 1
 _PACKAGES = ("pancam-graph", "gtsam", "numpy", "numba", "scipy", "pycolmap")
 
 
 def machine() -> dict[str, str]:
-    """What the figures were measured on."""
-    found = {
+    """Processor, system and versions of packages on which the figures were measured."""
+    about = {
         "platform": platform.platform(),
         "processor": _processor(),
         "cores": str(os.cpu_count()),
         "python": platform.python_version(),
     }
     installed = {d.name.lower(): d.version for d in importlib.metadata.distributions() if d.name}
-    return {**found, **{p: installed[p] for p in _PACKAGES if p in installed}}
+    return {**about, **{p: installed[p] for p in _PACKAGES if p in installed}}
 
 
 def _processor() -> str:
@@ -54,21 +54,21 @@ def _processor() -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class CaseResult:
-    """One case: how large, and what each engine took."""
+    """Size of a case, and the figures of each engine on it."""
 
     name: str
     size: Size
     engines: Mapping[str, Measured | NotRun]
 
     def measured(self, engine: str) -> Measured | None:
-        """Figures of an engine, if there are any."""
-        found = self.engines.get(engine)
-        return found if isinstance(found, Measured) else None
+        """Figures of an engine; None if it did not run."""
+        outcome = self.engines.get(engine)
+        return outcome if isinstance(outcome, Measured) else None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """A whole run."""
+    """Figures of all cases of a run."""
 
     cases: tuple[CaseResult, ...]
     first_ever_s: Mapping[str, float] = field(default_factory=dict)
@@ -77,16 +77,16 @@ class Report:
 
     def ratios(self) -> dict[str, float]:
         """Solve time of ours over the peer's, best to best, and the growth with length; no absolute times."""
-        found = {}
+        ratios = {}
         for case in self.cases:
             for ours, other in (("eliminated", "ceres"), ("explicit", "ceres"), ("eliminated", "explicit")):
                 a, b = case.measured(ours), case.measured(other)
                 if a and b:
-                    found[f"{case.name}: {ours} / {other}"] = a.best_s / b.best_s
+                    ratios[f"{case.name}: {ours} / {other}"] = a.best_s / b.best_s
         growth = self.growth()
         if growth is not None:
-            found[f"{GROWTH[1]} / {GROWTH[0]}: time per observation and iteration"] = growth
-        return found
+            ratios[f"{GROWTH[1]} / {GROWTH[0]}: time per observation and iteration"] = growth
+        return ratios
 
     def growth(self, *, per_iteration: bool = True) -> float | None:
         """Time per observation (and iteration) of the longer drive over that of the shorter one."""
@@ -101,23 +101,23 @@ class Report:
         return each[1] / each[0]
 
     def complaints(self) -> list[str]:
-        """What is wrong whatever the baseline says: failures, costs that differ, growth."""
+        """Faults that need no baseline: engines that failed, costs that differ, growth of the time."""
         return [*self._failures(), *self._disagreements(), *self._growth_complaint()]
 
     def _failures(self) -> Iterator[str]:
         for case in self.cases:
-            for name, found in case.engines.items():
-                if isinstance(found, NotRun) and found.failed:
-                    yield f"{case.name}: {name} failed: {found.reason}"
-                if isinstance(found, Measured) and "not converged" in found.detail:
-                    yield f"{case.name}: {name}: {found.detail}"
+            for name, outcome in case.engines.items():
+                if isinstance(outcome, NotRun) and outcome.failed:
+                    yield f"{case.name}: {name} failed: {outcome.reason}"
+                if isinstance(outcome, Measured) and "not converged" in outcome.detail:
+                    yield f"{case.name}: {name}: {outcome.detail}"
 
     def _disagreements(self) -> Iterator[str]:
         for case in self.cases:
             costs = {
-                name: found.cost_final
-                for name, found in case.engines.items()
-                if isinstance(found, Measured) and ENGINES[name].same_problem
+                name: outcome.cost_final
+                for name, outcome in case.engines.items()
+                if isinstance(outcome, Measured) and ENGINES[name].same_problem
             }
             reference = "ceres" if "ceres" in costs else next(iter(costs), "")
             for name, cost in costs.items():
@@ -137,14 +137,14 @@ class Report:
             )
 
     def notes(self) -> list[str]:
-        """What is missing and why, what Ceres did, and what belongs to no line of the table."""
+        """Lines below the table: engines that were skipped and why, and details of the others."""
         lines = []
         for case in self.cases:
-            for name, found in case.engines.items():
-                if isinstance(found, NotRun) and not found.failed:
-                    lines.append(f"{case.name}: {name} skipped: {found.reason}")
-                elif isinstance(found, Measured) and found.detail:
-                    lines.append(f"{case.name}: {name}: {found.detail}")
+            for name, outcome in case.engines.items():
+                if isinstance(outcome, NotRun) and not outcome.failed:
+                    lines.append(f"{case.name}: {name} skipped: {outcome.reason}")
+                elif isinstance(outcome, Measured) and outcome.detail:
+                    lines.append(f"{case.name}: {name}: {outcome.detail}")
         for name, seconds in self.first_ever_s.items():
             lines.append(f"{name}: first solve ever, code compiled on the way: {seconds:.1f} s")
         growth, whole = self.growth(), self.growth(per_iteration=False)
@@ -185,12 +185,12 @@ class Report:
         return "\n".join(lines)
 
     def text(self, changes: Sequence[str], faults: Sequence[str]) -> str:
-        """What is printed: the table, notes and changes of ratios, and last what is wrong."""
+        """Text to print: the table, notes, changes of ratios, and faults last."""
         listed = [f"- {line}" for line in (*self.notes(), *changes)]
         return "\n".join([self.markdown(), "", *listed, *(f"ERROR {line}" for line in faults)])
 
     def to_json(self) -> str:
-        """Everything, absolute times included."""
+        """All figures as JSON, absolute times included."""
         cases = {
             c.name: {"size": asdict(c.size), "engines": {name: asdict(e) for name, e in c.engines.items()}}
             for c in self.cases

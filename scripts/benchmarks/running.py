@@ -13,9 +13,9 @@ _CERES_SOURCE = Path(__file__).resolve().parents[3] / "shared" / "bench" / "peer
 
 
 def prepare(cases: Sequence[Case], folder: Path, ceres: Path | None) -> Setting:
-    """What the engines need: an empty cache under `folder`, and the Ceres program if a case wants it.
+    """The setting of a run: an empty cache under `folder`, and the Ceres program if a case needs it.
 
-    `ceres` is the program; None: compiled from ../shared/bench where that is possible.
+    `ceres` is the program; if None, it is compiled from ../shared/bench where that is possible.
     """
     wanted = any("ceres" in case.engines for case in cases)
     return Setting(
@@ -36,7 +36,7 @@ def run_cases(
     """Make each case in a new folder under `folder` and let its engines solve it, one after the other.
 
     Before that, an engine that compiles code solves its smallest case with nothing compiled, which leaves
-    the code for all others. `say` is told what goes on.
+    the code on disk for all others. `say` gets a sentence before each step.
     """
     made = {}
     for case in cases:
@@ -48,9 +48,9 @@ def run_cases(
         if solved:
             say(f"{name}: first solve ever")
             files, _ = min(solved, key=lambda files_size: files_size[1].observations)
-            found = solve_first_ever(ENGINES[name], files, setting)
-            if not isinstance(found, NotRun):  # if it failed, it fails again below and is reported there
-                first_ever_s[name] = found
+            first_s = solve_first_ever(ENGINES[name], files, setting)
+            if not isinstance(first_s, NotRun):  # if it failed, it fails again below and is reported there
+                first_ever_s[name] = first_s
     results = []
     for case in cases:
         files, size = made[case.name]

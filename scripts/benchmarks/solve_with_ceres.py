@@ -40,13 +40,13 @@ def main() -> None:
     program = os.path.abspath(arguments.program)  # noqa: PTH100  pathlib would enlarge this process
     tried = {s: solve(program, arguments.peer, s, arguments.threads) for s in arguments.solvers}
     best = min(tried, key=lambda s: tried[s][0]["seconds"])
-    found, memory_mb = tried[best]
+    fastest, memory_mb = tried[best]
     again = [solve(program, arguments.peer, best, arguments.threads)[0] for _ in range(arguments.repeats - 1)]
     others = ", ".join(f"{s} {r['seconds']:.3g} s" for s, (r, _) in tried.items() if s != best)
     measured = {
-        "seconds": [found["seconds"], *(r["seconds"] for r in again)],
-        "iterations": found["iterations"],
-        "cost_final": found["final_cost"],
+        "seconds": [fastest["seconds"], *(r["seconds"] for r in again)],
+        "iterations": fastest["iterations"],
+        "cost_final": fastest["final_cost"],
         "memory_mb": memory_mb,
         "detail": f"{best} Schur, {arguments.threads} threads" + (f"; {others}" if others else ""),
     }

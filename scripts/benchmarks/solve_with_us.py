@@ -1,4 +1,4 @@
-"""Solve a traverse folder with this package and print what it took, as JSON. Run in a process of its own."""
+"""Solve a traverse folder with this package and print time, memory and cost as JSON, in a new process."""
 
 import argparse
 import json

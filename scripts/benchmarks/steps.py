@@ -1,4 +1,4 @@
-"""Where the time of one run goes, step by step."""
+"""Time of each step of a run."""
 
 import time
 from collections.abc import Callable
@@ -9,7 +9,7 @@ __all__ = ["Steps"]
 
 @dataclass
 class Steps:
-    """Wall-clock and processor time by step, in the order in which the steps were first heard of."""
+    """Wall-clock and processor time of each step, in the order in which steps first ended."""
 
     wall: Callable[[], float] = time.perf_counter
     processor: Callable[[], float] = time.process_time
@@ -21,7 +21,7 @@ class Steps:
         self._last = self.wall(), self.processor()
 
     def done(self, step: str, *_: object) -> None:
-        """All time since the last call was spent on this step; what else is given is ignored."""
+        """Add the time since the last call to this step; further arguments are ignored."""
         now = self.wall(), self.processor()
         wall_s, processor_s = self.seconds.get(step, (0.0, 0.0))
         self.seconds[step] = wall_s + now[0] - self._last[0], processor_s + now[1] - self._last[1]

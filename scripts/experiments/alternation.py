@@ -1,4 +1,4 @@
-"""The joint solver against the thesis's own: regular and shared parameters in turn."""
+"""The joint solver against that of the thesis, which solves regular and shared parameters in turn."""
 
 from dataclasses import dataclass, replace
 
@@ -14,7 +14,10 @@ __all__ = ["NAME", "STEPS", "AlternationTask"]
 
 NAME = "joint against alternation"
 STEPS = (3, 10, 30, 100)
-"""After so many steps costs are compared. More are not taken; not to have converged by then is no failure."""
+"""Numbers of steps after which costs are compared.
+
+No solve takes more than the last; one that has not converged by then does not count as failed.
+"""
 _MODELS: tuple[Model, ...] = ("mast", "circle", "free")
 _METHODS: tuple[Method, ...] = ("joint", "alternation")
 
@@ -57,6 +60,9 @@ class AlternationTask:
 
 
 def _metrics(history: tuple[float, ...], best: float) -> dict[str, float]:
-    """How far above the best cost of both a solver is after so many steps; where it ends, it stays."""
-    found = {f"excess_after_{n}_steps": history[min(n, len(history) - 1)] / best - 1 for n in STEPS}
-    return {**found, "iterations": float(len(history) - 1)}
+    """Relative excess of the cost over the best of both solvers after each number of STEPS.
+
+    A solver that has ended keeps its last cost.
+    """
+    excess = {f"excess_after_{n}_steps": history[min(n, len(history) - 1)] / best - 1 for n in STEPS}
+    return {**excess, "iterations": float(len(history) - 1)}

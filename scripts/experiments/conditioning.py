@@ -18,20 +18,20 @@ _AWAY = np.array([0.6, -0.8, 0.0])
 
 
 def name_of(origin_m: float) -> str:
-    """Of the experiment."""
+    """Name of the experiment with the world's origin this far away."""
     return f"conditioning, origin {origin_m:g} m away"
 
 
 @dataclass(frozen=True, kw_only=True)
 class ConditioningTask:
-    """One seed of a cluster, the origin at every distance; its optimum is the same."""
+    """One seed of a cluster with the origin at every distance, which does not change the optimum."""
 
     scenario: Scenario
     noise_px: float
     seed: int
 
     def run(self) -> list[Sample]:
-        """Solve with both at each distance."""
+        """Solve with and without conditioning at each distance."""
         traverse = self.scenario.simulate(self.noise_px, self.seed).traverse
         return [
             self._sample(_elsewhere(traverse, origin_m), origin_m, normalise=normalise)
@@ -61,7 +61,7 @@ class ConditioningTask:
 
 
 def _elsewhere(traverse: Traverse, origin_m: float) -> Traverse:
-    """The traverse in a world whose origin is so far from it."""
+    """The traverse, shifted by this distance from the world's origin."""
     shift = origin_m * _AWAY
     stops = tuple(
         replace(

@@ -1,7 +1,7 @@
-"""Errors of a solution against the truth, after an alignment that takes away what no image tells.
+"""Errors of a solution against the truth, after an alignment in the directions that no image determines.
 
-A similarity, estimated on the camera centres alone (Umeyama 1991), is applied to centres and landmarks, so
-that both are seen in one frame. Rotations are aligned by their own mean: a circle of 0.14 m turns with the
+A similarity, estimated on the camera centres alone (Umeyama 1991), is applied to centres and landmarks, which
+brings both into one frame. Rotations are aligned by their own mean: a circle of 0.14 m turns with the
 millimetres of its centres. Where a stop's place is asked for, nothing may be scaled: there the first stop's
 cameras are laid on the true ones by a rigid motion.
 """
@@ -27,7 +27,7 @@ __all__ = [
 ]
 
 NEAR_M = 5.0
-"""Landmarks nearer than this to the mast nearest to them are near ones."""
+"""A landmark is near if its distance from the nearest mast is below this."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -69,10 +69,10 @@ def mean_rotation(rotations: FloatArray) -> FloatArray:
 
 
 def errors_of(solution: Solution, simulation: Simulation) -> dict[str, float]:
-    """Every metric of a simulated traverse's solution, by name; the unit is the name's end.
+    """Every metric of the solution of a simulated traverse, by name; a name ends with its unit.
 
-    Landmarks that the solution has beyond infinity count where they are: far off. One that it has not at all
-    makes the metrics of landmarks NaN.
+    A landmark that the solution places beyond infinity counts at its place, far off. One that the solution
+    does not have makes the metrics of landmarks NaN.
     """
     t, truth, final = solution.traverse, simulation.truth, solution.final
     true_R, true_t = _true_cameras(simulation)
@@ -80,7 +80,7 @@ def errors_of(solution: Solution, simulation: Simulation) -> dict[str, float]:
     centre = aligned.points(final.world_t_camera) - true_t
     mean = mean_rotation(true_R @ final.world_R_camera.transpose(0, 2, 1))
     turn = true_R.transpose(0, 2, 1) @ mean @ final.world_R_camera
-    found: dict[str, float] = {
+    metrics: dict[str, float] = {
         "centre_mm": 1e3 * _rms(centre),
         "rotation_mrad": 1e3 * float(np.sqrt(np.mean(_angle_rad(turn) ** 2))),
         "scale_percent": 100 * abs(aligned.scale - 1),
@@ -89,14 +89,14 @@ def errors_of(solution: Solution, simulation: Simulation) -> dict[str, float]:
     error = aligned.points(final.landmarks_m) - landmarks
     masts = np.array([pose.translation() for pose in truth.world_T_mast])
     is_near = np.linalg.norm(landmarks[:, None] - masts, axis=2).min(axis=1) < NEAR_M
-    own = umeyama(final.landmarks_m[is_near], landmarks[is_near]) if is_near.any() else aligned
-    found |= {
+    on_near = umeyama(final.landmarks_m[is_near], landmarks[is_near]) if is_near.any() else aligned
+    metrics |= {
         "landmark_m": _rms(error),
         "landmark_median_m": float(np.median(np.linalg.norm(error, axis=1))),
         "landmark_near_m": _rms(error[is_near]),
         "landmark_far_m": _rms(error[~is_near]),
         "landmark_near_aligned_on_itself_m": _rms(
-            own.points(final.landmarks_m[is_near]) - landmarks[is_near]
+            on_near.points(final.landmarks_m[is_near]) - landmarks[is_near]
         ),
         "focal_percent": _focal_percent(solution, simulation),
         "reprojection_px": solution.rms_final_px,
@@ -111,15 +111,17 @@ def errors_of(solution: Solution, simulation: Simulation) -> dict[str, float]:
                 for s in range(len(t.stops))
             ]
         )
-        found["centre_within_mm"] = 1e3 * _rms(by_itself)
-        found["distance_aligned_percent"] = distances_percent(t, aligned.points(final.world_t_camera), true_t)
-        found["distance_percent"] = distances_percent(t, final.world_t_camera, true_t)
+        metrics["centre_within_mm"] = 1e3 * _rms(by_itself)
+        metrics["distance_aligned_percent"] = distances_percent(
+            t, aligned.points(final.world_t_camera), true_t
+        )
+        metrics["distance_percent"] = distances_percent(t, final.world_t_camera, true_t)
         first = stop == 0
         rotation = mean_rotation(true_R[first] @ final.world_R_camera[first].transpose(0, 2, 1))
         ahead = (places[-1] - places[0]) @ rotation.T - (true_places[-1] - true_places[0])
         travelled = np.linalg.norm(np.diff(true_places, axis=0), axis=1).sum()
-        found["localisation_percent"] = 100 * float(np.linalg.norm(ahead) / travelled)
-    return found
+        metrics["localisation_percent"] = 100 * float(np.linalg.norm(ahead) / travelled)
+    return metrics
 
 
 def _true_cameras(simulation: Simulation) -> tuple[FloatArray, FloatArray]:
@@ -132,8 +134,8 @@ def _true_cameras(simulation: Simulation) -> tuple[FloatArray, FloatArray]:
 def _focal_percent(solution: Solution, simulation: Simulation) -> float:
     """RMS over images of the relative error of fx and fy."""
     true = replace(simulation.traverse, rig=simulation.truth.rig).calibration
-    found = solution.calibration
-    ratio = found[:, [0, 1], [0, 1]] / true[:, [0, 1], [0, 1]]
+    calibration = solution.calibration
+    ratio = calibration[:, [0, 1], [0, 1]] / true[:, [0, 1], [0, 1]]
     return 100 * float(np.sqrt(np.mean((ratio - 1) ** 2)))
 
 
@@ -152,8 +154,8 @@ def distances_percent(traverse: Traverse, centre_m: FloatArray, true_m: FloatArr
     """RMS over pairs of stops of the relative error of the distance of their places."""
     places, true_places = places_m(traverse, centre_m), places_m(traverse, true_m)
     pairs = np.array(list(combinations(range(len(places)), 2)))
-    found, true = (np.linalg.norm(p[pairs[:, 1]] - p[pairs[:, 0]], axis=1) for p in (places, true_places))
-    return 100 * float(np.sqrt(np.mean((found / true - 1) ** 2)))
+    estimated, true = (np.linalg.norm(p[pairs[:, 1]] - p[pairs[:, 0]], axis=1) for p in (places, true_places))
+    return 100 * float(np.sqrt(np.mean((estimated / true - 1) ** 2)))
 
 
 def _rms(vectors: FloatArray) -> float:

@@ -117,10 +117,10 @@ def _localisation(plt: ModuleType, results: Results) -> Any:
     models = results.models(shown[0])
     for i, model in enumerate(models):
         for row, name in enumerate(shown):
-            found = results.get(name, model, results.noises(name)[0], "localisation_percent")
-            if found is None:
+            entry = results.get(name, model, results.noises(name)[0], "localisation_percent")
+            if entry is None:
                 continue
-            _interval(ax, found, row + 0.17 * (i - (len(models) - 1) / 2), model, label=row == 0)
+            _interval(ax, entry, row + 0.17 * (i - (len(models) - 1) / 2), model, label=row == 0)
     ax.set_yticks(range(len(shown)), shown)
     ax.invert_yaxis()
     ax.set(

@@ -1,4 +1,4 @@
-"""Models as the experiments solve them: same observations and telemetry, priors that let images decide."""
+"""Options of each model in the experiments: the same observations, priors so wide that images decide."""
 
 from dataclasses import dataclass, field
 
@@ -17,14 +17,17 @@ from pancam_graph.solve import fit, judge, prepare, screen, solution_of
 __all__ = ["FREE_FLEX", "KNOWN_RIG", "RIG_OFF", "ClusterTask", "Variant", "variant"]
 
 FREE_FLEX = Flex(rotation_rad=0.02, translation_m=0.3)
-"""Of the models without a mast: rotations as loose as pan, centres so loose that telemetry says little of a
-circle of 0.14 m. With 0.1 m or 1 m aligned errors are the same within a few percent; with 1 m the scale of
-several clusters, which nothing but odometry tells, takes a hundred iterations."""
+"""Flex of the models without a mast: rotations as loose as pan, centres so loose that telemetry hardly
+constrains a circle of 0.14 m.
+
+With 0.1 m or 1 m aligned errors are the same within a few percent; with 1 m the scale of several clusters,
+which odometry alone determines, takes a hundred iterations to settle.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Variant:
-    """A model, and what of the rig is free."""
+    """A model, and the quantities of the rig that are free."""
 
     model: str
     sharing: str
@@ -32,7 +35,7 @@ class Variant:
 
 
 def variant(model: Model, sharing: str) -> Variant:
-    """A model as the experiments solve it."""
+    """The variant of a model with a way of sharing: "fixed", "shared" or "unshared"."""
     options = SolveOptions(
         model=model,
         loss="none",
@@ -46,7 +49,7 @@ def variant(model: Model, sharing: str) -> Variant:
 
 
 def _sharing(model: Model, name: str) -> Sharing | None:
-    """What of the rig is free: shared by the whole traverse, or as little shared as the model can bear."""
+    """Free quantities of the rig: shared by the whole traverse, or as little as the model allows."""
     if name == "fixed" or model == "projective":
         return None
     shared = name == "shared"
@@ -61,11 +64,11 @@ def _sharing(model: Model, name: str) -> Sharing | None:
 _WITH_RIG: tuple[Model, ...] = ("mast", "circle", "free")
 _PROJECTIVE = variant("projective", "unshared")
 KNOWN_RIG = (*(variant(model, "fixed") for model in _WITH_RIG), _PROJECTIVE)
-"""For the rig that the simulation had. `circle` finds the radius of each eye always, `projective` a
-calibration of each image."""
+"""Variants for solvers that know the true rig. `circle` always estimates the radius of each eye, `projective`
+the calibration of each image."""
 RIG_OFF = tuple(variant(model, name) for model in _WITH_RIG for name in ("fixed", "shared", "unshared"))
-"""For a rig that is not quite the true one. Not `projective`: its tie to the rig's calibration is wider than
-these errors by far."""
+"""Variants for solvers that are given a slightly wrong rig. `projective` is left out: its tie to the rig's
+calibration is much wider than these errors."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +109,7 @@ def _measured(simulation: Simulation, options: SolveOptions, seed: int) -> dict[
 
 
 def _require_whole(solution: Solution) -> None:
-    """Raise SolveError for what counts as failed."""
+    """Raise SolveError for a solution that counts as failed."""
     if not solution.converged:
         raise SolveError(f"not converged: {solution.stop_reason}")
     lost = int((~solution.used).sum())

@@ -65,7 +65,7 @@ class OpportunityTask:
 
 def _measured(traverse: Traverse, options: SolveOptions) -> dict[str, float]:
     solution = solve(traverse, options)
-    found = cross_validate(traverse, options, solution=solution)
+    validated = cross_validate(traverse, options, solution=solution)
     length = np.linalg.norm(solution.residual_final_px[solution.used], axis=1)
     off = _off_circle_m(solution)
     metrics = {
@@ -77,11 +77,11 @@ def _measured(traverse: Traverse, options: SolveOptions) -> dict[str, float]:
     }
     splittings: tuple[Splitting, ...] = ("random", "upper_lower")
     for splitting in splittings:
-        measured, expected = found.score_px(splitting)
+        measured, expected = validated.score_px(splitting)
         metrics[f"held_out_{splitting}_px"] = measured
         metrics[f"held_out_{splitting}_expected_px"] = expected
-    sigmas = found.relative_pointing
-    for (i, j), formal, honest in zip(found.pairs, sigmas.formal, sigmas.honest, strict=True):
+    sigmas = validated.relative_pointing
+    for (i, j), formal, honest in zip(validated.pairs, sigmas.formal, sigmas.honest, strict=True):
         for k, angle in enumerate(("pan", "tilt")):
             metrics[f"relative_{angle}_formal_{i + 1}_{j + 1}_mrad"] = 1e3 * float(formal[k])
             metrics[f"relative_{angle}_honest_{i + 1}_{j + 1}_mrad"] = 1e3 * float(honest[k])

@@ -1,4 +1,4 @@
-"""Writing results: whole or not at all, and never over something."""
+"""Writing results: complete or not at all, and never over existing files."""
 
 import json
 import tempfile
@@ -25,7 +25,7 @@ def write_results(samples: Sequence[Sample], left_out: Sequence[str], out: Path)
     require_new(out)
     rows = summarise(samples)
     results = Results(rows)
-    found = verdicts(results)
+    judged = verdicts(results)
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as beside:
         folder = Path(beside) / "results"
@@ -35,7 +35,7 @@ def write_results(samples: Sequence[Sample], left_out: Sequence[str], out: Path)
         (folder / "results.json").write_text(text + "\n", encoding="utf-8")
         figures = draw(results, folder)
         (folder / "results.md").write_text(
-            results_text(rows, samples, found, left_out, figures), encoding="utf-8"
+            results_text(rows, samples, judged, left_out, figures), encoding="utf-8"
         )
         folder.rename(out)
-    return found
+    return judged

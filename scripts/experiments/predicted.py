@@ -1,6 +1,6 @@
-"""Errors as a solution's own covariance predicts them: draws from it, aligned as the real errors are.
+"""Errors that a solution's covariance predicts: draws from the covariance, aligned as the real errors are.
 
-It tells apart what a model does badly from what the information that it is given does not tell.
+They separate the faults of a model from the limits of the information that it is given.
 """
 
 from dataclasses import replace
@@ -15,13 +15,13 @@ from pancam_graph.solve._joint import retracted
 __all__ = ["DRAWS", "predicted_errors"]
 
 DRAWS = 25
-"""Of each solution; over 50 seeds that is a median of 1250."""
+"""Draws from the covariance of each solution; over 50 seeds the median is of 1250."""
 
 
 def predicted_errors(judged: Judged, seed: int) -> dict[str, float]:
     """Medians over draws of the errors of centres and distances that a finished solve predicts for itself.
 
-    Nothing where it has no covariance.
+    The dictionary is empty for a solution without covariance.
     """
     if not np.isfinite(judged.uncertainty.stop_covariance).all():
         return {}
@@ -40,10 +40,10 @@ def predicted_errors(judged: Judged, seed: int) -> dict[str, float]:
         centre_mm.append(1e3 * _rms(aligned_centres(drawn, place) - place))
         if len(t.stops) > 1:
             distance_percent.append(distances_percent(t, drawn, place))
-    found = {"centre_predicted_mm": float(np.median(centre_mm))}
+    medians = {"centre_predicted_mm": float(np.median(centre_mm))}
     if distance_percent:
-        found["distance_predicted_percent"] = float(np.median(distance_percent))
-    return found
+        medians["distance_predicted_percent"] = float(np.median(distance_percent))
+    return medians
 
 
 def _rms(vectors: FloatArray) -> float:

@@ -1,4 +1,4 @@
-"""Which experiments there are, how large, and which are left out here."""
+"""The experiments, their sizes, and those that cannot be run here."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ CLUSTERS = (
     Scenario(name="three clusters, both eyes", eyes="both eyes", stops=3),
 )
 DENSE = Scenario(name="one cluster, one eye, 150 points per image", eyes="one eye", points_per_image=150)
-"""The same with six times as many tracks: how much of the difference between models is left."""
+"""The first cluster with six times as many tracks, which shows how much models still differ."""
 RIG_OFF_CLUSTERS = tuple(replace(c, name=f"{c.name}, rig not quite known", rig_off=True) for c in CLUSTERS)
 _PANORAMAS: tuple[tuple[Eyes, int], ...] = (
     ("both eyes", 5),
@@ -57,14 +57,14 @@ FAMILIES = ("validation", "clusters", "alternation", "conditioning", "localisati
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What is run, and what is not and why."""
+    """Tasks to run, and a sentence for each experiment that is left out."""
 
     tasks: tuple[Task, ...]
     left_out: tuple[str, ...]
 
 
 def plan(*, seeds: int, quick: bool, families: Sequence[str] = FAMILIES) -> Plan:
-    """The tasks of some families of experiments, each over so many seeds."""
+    """The tasks of some families of experiments, each over this number of seeds."""
     tasks: list[Task] = []
     left_out: list[str] = []
     few = min(seeds, max(2, seeds // 5))

@@ -20,16 +20,16 @@ class Sample:
     model: str
     sharing: str
     noise_px: float | None
-    """None: real images."""
+    """Noise of an observation; None for real images."""
     seed: int
     metrics: Mapping[str, float] = field(default_factory=dict, hash=False)
     failure: str = ""
-    """Why it failed; "" if it did not."""
+    """Reason of a failure; "" for a solve that did not fail."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """What all seeds say of one metric: an entry of results.json."""
+    """Median and interval of one metric over all seeds: an entry of results.json."""
 
     experiment: str
     model: str
@@ -38,14 +38,14 @@ class Row:
     seeds: int
     metric: str
     median: float
-    """By rank, a failed run the worst of all: infinite where half of the runs failed."""
+    """Median by rank, where a failed run is the worst: infinite if half of the runs failed."""
     q05: float
     q95: float
     failed: int
-    """How many of the seeds."""
+    """Number of seeds whose run failed."""
 
     def to_json(self) -> dict[str, str | int | float | None]:
-        """The entry; JSON knows no infinity, null stands for it."""
+        """The entry, with null for infinity, which JSON does not have."""
         return {k: None if isinstance(v, float) and math.isinf(v) else v for k, v in vars(self).items()}
 
 
@@ -58,7 +58,7 @@ class Task(Protocol):
 
 
 def attempt(measure: Callable[[], dict[str, float]]) -> tuple[dict[str, float], str]:
-    """Metrics, and why the run counts as failed: it raised, or a metric is not a number."""
+    """Metrics, and the reason of a failure ("" for none): an exception, or a metric that is not finite."""
     try:
         metrics = measure()
     except PancamGraphError as error:
@@ -71,13 +71,13 @@ def run_tasks(
     tasks: Sequence[Task], *, processes: int, progress: Callable[[str, int, int], None] | None = None
 ) -> list[Sample]:
     """Samples of all tasks in their order, whatever the number of processes."""
-    found: list[list[Sample]] = []
-    # The last are the longest: begun first, they leave no process alone at the end.
+    of_tasks: list[list[Sample]] = []
+    # The last tasks are the longest. Begun first, they do not leave one process busy alone at the end.
     for done, samples in enumerate(_results(tasks[::-1], processes), start=1):
-        found.append(samples)
+        of_tasks.append(samples)
         if progress is not None:
             progress("running", done, len(tasks))
-    return [sample for samples in reversed(found) for sample in samples]
+    return [sample for samples in reversed(of_tasks) for sample in samples]
 
 
 def _results(tasks: Sequence[Task], processes: int) -> Iterator[list[Sample]]:
@@ -90,7 +90,7 @@ def _results(tasks: Sequence[Task], processes: int) -> Iterator[list[Sample]]:
 
 
 def _work_alone() -> None:
-    """In a process beside others: one thread each, whose number changes no bit of a result."""
+    """Use one thread in a process beside others; the number of threads changes no bit of a result."""
     os.environ.setdefault("PANCAM_GRAPH_THREADS", "1")
 
 
@@ -99,9 +99,9 @@ def _run(task: Task) -> list[Sample]:
 
 
 def quantile(values: Sequence[float], share: float) -> float:
-    """The smallest value that at least a share of all do not exceed: by rank, so that infinite ones count.
+    """The smallest value that at least this share of all values does not exceed; infinite values count.
 
-    A value that is not a number is the worst of all.
+    NaN ranks as infinite.
     """
     ordered = sorted(math.inf if math.isnan(v) else v for v in values)
     return ordered[max(0, math.ceil(share * len(ordered) - 1e-9) - 1)]
@@ -110,8 +110,8 @@ def quantile(values: Sequence[float], share: float) -> float:
 def summarise(samples: Sequence[Sample]) -> list[Row]:
     """Medians and 90 % intervals over seeds of each metric, in the order of the samples.
 
-    A failed run is infinite in every metric. Where all runs of a model failed, it has the metrics that other
-    models of the experiment have.
+    A failed run is infinite in every metric. A model whose runs all failed gets the metrics of the other
+    models of the experiment.
     """
     groups: dict[tuple[str, str, str, float | None], list[Sample]] = {}
     everywhere: dict[str, dict[str, None]] = {}
@@ -120,8 +120,8 @@ def summarise(samples: Sequence[Sample]) -> list[Row]:
         everywhere.setdefault(s.experiment, {}).update(dict.fromkeys(s.metrics))
     rows = []
     for (experiment, model, sharing, noise_px), group in groups.items():
-        own = dict.fromkeys(name for s in group for name in s.metrics) or everywhere[experiment]
-        for metric in own:
+        metrics = dict.fromkeys(name for s in group for name in s.metrics) or everywhere[experiment]
+        for metric in metrics:
             values = [math.inf if s.failure else s.metrics.get(metric, math.inf) for s in group]
             rows.append(
                 Row(

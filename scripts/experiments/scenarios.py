@@ -15,14 +15,14 @@ NOISES_PX = (0.1, 0.2, 0.5, 1.0, 2.0)
 Eyes = Literal["one eye", "both eyes"]
 
 LOOSE_PAN_RAD = 0.02
-"""Sigma that solvers are told of pan: fifteen times that of its errors, so that images decide."""
+"""Sigma of pan that solvers are given: fifteen times that of its errors, so that images decide."""
 _FOCAL_ERROR, _MOUNT_ERROR_RAD, _MOUNT_ERROR_M = 3e-3, 5e-3, 2e-3
-"""Sigmas of errors of a rig that is not quite known: those of the package's priors."""
+"""Sigmas of the errors of a slightly wrong rig: those of the package's priors."""
 _STEP_RAD = np.deg2rad(20.0)
-"""From frame to frame. The field is 45 degrees: most points are seen by two frames, a strip by three, which
-alone joins the depths of one pair of frames to those of the next. The centres are 5 cm apart."""
+"""Pan from frame to frame. The field is 45 degrees: most points are seen by two frames, a strip by three;
+that strip alone ties the depths of one pair of frames to those of the next. The centres are 5 cm apart."""
 _TILT_RAD = float(np.deg2rad(-15.0))
-"""The ground from 2 m on, and the horizon."""
+"""Tilt of all frames, which shows the ground from 2 m on and the horizon."""
 
 
 def navcam(eyes: Eyes) -> Rig:
@@ -39,24 +39,24 @@ class Scenario:
     eyes: Eyes
     stops: int = 1
     images: int = 18
-    """Of each stop."""
+    """Number of images of each stop."""
     spacing_m: float = 8.0
     points_per_image: int = 25
     reach_m: float = 20.0
-    """Where a neighbour 5 cm away sees a parallax of 3 pixels."""
+    """Distance of the farthest points: two centres 5 cm apart see a parallax of 3 pixels there."""
     odometry: float = 0.06
     """Sigma of each component of a stop's place, as a share of the spacing."""
     rig_off: bool = False
-    """Whether solvers are told a rig that is not quite the true one (focal lengths and mounts)."""
+    """Whether solvers are given a slightly wrong rig (focal lengths and mounts)."""
 
     def simulate(self, noise_px: float, seed: int) -> Simulation:
-        """The simulation; another noise leaves all but the noise alone.
+        """The simulation; between noises only the noise differs.
 
-        Telemetry starts with the errors of the rig's encoders (1.3 mrad) and of coarse odometry. Solvers are
-        told the sigmas of these but for pan (LOOSE_PAN_RAD).
+        Telemetry has errors of the rig's encoders (1.3 mrad) and of coarse odometry. Solvers are given the
+        sigmas of these errors, except for pan (LOOSE_PAN_RAD).
         """
         frames = self.images // (2 if self.eyes == "both eyes" else 1)
-        found = simulate(
+        simulation = simulate(
             navcam(self.eyes),
             SimulationOptions(
                 stops=self.stops,
@@ -76,6 +76,6 @@ class Scenario:
             ),
             seed=seed,
         )
-        t = found.traverse
+        t = simulation.traverse
         loose = tuple(replace(f, sigma_pan_rad=LOOSE_PAN_RAD) for f in t.frames)
-        return replace(found, traverse=replace(t, frames=loose))
+        return replace(simulation, traverse=replace(t, frames=loose))

@@ -1,4 +1,4 @@
-"""results.md: what was done, tables, and what was expected."""
+"""The page results.md: methods, expectations, tables."""
 
 from collections.abc import Sequence
 
@@ -75,13 +75,13 @@ the thesis's own figures have not survived, so there is nothing to compare with,
 def results_text(
     rows: Sequence[Row],
     samples: Sequence[Sample],
-    found: Sequence[Verdict],
+    judged: Sequence[Verdict],
     left_out: Sequence[str],
     figures: Sequence[str],
 ) -> str:
-    """The whole document."""
+    """Text of results.md."""
     results = Results(rows)
-    parts = ["# Experiments of the thesis", _HOW, "## Expected and found", *map(_verdict, found)]
+    parts = ["# Experiments of the thesis", _HOW, "## Expected and found", *map(_verdict, judged)]
     if left_out:
         parts.append("## Left out\n\n" + "\n".join(f"- {sentence}." for sentence in left_out))
     failures = _failures(samples)
@@ -96,7 +96,7 @@ def results_text(
 
 def _verdict(verdict: Verdict) -> str:
     lines = [f"**{verdict.expectation}: {'holds' if verdict.holds else 'does not hold everywhere'}.**", ""]
-    lines += [f"- {'holds' if ok else 'does not hold'}: {text}" for text, ok in verdict.found]
+    lines += [f"- {'holds' if ok else 'does not hold'}: {text}" for text, ok in verdict.figures]
     if not verdict.holds and verdict.explanation:
         lines += ["", verdict.explanation]
     return "\n".join(lines)

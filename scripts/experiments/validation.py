@@ -1,6 +1,6 @@
-"""The joint solver against an independent one: plain formulas, dense, scipy's least squares.
+"""The joint solver against an independent, dense one: plain formulas and SciPy's least squares.
 
-Nothing of the package but its simulation and its result is used: rotations, projection, the pan-tilt chain
+Only the simulation and the result of the package are used: rotations, projection, the pan-tilt chain
 and the priors are written out here from their definitions.
 """
 
@@ -68,8 +68,8 @@ class _Dense:
         for i, stop in enumerate(self.t.stops):
             R, p = stop.world_T_mast.rotation().matrix(), np.asarray(stop.world_T_mast.translation())
             if i > 0:
-                own = x[6 * (i - 1) : 6 * i]
-                R, p = R @ _turn(own[:3]), p + R @ own[3:]
+                twist = x[6 * (i - 1) : 6 * i]
+                R, p = R @ _turn(twist[:3]), p + R @ twist[3:]
             masts.append((R, p))
         return masts, x[a:b].reshape(-1, 2), x[b:].reshape(-1, 3)
 
@@ -105,7 +105,7 @@ class _Dense:
 
 
 def compare(noise_px: float, seed: int) -> dict[str, float]:
-    """How far the two optima are from each other, in cost and in the numbers themselves."""
+    """Differences of the two optima, in cost and in the adjusted numbers."""
     simulation = simulate(navcam("both eyes"), replace(_TINY, noise_px=noise_px), seed=seed)
     t = simulation.traverse
     ours = solve(t, SolveOptions(loss="none", relative_decrease=1e-14))
@@ -122,13 +122,13 @@ def compare(noise_px: float, seed: int) -> dict[str, float]:
     )
     masts, angles, points = dense.split(theirs.x)
     place = np.array([pose.translation() for pose in ours.final.world_T_mast])
-    found = ours.final.landmarks_m[np.searchsorted(ours.landmark_track, dense.track)]
+    ours_m = ours.final.landmarks_m[np.searchsorted(ours.landmark_track, dense.track)]
     distance = np.linalg.norm(points, axis=1)
     return {
         "cost_relative": abs(ours.cost_final - theirs.cost) / theirs.cost,
         "angle_rad": float(np.abs(ours.final.pan_tilt_rad - angles).max()),
         "stop_m": float(np.abs(place - [p for _, p in masts]).max()),
-        "landmark_relative": float((np.linalg.norm(found - points, axis=1) / distance).max()),
+        "landmark_relative": float((np.linalg.norm(ours_m - points, axis=1) / distance).max()),
     }
 
 
@@ -140,7 +140,7 @@ class ValidationTask:
     seed: int
 
     def run(self) -> list[Sample]:
-        """Solve with both."""
+        """Solve with both solvers and compare."""
         metrics, failure = attempt(lambda: compare(self.noise_px, self.seed))
         return [
             Sample(

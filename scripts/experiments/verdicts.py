@@ -1,4 +1,4 @@
-"""What was expected, and whether the figures bear it out."""
+"""Expectations, and whether the figures bear them out."""
 
 import math
 from collections.abc import Sequence
@@ -19,22 +19,22 @@ _AGREES = 1.5
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """An expectation and what was found, place by place."""
+    """An expectation, and the figures that bear it out or do not."""
 
     expectation: str
-    found: tuple[tuple[str, bool], ...]
-    """Figures of one experiment, and whether they are as expected."""
+    figures: tuple[tuple[str, bool], ...]
+    """Figures of each experiment as text, and whether they are as expected."""
     explanation: str
-    """Why not, where not."""
+    """Reason why it does not hold everywhere."""
 
     @property
     def holds(self) -> bool:
-        """Whether it does everywhere; an expectation without figures does not."""
-        return bool(self.found) and all(ok for _, ok in self.found)
+        """Whether the expectation holds everywhere; one without figures does not."""
+        return bool(self.figures) and all(ok for _, ok in self.figures)
 
 
 class Results:
-    """Rows by what they are of."""
+    """Rows of results, looked up by experiment, model, noise and metric."""
 
     def __init__(self, rows: Sequence[Row]) -> None:
         self.rows = tuple(rows)
@@ -44,7 +44,7 @@ class Results:
             self._first.setdefault((r.experiment, r.model), r.sharing)
 
     def get(self, experiment: str, model: str, noise_px: float | None, metric: str) -> Row | None:
-        """The row of a model as the experiment has it first: with as little free as it can have."""
+        """The row of a model with the first sharing of the experiment, which frees the least."""
         sharing = self._first.get((experiment, model), "")
         return self._row.get((experiment, model, sharing, noise_px, metric))
 
@@ -55,20 +55,20 @@ class Results:
         )
 
     def models(self, experiment: str) -> tuple[str, ...]:
-        """Models of an experiment, in the order of how much they know."""
+        """Models of an experiment, the most constrained first."""
         present = {r.model for r in self.rows if r.experiment == experiment}
         return tuple(m for m in _ORDER if m in present)
 
 
 def number(value: float) -> str:
-    """Three digits; what lies among the failed runs is infinite."""
+    """Text of a number with three digits; a quantile among failed runs is infinite."""
     if math.isinf(value):
         return "∞"
     return f"{float(f'{value:.3g}'):,.0f}" if 1000 <= value < 1e6 else f"{value:.3g}"
 
 
 def verdicts(results: Results) -> list[Verdict]:
-    """All expectations of which there are figures."""
+    """All expectations that have figures."""
     return [
         v
         for v in (
@@ -78,25 +78,25 @@ def verdicts(results: Results) -> list[Verdict]:
             _distance(results),
             _agreement(results),
         )
-        if v.found
+        if v.figures
     ]
 
 
 def _same_optimum(results: Results) -> Verdict:
-    found = [
+    figures = [
         (f"{row.experiment}: median {number(row.median)}, worst {number(row.q95)}", row.q95 <= 1e-8)
         for row in results.rows
         if row.experiment == VALIDATION and row.metric == "cost_relative"
     ]
     return Verdict(
         expectation="The joint solver and a dense, independent one end at the same cost to 1e-8",
-        found=tuple(found),
+        figures=tuple(figures),
         explanation="",
     )
 
 
 def _order(results: Results) -> Verdict:
-    found = []
+    figures = []
     for scenario in CLUSTERS:
         for noise in results.noises(scenario.name):
             models = results.models(scenario.name)
@@ -112,10 +112,10 @@ def _order(results: Results) -> Verdict:
                 f"{m} {number(v)}{_in_brackets(results.get(scenario.name, m, noise, 'centre_predicted_mm'))}"
                 for m, v in zip(models, medians, strict=True)
             )
-            found.append((f"{scenario.name}, {noise} px: {text} mm", ok))
+            figures.append((f"{scenario.name}, {noise} px: {text} mm", ok))
     return Verdict(
         expectation="Camera centres: mast < circle < free <= projective at half a pixel and more",
-        found=tuple(found),
+        figures=tuple(figures),
         explanation="In brackets: what each solution's own covariance predicts. Of three clusters, "
         "millimetres are those of where the clusters are to each other. That is told by tracks that two of "
         "them see, to all models alike: there `mast` and `circle` are apart by less than seeds are. Within "
@@ -124,7 +124,7 @@ def _order(results: Results) -> Verdict:
 
 
 def _landmarks(results: Results) -> Verdict:
-    found = []
+    figures = []
     name = CLUSTERS[0].name
     for noise in results.noises(name):
         mast, free = (results.get(name, m, noise, "landmark_m") for m in ("mast", "free"))
@@ -132,10 +132,10 @@ def _landmarks(results: Results) -> Verdict:
             continue
         ratio = free.median / mast.median if math.isfinite(mast.median) else 0.0
         text = f"{noise} px: mast {number(mast.median)}, free {number(free.median)} m, ratio {number(ratio)}"
-        found.append((text, ratio >= 3))
+        figures.append((text, ratio >= 3))
     return Verdict(
         expectation="Landmarks of a one-eye cluster: the mast's RMS error is at most a third of the free's",
-        found=tuple(found),
+        figures=tuple(figures),
         explanation="A landmark's own noise is common to all models: at 20 m two rays 5 cm apart tell its "
         "distance to 25 % at half a pixel even if cameras are known. Triangulated from the true cameras of "
         "50 seeds, landmarks have a median error of 0.14 m and an RMS of 1.5 m at half a pixel, the RMS that "
@@ -144,7 +144,7 @@ def _landmarks(results: Results) -> Verdict:
 
 
 def _distance(results: Results) -> Verdict:
-    found = []
+    figures = []
     for scenario in PANORAMAS:
         row = results.get(scenario.name, "mast", 0.5, "distance_percent")
         if row is not None:
@@ -152,10 +152,10 @@ def _distance(results: Results) -> Verdict:
             predicted = results.get(scenario.name, "mast", 0.5, "distance_predicted_percent")
             if predicted is not None:
                 text += f", predicted by its covariance {number(predicted.median)} %"
-            found.append((text, row.median < 0.5))
+            figures.append((text, row.median < 0.5))
     return Verdict(
         expectation="Distance of two panoramas with the mast model: off by less than 0.5 % at half a pixel",
-        found=tuple(found),
+        figures=tuple(figures),
         explanation="The scale is that of the mast: with one eye 0.14 m from its axis, with both 0.2 m "
         "between them besides. The error is what the covariance predicts, so no solver gets below it with "
         "the same observations. It grows with the noise, with more than the distance (the farther the stops, "
@@ -165,7 +165,7 @@ def _distance(results: Results) -> Verdict:
 
 
 def _agreement(results: Results) -> Verdict:
-    found = []
+    figures = []
     for scenario in (*CLUSTERS, *PANORAMAS):
         for model in results.models(scenario.name):
             for name, predicted in (
@@ -178,11 +178,11 @@ def _agreement(results: Results) -> Verdict:
                     continue
                 ratio = medians[0] / medians[1]
                 text = f"{scenario.name}, {model}, {name}: {number(medians[0])} for {number(medians[1])}"
-                found.append((text, 1 / _AGREES <= ratio <= _AGREES))
+                figures.append((text, 1 / _AGREES <= ratio <= _AGREES))
     return Verdict(
         expectation="Errors at half a pixel are those that each solution's own covariance predicts, to a "
         f"factor of {_AGREES:g}",
-        found=tuple(found),
+        figures=tuple(figures),
         explanation="Measured for predicted, medians both. Predictions are too large where solvers are told "
         "looser telemetry than there was (pan 20 mrad instead of 1.3, and the ties of `free` and "
         "`projective`), and mean little where a straight step of a sigma leads astray: above all with "

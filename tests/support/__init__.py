@@ -1,1 +1,1 @@
-"""What several test modules share: scenes, samples, references."""
+"""Scenes, samples and references that several test modules share."""

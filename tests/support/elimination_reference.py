@@ -1,4 +1,4 @@
-"""Least squares with all landmarks, dense in NumPy: what elimination must equal."""
+"""Dense least squares with all landmarks in NumPy, which elimination must equal."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -14,7 +14,7 @@ from support import landmark_reference as reference
 def whitened(
     landmarks: Landmarks, m: Measurements, views: CameraViews
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Residuals (n, 2), their derivatives (n, 2, 4) by the landmark's vector, what is in front."""
+    """Residuals (n, 2), their derivatives (n, 2, 4) by the landmark's vector, whether in front (n,)."""
     i, j = m.image, m.landmark
     to_pixel = views.calibration[i] @ views.world_R_camera[i].transpose(0, 2, 1)
     offset = (landmarks.origin_m[j] - views.world_t_camera[i])[:, :, None]
@@ -59,11 +59,11 @@ def dense_of(
     landmarks: Landmarks,
     loss: Loss,
 ) -> Dense:
-    """By differences of the residuals where a step (columns,) leads the cameras, fourth order."""
+    """The system by fourth-order differences; `views_after` gives the cameras after a step (columns,)."""
     h, columns = 1e-4, []
     for unit in np.eye(n_columns):
-        found = {k: whitened(landmarks, m, views_after(k * h * unit))[0].ravel() for k in (-2, -1, 1, 2)}
-        columns.append((8 * (found[1] - found[-1]) - (found[2] - found[-2])) / (12 * h))
+        shifted = {k: whitened(landmarks, m, views_after(k * h * unit))[0].ravel() for k in (-2, -1, 1, 2)}
+        columns.append((8 * (shifted[1] - shifted[-1]) - (shifted[2] - shifted[-2])) / (12 * h))
     r, d_vector, front = whitened(landmarks, m, views_after(np.zeros(n_columns)))
     tangents = np.array([reference.tangents(v) for v in landmarks.vector])
     B = np.zeros((2 * len(r), 3 * len(tangents)))
@@ -96,7 +96,7 @@ def whole(panels: Panels) -> tuple[FloatArray, FloatArray]:
 
 
 def assert_systems_agree(S: FloatArray, s: FloatArray, expected: Dense, *, tolerance: float = 1e-8) -> None:
-    """In units of what the cameras' own columns weigh."""
+    """Assert that two reduced systems agree, relative to the norms of the cameras' columns."""
     S_expected, s_expected = expected.reduced
     size = np.linalg.norm(expected.A, axis=0).clip(1.0)  # an image without observations has none
     assert np.abs((S - S_expected) / np.outer(size, size)).max() < tolerance

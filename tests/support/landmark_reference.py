@@ -1,4 +1,4 @@
-"""Landmarks one by one in plain NumPy, from the definitions: what the compiled loops must equal.
+"""Landmarks one by one in plain NumPy, from the definitions; the compiled loops must equal them.
 
 Nothing here calls the package but for its data classes. Every function takes one landmark: a vector (4,), its
 origin (3,), the images (m,) that see it, its pixels (m, 2) and whitenings (m, 2, 2).
@@ -213,20 +213,20 @@ def screened(
             ]
             scale = max(min_scale, float(np.sqrt(np.median(ratio))))
         for k, (test, freedom, squared, front) in enumerate(verdicts):
-            own = accepted[rows[k]]
+            before = accepted[rows[k]]
             excess = test / scale**2 - limit[freedom]
-            excess[own] = np.maximum(excess, squared / scale**2 - limit[2])[own]
+            excess[before] = np.maximum(excess, squared / scale**2 - limit[2])[before]
             excess[~front] = np.inf
-            goes = own & (excess > 0)
-            if own.sum() > 2:
-                goes &= excess == excess[own].max()
-            comes = ~own & (excess < 0) & (freedom > 0)
-            if sweep > 0 or (own & ~goes).sum() < 2:
+            goes = before & (excess > 0)
+            if before.sum() > 2:
+                goes &= excess == excess[before].max()
+            comes = ~before & (excess < 0) & (freedom > 0)
+            if sweep > 0 or (before & ~goes).sum() < 2:
                 comes[:] = False
             if goes.any():
                 lost.append(k)
             changed |= bool(goes.any() or comes.any())
-            accepted[rows[k]] = (own & ~goes) | comes
+            accepted[rows[k]] = (before & ~goes) | comes
         anew = lost
         if not changed:
             break

@@ -1,4 +1,4 @@
-"""Solutions made without a solver, for tests of what is shown of them."""
+"""Solutions made without a solver, for tests of the report."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +12,7 @@ from pancam_graph.data import Seconds, Solution, State
 from pancam_graph.rigs import Rig, mer_navcam
 
 SIGMA_RAD = 1.34e-3
-"""Of the telemetry's pan and tilt."""
+"""Sigma of the telemetry's pan and tilt."""
 
 
 def _traverse_of(
@@ -77,7 +77,7 @@ def _state(
 def _observed(
     traverse: Traverse, truth: State, noise_px: float, outliers: float, rng: np.random.Generator
 ) -> tuple[Observations, BoolArray]:
-    """What images see of landmarks, about every second time, and which of it is an outlier."""
+    """Observations of about every second landmark in view, and whether each is an outlier."""
     landmarks, points = truth.landmarks_m, len(truth.landmarks_m)
     rows = []
     for image, (R, t) in enumerate(zip(truth.world_R_camera, truth.world_t_camera, strict=True)):

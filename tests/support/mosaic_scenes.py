@@ -25,14 +25,14 @@ _ACROSS, _ALONG = 4096, 1024
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """What is imaged, and how wrong telemetry is."""
+    """Pointings, light and cameras of a scene, and the errors of telemetry."""
 
     pans_rad: tuple[float, ...] = tuple(np.deg2rad([40.0, 10.0, -20.0]))
     tilt_rad: float = float(np.deg2rad(-34.0))
     error_rad: tuple[tuple[float, float], ...] = ()
-    """Pan and tilt of telemetry minus truth, by frame; the rest has none."""
+    """Pan and tilt of telemetry minus truth, by frame; further frames have no error."""
     exposure: tuple[float, ...] = ()
-    """By frame; the rest has 1."""
+    """Factor of the brightness by frame; further frames have 1."""
     vignetting: float = 0.0
     """Share of the light that is lost in the corners, with the square of the distance from the middle."""
     bits: int = 16
@@ -52,7 +52,7 @@ def _texture() -> NDArray[np.float32]:
 
 
 def brightness(xy_m: FloatArray) -> FloatArray:
-    """Of the plane at places (n, 2): about as coarse as pixels are, at any distance from the mast."""
+    """Brightness of the plane at places (n, 2), with details of about a pixel at any distance."""
     d = xy_m - PLACE_M[:2]
     column = (np.arctan2(d[:, 1], d[:, 0]) % (2 * np.pi)) / (2 * np.pi) * _ACROSS
     row = (np.log(np.hypot(d[:, 0], d[:, 1])) - np.log(0.3)) / np.log(100) * _ALONG
@@ -63,7 +63,7 @@ def brightness(xy_m: FloatArray) -> FloatArray:
 
 
 def solved(scene: Scene, folder: Path) -> Solution:
-    """Write the images of a scene into a folder; the solution with the truth for its end."""
+    """Write the images of a scene into a folder; returns a solution that ends at the truth."""
     rig = scene.rig
     n = len(scene.pans_rad)
     truth = np.array([[pan, scene.tilt_rad] for pan in scene.pans_rad])

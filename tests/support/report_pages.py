@@ -1,4 +1,4 @@
-"""What a page of the report holds."""
+"""Reading a page of the report: its structure and its packed figures."""
 
 import base64
 import gzip
@@ -11,10 +11,10 @@ VOID = {"meta", "link", "br", "img", "input", "hr"}
 
 
 def unpacked(page: str, name: str) -> str:
-    """What is packed in one of the page's script elements."""
-    found = re.search(f'<script type="text/plain" id="{name}">([^<]*)</script>', page)
-    assert found is not None
-    return gzip.decompress(base64.b64decode(found[1])).decode()
+    """Text that is packed in one of the page's script elements."""
+    packed = re.search(f'<script type="text/plain" id="{name}">([^<]*)</script>', page)
+    assert packed is not None
+    return gzip.decompress(base64.b64decode(packed[1])).decode()
 
 
 def figures_of(page: str) -> dict[str, Any]:

@@ -50,11 +50,11 @@ def worst_unseen(fit: RigFit, rig: Rig) -> float:
     worst = 0.0
     for angles in angles_of(7, seed=99):
         for eye, mount in zip(fit.eyes, fit.head_T_camera, strict=True):
-            found = camera_at(
+            fitted = camera_at(
                 fit.world_T_mast, fit.pan_T_tilt, mount, (angles + fit.angle_offset_rad).tolist()
             )
             (true,) = cameras_of(rig, angles[None], [eye])
-            worst = max(worst, float(np.abs(true.localCoordinates(found)).max()))
+            worst = max(worst, float(np.abs(true.localCoordinates(fitted)).max()))
     return worst
 
 

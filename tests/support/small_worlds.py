@@ -1,4 +1,4 @@
-"""Worlds to render that are made in a moment."""
+"""Small worlds, which are quick to render."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,7 +10,7 @@ from pancam_graph.simulate import _scene
 
 @contextmanager
 def smaller_worlds() -> Iterator[None]:
-    """The same ground and rocks over less of it."""
+    """Limit the ground and its rocks to a smaller area."""
     with pytest.MonkeyPatch.context() as patch:
         for name, value in (
             ("_FINE_REACH_M", 6.0),
