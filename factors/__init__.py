@@ -1,8 +1,8 @@
 """Custom GTSAM factors: pure residuals with analytic Jacobians, and thin makers.
 
-One module a factor: `mast` (pan-tilt chain, 6 rows), `circle` (thesis eq. 4.8, 3 rows), `projective`
-(projection matrix, 12 rows). Whatever GTSAM
-has itself (priors, projections) is taken from there.
+One module a factor: `mast` (pan-tilt chain, 6 rows), `mast_projection` (a point seen from a rigid mast, 2
+rows), `circle` (thesis eq. 4.8, 3 rows), `projective` (projection matrix, 12 rows). Whatever GTSAM has itself
+(priors, projections of a camera pose) is taken from there.
 """
 
 from pancam_graph.factors._slots import Corrected as Corrected
@@ -16,5 +16,7 @@ from pancam_graph.factors.circle import circle_residual as circle_residual
 from pancam_graph.factors.landmark_blocks import LandmarkBlocks as LandmarkBlocks
 from pancam_graph.factors.mast import mast_factor as mast_factor
 from pancam_graph.factors.mast import mast_residual as mast_residual
+from pancam_graph.factors.mast_projection import mast_projection_factor as mast_projection_factor
+from pancam_graph.factors.mast_projection import mast_projection_residual as mast_projection_residual
 from pancam_graph.factors.projective import projective_factor as projective_factor
 from pancam_graph.factors.projective import projective_residual as projective_residual

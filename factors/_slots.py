@@ -50,8 +50,8 @@ class Corrected:
 
 Slot = Key | Fixed
 PoseSlot = Key | Fixed | Corrected
-Kind = Literal["pose", "vector", "number"]
-"""What a slot holds: a gtsam.Pose3, a vector, a number."""
+Kind = Literal["pose", "vector", "point", "number"]
+"""What a slot holds: a gtsam.Pose3, a vector, a Point3, a number."""
 
 Residual = Callable[..., tuple[FloatArray, tuple[FloatArray, ...]]]
 """Takes the values of each slot at n sites (poses as rotations (n, 3, 3) and translations (n, 3), vectors
@@ -119,6 +119,7 @@ class _Reader:
         self._read = {
             "pose": gtsam.Values.atPose3,
             "vector": gtsam.Values.atVector,
+            "point": gtsam.Values.atPoint3,
             "number": gtsam.Values.atDouble,
         }[kind]
         self._is_pose = kind == "pose"

@@ -47,7 +47,9 @@ if TYPE_CHECKING:
     from pancam_graph.solve import CrossValidation as CrossValidation
     from pancam_graph.solve import SolveOptions as SolveOptions
     from pancam_graph.solve import StopRule as StopRule
+    from pancam_graph.solve import build_graph as build_graph
     from pancam_graph.solve import cross_validate as cross_validate
+    from pancam_graph.solve import graph_keys as graph_keys
     from pancam_graph.solve import solve as solve
 
 __version__ = "0.1.0"
@@ -68,7 +70,15 @@ _PUBLIC = {
         "write_rendering",
     ),
     "smoother": ("SmootherOptions", "TraverseSmoother"),
-    "solve": ("CrossValidation", "SolveOptions", "StopRule", "cross_validate", "solve"),
+    "solve": (
+        "CrossValidation",
+        "SolveOptions",
+        "StopRule",
+        "build_graph",
+        "cross_validate",
+        "graph_keys",
+        "solve",
+    ),
 }
 """The public names by the room that they come from: those imported above for type checkers."""
 

@@ -27,3 +27,4 @@ from pancam_graph.graph._rig_variables import RigVariables as RigVariables
 from pancam_graph.graph._soft import SoftTemplate as SoftTemplate
 from pancam_graph.graph._template import FactorTemplate as FactorTemplate
 from pancam_graph.graph._template import diagonal_noise as diagonal_noise
+from pancam_graph.graph._whole_graph import whole_graph as whole_graph

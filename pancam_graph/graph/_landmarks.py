@@ -103,9 +103,13 @@ class ExplicitLandmarks:
     def with_landmarks(self, cameras: gtsam.Values, points_m: FloatArray, present: BoolArray) -> gtsam.Values:
         """The cameras' values together with those of the landmarks that take part."""
         values = self.calibrations.values_of(cameras)
+        self.insert_points(values, points_m, present)
+        return values
+
+    def insert_points(self, values: gtsam.Values, points_m: FloatArray, present: BoolArray) -> None:
+        """Add the landmarks (landmarks, 3) that take part."""
         for j in np.flatnonzero(present):
             values.insert(self.key(int(j)), points_m[j])
-        return values
 
     def only_cameras(self, values: gtsam.Values) -> gtsam.Values:
         """The template's variables, out of values that hold landmarks too."""

@@ -92,11 +92,15 @@ class NativeCalibrations:
         """A template's values, `K` replaced by `C`."""
         values = gtsam.Values(cameras)
         for n in self._native:
-            numbers = n.nominal + n.basis @ values.atVector(n.variable.key)
+            _insert(n, values)
             values.erase(n.variable.key)
-            for key, own in zip(n.keys, numbers.reshape(-1, 5), strict=True):
-                values.insert(key, gtsam.Cal3_S2(*own))
         return values
+
+    def join(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+        """Add each `C` to a graph and values that have `K`, held exactly to what `K` says."""
+        for n in self._native:
+            _insert(n, values)
+            graph.push_back(_link(n))
 
     def free_entries(self, values: gtsam.Values) -> dict[int, FloatArray]:
         """Each `K` (n,) by its key, from values that hold `C`."""
@@ -120,6 +124,31 @@ class NativeCalibrations:
         for n in self._native:
             out.insert(n.variable.key, n.along @ np.concatenate([step.at(key) for key in n.keys]))
         return out
+
+
+def _insert(native: _Native, values: gtsam.Values) -> None:
+    """Add the `C` that values of `K` make."""
+    numbers = native.nominal + native.basis @ values.atVector(native.variable.key)
+    for key, own in zip(native.keys, numbers.reshape(-1, 5), strict=True):
+        values.insert(key, gtsam.Cal3_S2(*own))
+
+
+def _link(native: _Native) -> gtsam.CustomFactor:
+    """The constraint that `C` are what `K` says."""
+    n = len(native.nominal)
+    columns = [np.asfortranarray(part) for part in (-native.basis, *np.split(np.eye(n), len(native.keys), 1))]
+
+    def evaluate(
+        _this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
+    ) -> FloatArray:
+        numbers = np.concatenate([values.atCal3_S2(key).vector() for key in native.keys])
+        if jacobians is not None:
+            for i, column in enumerate(columns):
+                jacobians[i] = column
+        return np.asarray(numbers - native.nominal - native.basis @ values.atVector(native.variable.key))
+
+    noise = gtsam.noiseModel.Constrained.All(n)
+    return gtsam.CustomFactor(noise, [native.variable.key, *native.keys], evaluate)
 
 
 def _entries(native: _Native, values: gtsam.Values) -> FloatArray:

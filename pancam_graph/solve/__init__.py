@@ -5,6 +5,8 @@ from pancam_graph.solve._eliminated import EliminatedSolver as EliminatedSolver
 from pancam_graph.solve._fit import Fitted as Fitted
 from pancam_graph.solve._fit import fit as fit
 from pancam_graph.solve._fit import fitted_elsewhere as fitted_elsewhere
+from pancam_graph.solve._graph import build_graph as build_graph
+from pancam_graph.solve._graph import graph_keys as graph_keys
 from pancam_graph.solve._judge import Judged as Judged
 from pancam_graph.solve._judge import judge as judge
 from pancam_graph.solve._judge import reduced_of as reduced_of

@@ -7,7 +7,7 @@ import numpy as np
 from pancam_graph.base.errors import SolveError
 from pancam_graph.base.geometry import BoolArray
 from pancam_graph.data import State
-from pancam_graph.graph import HardTemplate, SoftTemplate
+from pancam_graph.graph import HardTemplate
 from pancam_graph.landmarks import refine
 from pancam_graph.solve._covariance import Uncertainty, uncertainty
 from pancam_graph.solve._diagnose import connection_warnings, listed
@@ -62,7 +62,7 @@ def state_of(problem: Problem) -> State:
 def regular_problem(fitted: Fitted) -> Problem:
     """The problem as covariances are taken from it."""
     prepared, problem = fitted.screened.prepared, fitted.problem
-    if prepared.options.firm_tie == "hard" and isinstance(problem.template, SoftTemplate):
+    if prepared.options.firm_tie == "hard" and problem.template.has_cameras:
         # The inverse of a system with a tie of 1e-8 would have lost half its digits.
         return problem.on(HardTemplate(prepared.traverse, prepared.sharing))
     return problem

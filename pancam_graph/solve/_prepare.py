@@ -10,7 +10,17 @@ from numpy.typing import NDArray
 from pancam_graph.base.errors import InputError, SolveError
 from pancam_graph.base.geometry import BoolArray, IntArray
 from pancam_graph.data import Observations, PixelNoise, RigCorrection, Sharing, State, Traverse
-from pancam_graph.graph import RIGID, FactorTemplate, HardTemplate, ProjectiveTemplate, SoftTemplate
+from pancam_graph.graph import (
+    RIGID,
+    Factors,
+    FactorTemplate,
+    HardTemplate,
+    ProjectiveTemplate,
+    SoftTemplate,
+    UserFactors,
+    check_given,
+    given_factors,
+)
 from pancam_graph.initialise import FreeCameras, Start, start_from_telemetry
 from pancam_graph.landmarks import Landmarks, Measurements, rays_of, residuals, triangulate
 from pancam_graph.solve._alternation import AlternatingSolver
@@ -73,12 +83,14 @@ def prepare(
     options: SolveOptions,
     start: Start | None = None,
     on_iteration: Callable[[Iteration], None] | None = None,
+    factors: UserFactors | None = None,
 ) -> Prepared:
     """Observations of tracks that are seen twice or more as measurements, and first values of everything.
 
-    `start` gives the first stops, angles and cameras; default: telemetry's. Raises InputError for a traverse
-    without observations, for given cameras that are not one an image, and for options that the traverse
-    cannot serve; SolveError where no track is seen twice.
+    `start` gives the first stops, angles and cameras; default: telemetry's. `factors` are the caller's own,
+    on keys of `graph_keys`. Raises InputError for a traverse without observations, for given cameras that are
+    not one an image, for options that the traverse cannot serve, and for factors that cannot be evaluated;
+    SolveError where no track is seen twice.
     """
     if traverse.observations is None:
         raise InputError(
@@ -94,7 +106,7 @@ def prepare(
     n = measurements.n_landmarks
     problem = Problem(
         template=template,
-        factors=template.factors(),
+        factors=_factors(template, values, factors),
         measurements=measurements,
         accepted=np.ones(len(measurements.row), dtype=bool),
         values=values,
@@ -174,6 +186,13 @@ def _first_state(traverse: Traverse, start: Start, cameras: FreeCameras | None) 
         landmarks_m=np.zeros((0, 3)),
         rig=rig,
     )
+
+
+def _factors(template: FactorTemplate, values: gtsam.Values, factors: UserFactors | None) -> Factors:
+    """Priors and ties of the rig, and the caller's factors, each evaluated once at the start."""
+    given = given_factors(factors, template.keys)
+    check_given(given, template.seats(given), values, template.keys)
+    return template.factors(given)
 
 
 def _measure(

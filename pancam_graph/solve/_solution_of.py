@@ -44,6 +44,7 @@ def solution_of(judged: Judged) -> Solution:
         stop_covariance=covariances.stop_covariance,
         angle_sigma_rad=covariances.angle_sigma_rad,
         landmark_covariance_m2=covariances.landmark_covariance_m2,
+        mast_covariance=covariances.masts,
         came_back=judged.used & screened.set_aside,
         refined=problem.template.refined(problem.values, covariances.rig_sigmas),
         warnings=judged.warnings,

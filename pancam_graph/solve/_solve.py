@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from pancam_graph.base.threads import blas_on_one_thread
 from pancam_graph.data import Seconds, Solution, Traverse
+from pancam_graph.graph import UserFactors
 from pancam_graph.initialise import Start
 from pancam_graph.landmarks import kernel
 from pancam_graph.solve._fit import fit
@@ -30,21 +31,26 @@ def solve(
     *,
     start: Start | None = None,
     on_iteration: Callable[[Iteration], None] | None = None,
+    factors: UserFactors | None = None,
 ) -> Solution:
     """Adjust a traverse that has observations.
 
     `start` gives first values of the stops and angles where they differ from the priors' centres;
-    `on_iteration` is told of every iteration. Deterministic: the same input gives the same output.
+    `on_iteration` is told of every iteration. `factors` are GTSAM factors of the caller's on keys of
+    `graph_keys(traverse, options)`: they count as observations do, from the first screening to covariances,
+    and are never taken for outliers (give them a robust noise model for that). Deterministic: the same
+    input gives the same output.
 
     A solve that reaches its iteration limit is returned with `converged` False. Raises InputError for a
-    traverse without observations or unknown options, SolveError where no track is seen twice or the system
+    traverse without observations, unknown options, or a factor that cannot be evaluated at the start,
+    SolveError where no track is seen twice or the system
     has a direction that neither observations nor priors hold.
     """
     if kernel.must_compile():
         _LOG.info(COMPILING)
     clock = _Clock()
     with blas_on_one_thread():
-        prepared = prepare(traverse, options or SolveOptions(), start, on_iteration)
+        prepared = prepare(traverse, options or SolveOptions(), start, on_iteration, factors)
         clock.ended("initialise")
         screened = screen(prepared)
         fitted = fit(screened)

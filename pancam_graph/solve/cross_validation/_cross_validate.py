@@ -23,6 +23,7 @@ from pancam_graph.data import (
     rms_px,
 )
 from pancam_graph.elimination import Covariance
+from pancam_graph.graph import UserFactors
 from pancam_graph.initialise import Start
 from pancam_graph.solve._covariance import covariance_of
 from pancam_graph.solve._diagnose import listed
@@ -58,6 +59,7 @@ def cross_validate(
     halvings: int = 4,
     seed: int = 0,
     progress: Callable[[str, int, int], None] | None = None,
+    factors: UserFactors | None = None,
 ) -> CrossValidation:
     """Solve halves of a traverse's tracks and compare them: `halvings` times by lot, once by image halves.
 
@@ -66,6 +68,7 @@ def cross_validate(
     the upper half if the mean position of its observations is above the middle of their images. Every half is
     adjusted with all priors, from the optimum of the whole; formal covariances are all taken at that optimum.
 
+    `factors` are the caller's own, as `solve` was given them: every half has all of them, as all priors.
     `solution` is the solution of the traverse with the options; default: the traverse is solved first.
     `progress` is told the name of a step, its number, and the number of steps. Deterministic: the same
     arguments give the same numbers.
@@ -80,11 +83,11 @@ def cross_validate(
             raise InputError(f"cross-validation: {name}: expected {least} or more, found {value}")
     options = options or SolveOptions()
     if solution is None:
-        solution = solve(traverse, options)
+        solution = solve(traverse, options, factors=factors)
     else:
         _require_solution_of(traverse, options, solution)
     with blas_on_one_thread():
-        whole = _Whole(solution, options)
+        whole = _Whole(solution, options, factors)
         m, lots = whole.problem.measurements, np.random.default_rng(seed)
         splits: dict[Splitting, list[BoolArray]] = {
             "random": [random_half(whole.traverse, m, lots) for _ in range(halvings)],
@@ -146,7 +149,7 @@ class _Whole:
     One vector holds all quantities: pan and tilt of each frame, of each pair, and six numbers of each stop.
     """
 
-    def __init__(self, solution: Solution, options: SolveOptions) -> None:
+    def __init__(self, solution: Solution, options: SolveOptions, factors: UserFactors | None) -> None:
         given, used, final = solution.traverse.observations, solution.used, solution.final
         assert given is not None
         # Sigmas stay those that the solution ended with: halves are not to scale them to their own residuals.
@@ -162,7 +165,7 @@ class _Whole:
             relative_decrease=min(options.relative_decrease, _RELATIVE_DECREASE),
         )
         start = Start(world_T_mast=final.world_T_mast, pan_tilt_rad=final.pan_tilt_rad)
-        self.fitted = fit(screen(prepare(self.traverse, options, start)))
+        self.fitted = fit(screen(prepare(self.traverse, options, start, factors=factors)))
         self.problem, self.regular = self.fitted.problem, regular_problem(self.fitted)
         self.state = state_of(self.problem)
         n_tracks = int(self.problem.present.sum())

@@ -1,0 +1,76 @@
+"""The graph of a traverse for callers who write GTSAM: its keys, and all of its factors and first values."""
+
+from dataclasses import replace
+
+import gtsam
+
+from pancam_graph.base.errors import InputError
+from pancam_graph.base.geometry import BoolArray
+from pancam_graph.data import Sharing, Traverse
+from pancam_graph.graph import ExplicitLandmarks, GraphKeys, RigVariables, SoftTemplate, whole_graph
+from pancam_graph.initialise import Start
+from pancam_graph.landmarks import SQUARED, loss_of
+from pancam_graph.solve._options import SolveOptions
+from pancam_graph.solve._prepare import prepare
+from pancam_graph.solve._screen import screened_elsewhere
+
+__all__ = ["build_graph", "graph_keys"]
+
+
+def graph_keys(traverse: Traverse, options: SolveOptions | None = None) -> GraphKeys:
+    """Keys of masts, angles and free entries of the rig, for factors that `solve` is given and `build_graph`.
+
+    Which entries of the rig are free is what the options say, or else the traverse. Raises InputError for a
+    sharing that the model does not take.
+    """
+    options = options or SolveOptions()
+    sharing = (options.sharing or traverse.sharing or Sharing()).for_model(options.model)
+    return GraphKeys(traverse, RigVariables(traverse, sharing))
+
+
+def build_graph(
+    traverse: Traverse,
+    options: SolveOptions | None = None,
+    *,
+    start: Start | None = None,
+    used: BoolArray | None = None,
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """All factors of a traverse and values to start from, for GTSAM's own optimisers.
+
+    Terrain points are variables `L` (Point3), numbered as the tracks in `Solution.landmark_track`. Where
+    cameras are variables of their own (`X`, Pose3, numbered as images), the factors of observations are
+    GTSAM's projection factors; on a rigid mast they are on mast, angles and point directly
+    (`mast_projection_factor`). All other variables have the keys of `graph_keys`. What telemetry holds is a
+    variable with a constraint. Pixels are those of pinholes, carried there once: where lenses are distorted
+    and calibrations free, or pupils move, `solve` carries them again and the graph does not.
+
+    `used` (observations,) are those to take, by least squares, as `Solution.used` has them. Default: all of
+    tracks that are seen twice or more, by the robust loss of the options, since nothing is screened; the loss
+    "none" makes it least squares. `start` gives the first stops and angles; default: telemetry's.
+
+    Raises InputError for the model `projective`, for which GTSAM has no projection factor, and as `solve`.
+    """
+    options = options or SolveOptions()
+    if options.model == "projective":
+        raise InputError(
+            "build_graph: expected the model mast, circle or free, found projective: GTSAM has no projection "
+            "factor for matrices"
+        )
+    prepared = prepare(traverse, replace(options, landmarks="explicit", method="joint"), start)
+    problem, loss = prepared.problem, loss_of(options.loss)
+    if used is not None:
+        if len(used) != len(prepared.observations):
+            raise InputError(
+                f"used: expected one entry for each of {len(prepared.observations)} observations, "
+                f"found {len(used)}"
+            )
+        problem, loss = screened_elsewhere(prepared, problem.values, used).problem, SQUARED
+    assert isinstance(problem.template, SoftTemplate)  # explicit landmarks have no other
+    return whole_graph(
+        problem.values,
+        ExplicitLandmarks(problem.template, problem.measurements),
+        problem.points_m(),
+        problem.kept,
+        loss=loss,
+        is_rigid=options.firm_tie == "hard",
+    )
