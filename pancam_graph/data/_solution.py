@@ -291,6 +291,8 @@ class Solution:
         `stop_covariance_between`.
         """
         joint = self.stop_covariance_between(stop_a, stop_b)
+        if stop_a == stop_b:
+            return np.zeros((6, 6))
         a, b = (self.final.world_T_mast[self._stop_row(stop)] for stop in (stop_a, stop_b))
         return relative_pose_covariance(a, b, joint)
 

@@ -19,8 +19,8 @@ from pancam_graph.graph._keys import read_variable
 
 __all__ = ["GivenFactor", "Seat", "UserFactors", "check_given", "given_factors", "seated"]
 
-UserFactors = Iterable[gtsam.NonlinearFactor] | gtsam.NonlinearFactorGraph
-"""What a caller may give: factors one by one, or a graph of them."""
+UserFactors = Iterable[gtsam.NonlinearFactor] | gtsam.NonlinearFactorGraph | gtsam.NonlinearFactor
+"""What a caller may give: some factors, a graph of them, or one."""
 
 _T = TypeVar("_T")
 _WORST = 1e30

@@ -8,7 +8,7 @@ import numpy as np
 from pancam_graph.base.choices import expected_one_of, some_of
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import BoolArray
-from pancam_graph.data import Quantity, Traverse
+from pancam_graph.data import ENTRIES, Quantity, Traverse
 from pancam_graph.graph._keys import Kind, key_of
 from pancam_graph.graph._rig_variables import RigVariable, RigVariables
 
@@ -21,7 +21,6 @@ _CALLED: dict[Quantity, str] = {
     "pan_T_tilt": "tilt axis",
     "radius": "radius",
 }
-_POSE = ("rotation_x_rad", "rotation_y_rad", "rotation_z_rad", "x_m", "y_m", "z_m")
 
 
 class GraphKeys:
@@ -41,7 +40,7 @@ class GraphKeys:
         self._name = {key: f"mast of {stop}" for stop, key in self._stop.items()}
         self._name |= {key: f"angles of {frame}" for frame, key in self._frame.items()}
         self._name |= {v.key: self._name_of(v) for v in rig.variables}
-        self._entries: dict[int, tuple[str, ...]] = dict.fromkeys(self._stop.values(), _POSE)
+        self._entries: dict[int, tuple[str, ...]] = dict.fromkeys(self._stop.values(), ENTRIES["mounts"])
         self._entries |= dict.fromkeys(self._frame.values(), ("pan_rad", "tilt_rad"))
         self._entries |= {v.key: v.entries for v in rig.variables}
 

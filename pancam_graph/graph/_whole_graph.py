@@ -24,7 +24,7 @@ def whole_graph(
     loss: Loss,
     is_rigid: bool,
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """Factors and values: landmarks (landmarks, 3) at `points_m`, all other variables at the template's values.
+    """Factors and values: landmarks (landmarks, 3) at `points_m`, all else at the template's values.
 
     `kept` (n,) are the measurements that take part. `is_rigid`: cameras are no variables, and points are seen
     from masts and angles directly. What telemetry holds is a variable with a constraint; where a tie is not
