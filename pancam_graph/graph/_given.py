@@ -5,7 +5,7 @@ The caller writes factors on masts, on pan and tilt of single frames, and on cor
 stop in one vector. A `Seat` says where each of the caller's variables is among the template's.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -19,7 +19,7 @@ from pancam_graph.graph._keys import read_variable
 
 __all__ = ["GivenFactor", "Seat", "UserFactors", "check_given", "given_factors", "seated"]
 
-UserFactors = Iterable[gtsam.NonlinearFactor] | gtsam.NonlinearFactorGraph | gtsam.NonlinearFactor
+UserFactors = Sequence[gtsam.NonlinearFactor] | gtsam.NonlinearFactorGraph | gtsam.NonlinearFactor
 """What a caller may give: some factors, a graph of them, or one."""
 
 _T = TypeVar("_T")

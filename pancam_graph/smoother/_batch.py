@@ -11,7 +11,7 @@ from pancam_graph.landmarks import Landmarks
 from pancam_graph.smoother._map import DriveMap
 from pancam_graph.solve import EliminatedSolver, Problem, StopRule
 
-__all__ = ["solved_anew", "whole_problem", "whole_traverse"]
+__all__ = ["solved_anew", "whole_problem", "whole_template", "whole_traverse"]
 
 
 def whole_traverse(drive: DriveMap) -> Traverse:
@@ -27,13 +27,20 @@ def whole_traverse(drive: DriveMap) -> Traverse:
     )
 
 
+def whole_template(drive: DriveMap) -> HardTemplate:
+    """The rig of the whole drive as a template; its variables have the drive's keys."""
+    return HardTemplate(whole_traverse(drive), drive.stations[0].template.rig_variables.sharing)
+
+
 def whole_problem(drive: DriveMap, values: gtsam.Values) -> Problem:
     """What is used of the drive, landmarks as they were linearised last."""
     placed = drive.whole()
-    template = HardTemplate(whole_traverse(drive), drive.stations[0].template.rig_variables.sharing)
+    template = whole_template(drive)
     return Problem(
         template=template,
-        factors=Factors(telemetry=tuple(drive.factors(firm=True))),
+        factors=Factors(
+            telemetry=tuple(drive.factors(firm=True)), given=tuple(drive.given), seated=tuple(drive.seated)
+        ),
         measurements=placed.measurements,
         accepted=np.ones(len(placed.measurements.row), dtype=bool),
         values=values,

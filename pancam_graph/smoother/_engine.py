@@ -175,12 +175,16 @@ class Engine:
             if (kind := kind_of(key)) is not Kind.MAST
             and np.any(np.abs(delta) > limit.get(kind, o.relinearise_rig))
         }
+        # A factor of the caller's may change with where the whole drive is, as a block does not.
+        named = {key for factor in self._drive.seated for key in factor.keys()}  # noqa: SIM118  a gtsam factor
+        masts = (key for key in named if kind_of(key) is Kind.MAST and key in moved)
+        far |= {key for key in masts if np.any(np.abs(moved[key]) > self._unit)}
         pending = {
             b
             for b, block in blocks.items()
             if b in unlike or self._apart[b] > 1 or not far.isdisjoint(block.keys)
         }
-        moving: set[int] = set()
+        moving = far & named
         while pending:
             moving |= {key for b in pending for key in blocks[b].keys}
             pending = {
@@ -199,7 +203,7 @@ class Engine:
         for block in blocks:
             theta.of_all(block.patch.stations)
         each(lambda block: block.linearise(theta, values, self._unit), blocks)
-        factors = self._drive.factors(firm=False)
+        factors = [*self._drive.factors(firm=False), *self._drive.seated]
         self._priors = gtsam.NonlinearFactorGraph()
         for factor in factors:
             self._priors.push_back(factor)

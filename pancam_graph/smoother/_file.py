@@ -43,6 +43,7 @@ def save_smoother(state: SmootherState, path: Path) -> None:
         "format": _FORMAT,
         "version": _VERSION,
         "options": options,
+        "n_given": state.n_given,
         "traverse": traverse_entries(state.traverse).model_dump(exclude={"sharing"}),
     }
     text = json.dumps(header, allow_nan=False, ensure_ascii=False).encode()
@@ -98,5 +99,6 @@ def _state(path: Path, header: dict[str, Any], arrays: dict[str, NDArray[Any]]) 
     return SmootherState(
         traverse=traverse,
         options=SmootherOptions(**options),
+        n_given=int(header.get("n_given", 0)),
         **{name: arrays[name] for name in _ARRAYS},
     )

@@ -10,7 +10,18 @@ import numpy as np
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import IntArray
 from pancam_graph.base.threads import blas_on_one_thread
-from pancam_graph.data import Frame, Image, Incremental, Observations, Seconds, Solution, Stop, Traverse
+from pancam_graph.data import (
+    Frame,
+    Image,
+    Incremental,
+    Observations,
+    Seconds,
+    Sharing,
+    Solution,
+    Stop,
+    Traverse,
+)
+from pancam_graph.graph import HardTemplate, UserFactors
 from pancam_graph.smoother._options import SmootherOptions, Update
 from pancam_graph.smoother._smoother import TraverseSmoother
 from pancam_graph.solve import SolveOptions, fitted_elsewhere, judge, prepare, screened_elsewhere, solution_of
@@ -42,8 +53,11 @@ def solve_incrementally(
     options: SolveOptions | None = None,
     *,
     on_stop: Callable[[Update], None] | None = None,
+    factors: UserFactors | None = None,
 ) -> Solution:
     """As `solve`, by adding stop after stop in their order; `on_stop` is told of every one.
+
+    `factors` as for `solve`; they are added after the last stop.
 
     Raises InputError for what the smoother has not: another model than the rigid mast, explicit landmarks,
     alternation, and a robust loss other than that observations are judged as they come.
@@ -71,14 +85,21 @@ def solve_incrementally(
         _LOG.info("%s: cost %.6g, %.3f s", stop.id, updates[-1].cost, updates[-1].seconds)
         if on_stop is not None:
             on_stop(updates[-1])
+    if factors is not None:
+        sharing = (options.sharing or traverse.sharing or Sharing()).for_model("mast")
+        smoother.add_factors_of(HardTemplate(traverse, sharing), factors)
     solved = time.perf_counter()
-    solution = _as_solution(traverse, options, smoother, updates)
+    solution = _as_solution(traverse, options, smoother, updates, factors)
     done = time.perf_counter()
     return replace(solution, seconds=Seconds(initialise=0.0, solve=solved - begin, report=done - solved))
 
 
 def _as_solution(
-    traverse: Traverse, options: SolveOptions, smoother: TraverseSmoother, updates: list[Update]
+    traverse: Traverse,
+    options: SolveOptions,
+    smoother: TraverseSmoother,
+    updates: list[Update],
+    factors: UserFactors | None,
 ) -> Solution:
     """What the smoother found, as a solution of the traverse."""
     assert traverse.observations is not None
@@ -86,8 +107,9 @@ def _as_solution(
     used[_rows_as_added(traverse)] = smoother.used
     costs = tuple(u.cost for u in updates)
     with blas_on_one_thread():
-        screened = screened_elsewhere(prepare(traverse, options), smoother.values(), used)
-        fitted = fitted_elsewhere(screened, costs, f"{len(updates)} stops added one by one")
+        screened = screened_elsewhere(prepare(traverse, options, factors=factors), smoother.values(), used)
+        with_factors = costs if factors is None else (*costs, smoother.cost)
+        fitted = fitted_elsewhere(screened, with_factors, f"{len(updates)} stops added one by one")
         solution = solution_of(judge(fitted))
     warnings = (w for u in updates for w in u.warnings)
     return replace(

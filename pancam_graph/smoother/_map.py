@@ -9,6 +9,15 @@ import numpy as np
 from pancam_graph.base.geometry import BoolArray, IntArray
 from pancam_graph.base.threads import each
 from pancam_graph.elimination import Room
+from pancam_graph.graph import (
+    FactorList,
+    GivenFactor,
+    HardTemplate,
+    UserFactors,
+    check_given,
+    given_factors,
+    seated,
+)
 from pancam_graph.landmarks import Landmarks, residuals
 from pancam_graph.smoother._block import LandmarkBlock
 from pancam_graph.smoother._ledger import Fate, Ledger
@@ -50,6 +59,10 @@ class DriveMap:
         self.stations: list[Station] = []
         self.ledger = Ledger()
         self.blocks: dict[int, LandmarkBlock] = {}
+        self.given: list[GivenFactor] = []
+        """Factors of the caller's."""
+        self.seated: list[gtsam.NonlinearFactor] = []
+        """The same on the drive's variables."""
         self.image_station = np.zeros(0, dtype=np.int64)
         """(images,) of the whole drive"""
         self._track, self._home = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
@@ -61,9 +74,23 @@ class DriveMap:
         self.image_station = np.concatenate([self.image_station, own])
 
     def factors(self, *, firm: bool) -> list[gtsam.NonlinearFactor]:
-        """All factors but those of landmarks; see `Station.factors`."""
+        """All factors but those of landmarks and of the caller; see `Station.factors`."""
         shared = self.stations[0].shared_priors() if self.stations else []
         return [*shared, *(factor for s in self.stations for factor in s.factors(firm=firm))]
+
+    def take_factors(self, template: HardTemplate, factors: UserFactors, values: gtsam.Values) -> FactorList:
+        """Take factors of the caller's, on keys of a template of the whole drive; those on its variables.
+
+        `values` are those of the drive. Raises InputError, and changes nothing, for a factor that cannot be
+        evaluated there.
+        """
+        given = given_factors(factors, template.keys)
+        seats = template.seats(given)
+        check_given(given, seats, values, template.keys)
+        new: FactorList = [factor for one in given if (factor := seated(one, seats)) is not None]
+        self.given += given
+        self.seated += new
+        return new
 
     def station_of(self, rows: IntArray) -> IntArray:
         """Station (n,) of rows of the ledger."""

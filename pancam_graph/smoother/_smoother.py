@@ -13,9 +13,10 @@ from pancam_graph.base.threads import blas_on_one_thread
 from pancam_graph.cameras import carry_to_pinhole
 from pancam_graph.data import Frame, Image, Observations, Sharing, Stop, Traverse
 from pancam_graph.elimination import relative_pose_covariance
+from pancam_graph.graph import GraphKeys, HardTemplate, UserFactors
 from pancam_graph.landmarks import Landmarks
 from pancam_graph.rigs import Rig
-from pancam_graph.smoother._batch import whole_traverse
+from pancam_graph.smoother._batch import whole_template, whole_traverse
 from pancam_graph.smoother._closure import bridge, judged, loops
 from pancam_graph.smoother._engine import Engine, Rounds
 from pancam_graph.smoother._ledger import Fate
@@ -335,6 +336,36 @@ class TraverseSmoother:
             drive.take_in(near, Postures(engine.estimate), change, far)
             return self._closed(None, rows, far, change, self._advanced(change), begin)
 
+    @property
+    def keys(self) -> GraphKeys:
+        """Keys of the stops, frames and the rig so far, for `add_factors`.
+
+        Frames are numbered as added. Raises InputError where no stop was added.
+        """
+        return self._template.keys
+
+    @property
+    def _template(self) -> HardTemplate:
+        if not self._stop:
+            raise InputError("smoother: expected at least one stop to have keys of, found none")
+        return whole_template(self._drive)
+
+    def add_factors(self, factors: UserFactors) -> Update:
+        """Add GTSAM factors of the caller's, on `keys`; they count from now on, as `solve` counts them.
+
+        Raises InputError, and changes nothing, for a factor that cannot be evaluated where the drive is.
+        """
+        return self.add_factors_of(self._template, factors)
+
+    def add_factors_of(self, template: HardTemplate, factors: UserFactors) -> Update:
+        """The same on the keys of a template of the whole drive, whose frames may be in another order."""
+        begin = time.perf_counter()
+        with blas_on_one_thread():
+            new = self._drive.take_factors(template, factors, self._engine.estimate)
+            change = Change()
+            done = self._advanced(change, new) if new else []
+        return self._update(None, np.zeros(0, dtype=np.int64), change.rejected, done, (), begin)
+
     def remove(self, observations: Observations) -> Update:
         """Take back observations: those with the same `image` (row of `images`) and `track`.
 
@@ -379,8 +410,12 @@ class TraverseSmoother:
         return state_of(self._drive, self.options, self._engine.estimate)
 
     @staticmethod
-    def of(state: SmootherState) -> "TraverseSmoother":
-        """A smoother that goes on from a state: all is linearised where it was estimated to be."""
+    def of(state: SmootherState, factors: UserFactors = ()) -> "TraverseSmoother":
+        """A smoother that goes on from a state: all is linearised where it was estimated to be.
+
+        `factors` are those that the caller had added: a state cannot keep them. Raises InputError for another
+        number of them.
+        """
         t = state.traverse
         smoother = TraverseSmoother(t.rig, state.options)
         drive = smoother._drive
@@ -397,7 +432,14 @@ class TraverseSmoother:
                 smoother._append(t.observations, t.observations.image)
                 drive.ledger.fate[:] = state.fate
             drive.restore(state.track, state.home, Landmarks(vector=state.vector, origin_m=state.origin_m))
-            smoother._engine.restart(state.values())
+            values = state.values()
+            drive.take_factors(smoother._template, factors, values)
+            if len(drive.given) != state.n_given:
+                raise InputError(
+                    f"factors: expected the {state.n_given} that were added before the smoother was kept, "
+                    f"found {len(drive.given)}"
+                )
+            smoother._engine.restart(values)
         return smoother
 
     def save(self, path: Path | str) -> None:
@@ -410,8 +452,11 @@ class TraverseSmoother:
         save_smoother(self.state(), Path(path))
 
     @staticmethod
-    def load(path: Path | str) -> "TraverseSmoother":
-        """A smoother as it was saved. Raises InputError for a file of another version or a damaged one."""
+    def load(path: Path | str, factors: UserFactors = ()) -> "TraverseSmoother":
+        """A smoother as it was saved; `factors` as for `of`.
+
+        Raises InputError for a file of another version or a damaged one.
+        """
         from pancam_graph.smoother._file import load_smoother  # noqa: PLC0415  io imports this module
 
-        return TraverseSmoother.of(load_smoother(Path(path)))
+        return TraverseSmoother.of(load_smoother(Path(path)), factors)

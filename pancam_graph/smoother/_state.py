@@ -40,6 +40,8 @@ class SmootherState:
     """(variables,) numbers of each"""
     value: FloatArray
     """Of all variables one after the other; of a pose the first three rows of its matrix."""
+    n_given: int = 0
+    """Number of factors of the caller's, which no file can keep."""
 
     @staticmethod
     def numbers(values: gtsam.Values, key: int) -> FloatArray:
@@ -79,4 +81,5 @@ def state_of(drive: DriveMap, options: SmootherOptions, values: gtsam.Values) ->
         key=np.array(keys, dtype=np.int64),
         width=np.array([len(part) for part in parts], dtype=np.int64),
         value=np.concatenate([np.zeros(0), *parts]),
+        n_given=len(drive.given),
     )
