@@ -12,8 +12,7 @@ What becomes what (docs/conventions.md for the frames):
 - pan and tilt: of the chain's head frame, so that the chain reproduces the label's camera. They are the
   measured angles where those do (MER: through the label's mast quaternion; Curiosity: through the joints'
   zero points), else angles and axes are fitted to the labels' cameras.
-Labels are turned from z-down to z-up here and nowhere else. Label pixels count from 0 at the centre of
-the first one, as ours do.
+Label pixels count from 0 at the centre of the first one, as ours do.
 """
 
 import logging
@@ -29,9 +28,9 @@ from pancam_graph.base.errors import ImageError, InputError
 from pancam_graph.base.geometry import FloatArray, IntArray, wrap_angle
 from pancam_graph.data import Frame, Image, Stop, Traverse
 from pancam_graph.io._input_format import InputFormat
-from pancam_graph.io._pds_image import PMA_GROUPS, LabelledImage, read_labelled_image
+from pancam_graph.io._pds_image import LabelledImage, read_labelled_image
 from pancam_graph.io._pictures import left_out
-from pancam_graph.rigs import MER_MAST, MastKinematics, ReferenceSigma, RigFit, RigFitOptions, fit_rig
+from pancam_graph.rigs import MastKinematics, ReferenceSigma, RigFit, RigFitOptions, fit_rig
 
 __all__ = ["LOCALISATION_SIGMA", "PDS3", "SAME_POINTING_RAD", "LocalisationSigma", "read_pds"]
 
@@ -177,11 +176,8 @@ def _common_mast(images: Sequence[LabelledImage]) -> MastKinematics:
                 f"{image.label.label_file}: ROVER_MOTION_COUNTER: expected site {first.stop[0]} as in "
                 f"{first.label.label_file.name}, found {image.stop[0]}: poses in two site frames"
             )
-    mast = first.mast
-    if mast is MER_MAST:
-        x, y, z = (float(c) for c in first.label.group(*PMA_GROUPS).numbers("ORIGIN_OFFSET_VECTOR", 3))
-        mast = replace(mast, azimuth_point_m=(x, y, z), elevation_point_m=(x, y, z))
-    return mast
+    rover = first.rover
+    return rover.mast if rover.mast_of is None else rover.mast_of(first.label)
 
 
 def _sort_eyes(images: Sequence[LabelledImage]) -> tuple[IntArray, list[str]]:

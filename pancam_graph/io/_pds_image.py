@@ -4,25 +4,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import gtsam
-import numpy as np
 
 from pancam_graph.base.errors import CameraError, GeometryError, InputError
-from pancam_graph.base.geometry import Z_DOWN_R_Z_UP, FloatArray, pose_from_wxyz, rotation_from_wxyz
+from pancam_graph.base.geometry import FloatArray, pose_from_wxyz
 from pancam_graph.cameras import CAHV, cahv_of_vectors
 from pancam_graph.io._pds_label import LabelGroup, PdsLabel, read_label
+from pancam_graph.io._pds_rover import ROVER_FRAMES, LabelledRover, reference_frame
+from pancam_graph.io._pds_rovers import rover_of
 from pancam_graph.io._pds_samples import image_of_label
-from pancam_graph.rigs import MARS2020_MAST, MER_MAST, MSL_MAST, MastKinematics
+from pancam_graph.rigs import camera_z_up, pose_z_up
 
-__all__ = ["PMA_GROUPS", "LabelledImage", "read_labelled_image"]
+__all__ = ["LabelledImage", "read_labelled_image"]
 
-_ROVER_FRAMES = {"ROVER_FRAME", "ROVER_NAV_FRAME"}
 _CAMERA_GROUPS = ("GEOMETRIC_CAMERA_MODEL", "GEOMETRIC_CAMERA_MODEL_PARMS")
 _ROVER_GROUPS = ("ROVER_COORDINATE_SYSTEM", "ROVER_COORDINATE_SYSTEM_PARMS", "ROVER_COORD_SYSTEM_PARMS")
-PMA_GROUPS = ("PMA_COORDINATE_SYSTEM", "PMA_COORDINATE_SYSTEM_PARMS")
-_RSM_GROUPS = ("RSM_ARTICULATION_STATE", "RSM_ARTICULATION_STATE_PARMS")
-_MAST_CAMERAS = ("PANCAM", "NAVCAM", "NAV_", "MAST_", "MCZ_", "ZCAM", "CHEMCAM", "SUPERCAM", "SCAM")
-_HOSTS = {"MER": MER_MAST, "MSL": MSL_MAST, "M20": MARS2020_MAST, "MARS2020": MARS2020_MAST}
-_Z_UP_T_Z_DOWN = gtsam.Pose3(gtsam.Rot3(Z_DOWN_R_Z_UP), np.zeros(3))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -34,8 +29,7 @@ class LabelledImage:
     instrument: str
     stop: tuple[int, int]
     """Site and drive."""
-    mast: MastKinematics
-    """As published; not yet moved to what the labels say."""
+    rover: LabelledRover
     mast_counter: int | None
     """How often the mast had moved; None where the label does not count."""
     pan_tilt_rad: tuple[float, float]
@@ -52,28 +46,17 @@ def read_labelled_image(file: Path) -> LabelledImage:
     ImageError for a file shorter than its label says.
     """
     label = read_label(file)
-    host = label.top.text("INSTRUMENT_HOST_ID").upper()
-    instrument = label.top.text("INSTRUMENT_ID").upper()
-    if not host.startswith(tuple(_HOSTS)):
-        raise InputError(
-            f"{label.label_file}: INSTRUMENT_HOST_ID: expected MER1, MER2, MSL or M20, found {host!r}"
-        )
-    if not instrument.startswith(_MAST_CAMERAS):
-        raise InputError(
-            f"{label.label_file}: INSTRUMENT_ID: expected a camera on the mast (PANCAM, NAVCAM, MAST, MCZ), "
-            f"found {instrument!r}"
-        )
-    mast = next(mast for prefix, mast in _HOSTS.items() if host.startswith(prefix))
+    rover, host, instrument = rover_of(label)
     camera = label.group(*_CAMERA_GROUPS)
     layout = image_of_label(label).layout
     layout.require_complete()
     try:
         site_T_rover = _pose(label.group(*_ROVER_GROUPS), {"SITE_FRAME"})
         model = _camera_model(camera, layout.width_px, layout.height_px)
-        frame = _reference_frame(camera, _ROVER_FRAMES | {"SITE_FRAME"})
+        frame = reference_frame(camera, ROVER_FRAMES | {"SITE_FRAME"})
         if frame == "SITE_FRAME":
             model = model.transformed(site_T_rover.inverse())
-        angles = _mast_angles(label, mast)
+        pan_tilt_rad = rover.mast.pan_tilt_rad(*rover.joints_rad(label))
     except (CameraError, GeometryError) as error:
         raise InputError(f"{label.label_file}: {error}") from error
     counter = label.counter()
@@ -88,27 +71,17 @@ def read_labelled_image(file: Path) -> LabelledImage:
         host=host,
         instrument=instrument,
         stop=(counter["SITE"], counter["DRIVE"]),
-        mast=mast,
+        rover=rover,
         mast_counter=counter.get("PMA", counter.get("RSM")),
-        pan_tilt_rad=angles,
-        world_T_rover=_Z_UP_T_Z_DOWN * site_T_rover * _Z_UP_T_Z_DOWN,
-        model=model.transformed(_Z_UP_T_Z_DOWN),
+        pan_tilt_rad=pan_tilt_rad,
+        world_T_rover=pose_z_up(site_T_rover),
+        model=camera_z_up(model),
     )
-
-
-def _reference_frame(group: LabelGroup, expected: set[str]) -> str:
-    frame = group.text("REFERENCE_COORD_SYSTEM_NAME").upper()
-    if frame not in expected:
-        raise InputError(
-            f"{group.where}: REFERENCE_COORD_SYSTEM_NAME: expected {' or '.join(sorted(expected))}, "
-            f"found {frame!r}"
-        )
-    return frame
 
 
 def _pose(group: LabelGroup, reference: set[str]) -> gtsam.Pose3:
     """`reference_T_frame` of a coordinate system group, z down."""
-    _reference_frame(group, reference)
+    reference_frame(group, reference)
     offset = group.numbers("ORIGIN_OFFSET_VECTOR", 3)
     wxyz = group.numbers("ORIGIN_ROTATION_QUATERNION", 4)
     try:
@@ -147,27 +120,3 @@ def _linearity(group: LabelGroup, order: list[str], vectors: dict[str, FloatArra
             f"found {vectors['T'][0]:g}"
         )
     return found
-
-
-def _mast_angles(label: PdsLabel, mast: MastKinematics) -> tuple[float, float]:
-    """Measured pan and tilt of the chain."""
-    if mast is MER_MAST:
-        # INSTRUMENT_ELEVATION changes its sign between rovers and the encoders have offsets; the
-        # quaternion is what the camera model was made with.
-        group = label.group(*PMA_GROUPS)
-        _reference_frame(group, _ROVER_FRAMES)
-        rotation = rotation_from_wxyz(group.numbers("ORIGIN_ROTATION_QUATERNION", 4))
-        azimuth = float(np.arctan2(rotation[1, 0], rotation[0, 0]))
-        return mast.pan_tilt_rad(azimuth, float(np.arcsin(np.clip(-rotation[2, 0], -1, 1))))
-    group = label.group(*_RSM_GROUPS)
-    angles = group.angles_rad()
-    found: list[float] = []
-    for names in (mast.azimuth_names, mast.elevation_names):
-        name = next((n for n in names if n in angles), None)
-        if name is None:
-            raise InputError(
-                f"{group.where}: ARTICULATION_DEVICE_ANGLE_NAME: expected {' or '.join(names)} with a value, "
-                f"found {', '.join(angles) or 'none'}"
-            )
-        found.append(angles[name])
-    return mast.pan_tilt_rad(*found)

@@ -1,4 +1,7 @@
-"""Cameras on Perseverance's mast: the models that nasa-jpl/m2020-urdf-models publishes, in RSM_EL, z down."""
+"""Perseverance: the remote sensing mast, Navcam and Mastcam-Z.
+
+The cameras are the models that nasa-jpl/m2020-urdf-models publishes, in RSM_EL, z down.
+"""
 
 from collections.abc import Callable
 from functools import partial
@@ -7,11 +10,31 @@ import numpy as np
 
 from pancam_graph.base.errors import InputError
 from pancam_graph.cameras import CAHVOR, CAHVORE
-from pancam_graph.rigs._masts import MARS2020_MAST
-from pancam_graph.rigs._rig import Rig
-from pancam_graph.rigs._rover_eyes import document_eye, mast_rig
+from pancam_graph.rigs._eyes import document_eye, mast_rig
+from pancam_graph.rigs._mast import MastKinematics
+from pancam_graph.rigs._rig import PointingSigma, Rig
 
-__all__ = ["MASTCAM_Z_TEMPLATES", "mars2020_mastcam_z", "mars2020_navcam"]
+__all__ = ["MARS2020_MAST", "MARS2020_TEMPLATES", "mars2020_mastcam_z", "mars2020_navcam"]
+
+_POINTING = PointingSigma(pan_rad=float(np.deg2rad(0.063)), tilt_rad=float(np.deg2rad(0.063)))
+"""Accuracy of the measured angles: VICAR PigPointM20."""
+
+MARS2020_MAST = MastKinematics(
+    name="mars2020",
+    azimuth_point_m=(0.804037, 0.559028, -1.91927),
+    azimuth_axis=(0.0, 0.0, 1.0),
+    elevation_point_m=(0.804037, 0.559028, -1.91927),
+    elevation_axis=(0.0, 1.0, 0.0),
+    elevation_given_at_rad=2 * np.pi - 3.12414,
+    home_azimuth_rad=2 * np.pi - 3.12414,
+    home_elevation_rad=np.pi - 1.55334,
+    pointing_sigma=_POINTING,
+    mast_height_m=1.98,
+    source="nasa-jpl/m2020-urdf-models (design values)",
+)
+"""Remote sensing mast of Perseverance, as designed: axes that meet. The label of a Navcam image of sol 629
+puts the head 1.1 mm and 1.8 mrad (azimuth), 1.2 mrad (elevation), 2.5 mrad (roll) off these values, so
+the flight unit's axes have to be fitted to the labels."""
 
 _SOURCE = "m2020-camera-models.json"
 
@@ -210,6 +233,7 @@ def _mastcam_z_name(zoom_mm: int) -> str:
     return f"mars2020-mastcam-z-{zoom_mm}mm"
 
 
-MASTCAM_Z_TEMPLATES: dict[str, Callable[[], Rig]] = {
-    _mastcam_z_name(zoom): partial(mars2020_mastcam_z, zoom) for zoom in _MASTCAM_Z
+MARS2020_TEMPLATES: dict[str, Callable[[], Rig]] = {
+    "mars2020-navcam": mars2020_navcam,
+    **{_mastcam_z_name(zoom): partial(mars2020_mastcam_z, zoom) for zoom in _MASTCAM_Z},
 }

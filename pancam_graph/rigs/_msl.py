@@ -1,15 +1,36 @@
-"""Cameras on Curiosity's mast."""
+"""Curiosity: the remote sensing mast, Navcam and Mastcam."""
 
 import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pancam_graph.cameras import CAHV, CAHVOR
-from pancam_graph.rigs._masts import MSL_MAST
-from pancam_graph.rigs._rig import Eye, Rig
-from pancam_graph.rigs._rover_eyes import label_eye, mast_rig
+from pancam_graph.rigs._eyes import label_eye, mast_rig
+from pancam_graph.rigs._mast import MastKinematics
+from pancam_graph.rigs._rig import Eye, PointingSigma, Rig
 
-__all__ = ["msl_mastcam", "msl_navcam"]
+__all__ = ["MSL_MAST", "MSL_TEMPLATES", "msl_mastcam", "msl_navcam"]
+
+_POINTING = PointingSigma(pan_rad=float(np.deg2rad(0.063)), tilt_rad=float(np.deg2rad(0.063)))
+"""Accuracy of the measured angles: VICAR PigPointMSL."""
+
+MSL_MAST = MastKinematics(
+    name="msl",
+    # Published in the mechanical frame; ROVER_NAV_FRAME = that + (0.09002, 0, -1.1205).
+    azimuth_point_m=(0.714803 + 0.09002, 0.559424, -1.109344 - 1.1205),
+    azimuth_axis=(-0.001, 0.0, 1.0),
+    elevation_point_m=(0.714668 + 0.09002, 0.561701, -0.785576 - 1.1205),
+    elevation_axis=(-0.022, -1.0, 0.0),
+    elevation_given_at_rad=0.0,
+    home_azimuth_rad=3.167345,
+    home_elevation_rad=1.588171,
+    pointing_sigma=_POINTING,
+    mast_height_m=1.97,
+    source="VICAR PigPointMSLmastCamera, as-measured values; sign of the elevation axis from labels",
+)
+"""Remote sensing mast of Curiosity. The elevation axis is published with y = +1, which contradicts the
+labels: with y = -1 (it is given at azimuth 0, where the head looks backwards) the head poses in two
+Mastcam labels (sols 1664 and 2264) come out to 1 um and 1 urad."""
 
 _NAVCAM_RIGHT_B = CAHVOR(
     width_px=1024,
@@ -86,3 +107,6 @@ def msl_mastcam() -> Rig:
     )
     source = "PDS labels 2264ML0121141200805116C00_DRCL, 1664MR0086340000802438C00_DRCL"
     return mast_rig("msl-mastcam", MSL_MAST, eyes, source)
+
+
+MSL_TEMPLATES = {"msl-navcam": msl_navcam, "msl-mastcam": msl_mastcam}

@@ -7,7 +7,7 @@ from pancam_graph.base.geometry import HEAD_R_FORWARD_CAMERA, FloatArray, rz
 from pancam_graph.cameras import Pinhole
 from pancam_graph.rigs._rig import Eye, PointingSigma, Rig
 
-__all__ = ["ladybug3", "ladybug5"]
+__all__ = ["RING_TEMPLATES", "ladybug3", "ladybug5"]
 
 _RING_CAMERAS = 5
 _HEAD_R_UPWARD_CAMERA: FloatArray = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -67,3 +67,6 @@ def _ladybug(*, name: str, radius_m: float, top_m: float, camera: Pinhole, sourc
         turns=False,
         source=source,
     )
+
+
+RING_TEMPLATES = {"ladybug3": ladybug3, "ladybug5": ladybug5}

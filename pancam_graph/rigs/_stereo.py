@@ -8,7 +8,7 @@ from pancam_graph.base.geometry import HEAD_R_FORWARD_CAMERA, rz
 from pancam_graph.cameras import Pinhole
 from pancam_graph.rigs._rig import Eye, PointingSigma, Rig
 
-__all__ = ["stereo_pan_tilt"]
+__all__ = ["STEREO_TEMPLATES", "stereo_pan_tilt"]
 
 _POINTING = PointingSigma(pan_rad=float(np.deg2rad(0.1)), tilt_rad=float(np.deg2rad(0.1)))
 
@@ -82,3 +82,6 @@ def stereo_pan_tilt(
         mast_height_m=mast_height_m,
         source="parameters of stereo_pan_tilt",
     )
+
+
+STEREO_TEMPLATES = {"stereo-pan-tilt": stereo_pan_tilt}

@@ -17,7 +17,16 @@ from pancam_graph.cameras import (
     decompose_projection,
     projection_matrix,
 )
-from support.published_cameras import MODEL_A, MODEL_B, MODEL_C
+from support.published_cameras import (
+    LINEAR_PIXEL_B,
+    MODEL_A,
+    MODEL_B,
+    MODEL_C,
+    PIXEL_B,
+    PIXELS_C,
+    POINT_B,
+    POINTS_C,
+)
 
 # Their pixels in the tests were computed by two independent programs.
 PINHOLE = Pinhole(
@@ -66,11 +75,10 @@ def pixel(camera: Camera, point: tuple[float, float, float]) -> FloatArray:
 def test_published_pixels() -> None:
     a = pixel(MODEL_A, (-0.593194, 0.294442, 0.545509))
     assert a == pytest.approx([599.66607394, 131.22968783], abs=5e-9)
-    b = (4.517368, 0.544692, 1.752992)
-    assert pixel(MODEL_B, b) == pytest.approx([680.20780863, 419.72866434], abs=5e-9)
-    assert pixel(CAHV_B, b) == pytest.approx([680.1977727, 419.73463548], abs=5e-8)
-    assert pixel(MODEL_C, (5.0, -1.5, 1.0)) == pytest.approx([1852.618962, 2538.835153], abs=5e-7)
-    assert pixel(MODEL_C, (3.0, 1.0, 0.5)) == pytest.approx([3804.139186, 2467.839948], abs=5e-7)
+    assert pixel(MODEL_B, POINT_B) == pytest.approx(PIXEL_B, abs=5e-9)
+    assert pixel(CAHV_B, POINT_B) == pytest.approx(LINEAR_PIXEL_B, abs=5e-8)
+    for point, expected in zip(POINTS_C, PIXELS_C, strict=True):
+        assert pixel(MODEL_C, point) == pytest.approx(expected, abs=5e-7)
 
 
 def test_published_intrinsics() -> None:

@@ -1,7 +1,9 @@
 """Published camera models that several test modules use.
 
 A is of an unnamed rover camera, B Curiosity's right Navcam in the rover frame, C Perseverance's left Navcam
-in the head frame.
+in the head frame. B and C come from the same publications as the shipped rigs: that their numbers are equal
+to a rig's shows nothing. What shows something is the pixel that a published point has, computed from these
+numbers by two independent programs: `PIXEL_B` and `PIXELS_C`.
 """
 
 import numpy as np
@@ -40,3 +42,12 @@ MODEL_C = CAHVORE(
     E=np.array([-0.003612, 0.013016, -0.023961]),
     linearity=0.37,
 )
+
+POINT_B = (4.517368, 0.544692, 1.752992)
+PIXEL_B = (680.20780863, 419.72866434)
+"""Of `POINT_B` with model B, in the rover frame."""
+LINEAR_PIXEL_B = (680.1977727, 419.73463548)
+"""The same without distortion: C, A, H and V alone."""
+POINTS_C = ((5.0, -1.5, 1.0), (3.0, 1.0, 0.5))
+PIXELS_C = ((1852.618962, 2538.835153), (3804.139186, 2467.839948))
+"""Of `POINTS_C` with model C, in the head frame."""

@@ -1,0 +1,17 @@
+"""Labels of Perseverance. Source: the camera SIS of Mars 2020."""
+
+from pancam_graph.io._pds_rover import LabelledRover, named_joints
+from pancam_graph.rigs import MARS2020_MAST
+
+__all__ = ["MARS2020"]
+
+MARS2020 = LabelledRover(
+    hosts=("M20", "MARS2020"),
+    named="M20",
+    cameras=("NAVCAM", "NAV_", "MCZ_", "ZCAM", "SUPERCAM", "SCAM"),
+    mast=MARS2020_MAST,
+    joints_rad=named_joints(
+        azimuth=("AZIMUTH FINAL-RESOLVER", "AZIMUTH-MEASURED", "AZIMUTH FINAL-ENCODER"),
+        elevation=("ELEVATION FINAL-RESOLVER", "ELEVATION-MEASURED", "ELEVATION FINAL-ENCODER"),
+    ),
+)

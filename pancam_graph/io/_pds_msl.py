@@ -1,0 +1,16 @@
+"""Labels of Curiosity. Source: the camera SIS of MSL."""
+
+from pancam_graph.io._pds_rover import LabelledRover, named_joints
+from pancam_graph.rigs import MSL_MAST
+
+__all__ = ["MSL"]
+
+MSL = LabelledRover(
+    hosts=("MSL",),
+    named="MSL",
+    cameras=("NAV_", "NAVCAM", "MAST_", "CHEMCAM"),
+    mast=MSL_MAST,
+    joints_rad=named_joints(
+        azimuth=("AZIMUTH-MEASURED", "AZIMUTH-FINAL"), elevation=("ELEVATION-MEASURED", "ELEVATION-FINAL")
+    ),
+)

@@ -1,0 +1,38 @@
+"""ExoMars (Rosalind Franklin): PanCam. Offsets of eyes are in our head frame, z up."""
+
+import gtsam
+import numpy as np
+
+from pancam_graph.rigs._eyes import design_eye
+from pancam_graph.rigs._mer import MER_POINTING
+from pancam_graph.rigs._rig import Rig
+
+__all__ = ["EXOMARS_TEMPLATES", "exomars_pancam"]
+
+
+def exomars_pancam() -> Rig:
+    """PanCam of ExoMars (Rosalind Franklin): two wide-angle eyes (WAC) and the zoomed one (HRC).
+
+    Focal lengths 1474 px (38.3 degrees) and 12016 px (4.88 degrees), 1024 x 1024, and the WAC's 0.500 m
+    baseline are from Coates et al. 2017 (the structure kernel implies 0.490 m); the thesis gives 22 mm
+    (34 degrees) and 180 mm (5 degrees) of an earlier design. The toe-in of 2.8 degrees is taken as the
+    angle between the WACs. Offsets from the pan-tilt pivot, WAC (0, +-0.25, 0.06) m and HRC (0, -0.15,
+    0.06) m, and axes that meet: ESA's frame and structure kernels. Pointing accuracy is not published;
+    that of MER stands in. Mast about 2 m.
+    """
+    toe_in = np.deg2rad(2.8) / 2
+    return Rig(
+        name="exomars-pancam",
+        pan_T_tilt=gtsam.Pose3(),
+        eyes=(
+            design_eye("wac-left", 1474.0, 1024, (0.0, 0.25, 0.06), -toe_in),
+            design_eye("wac-right", 1474.0, 1024, (0.0, -0.25, 0.06), toe_in),
+            design_eye("hrc", 12016.0, 1024, (0.0, -0.15, 0.06), 0.0),
+        ),
+        pointing_sigma=MER_POINTING,
+        mast_height_m=2.0,
+        source="Coates et al. 2017; ESA ExoMars frame and structure kernels",
+    )
+
+
+EXOMARS_TEMPLATES = {"exomars-pancam": exomars_pancam}
