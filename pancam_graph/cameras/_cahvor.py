@@ -67,11 +67,11 @@ class CAHVOR(CAHV):
             if np.all(np.abs(step) < 1e-15):
                 break
         value = r2 * t**2 * u**5 + r1 * t * u**3 + (1 + r0) * u - 1
-        found = ray - (1 - u)[:, None] * lateral
+        undistorted = ray - (1 - u)[:, None] * lateral
         # The polynomial takes O for a unit vector; one Newton step on the model itself takes it as it is.
-        again, jacobian, _ = self._distort_with_jacobian(found)
-        found = found - np.linalg.solve(jacobian, (again - ray)[..., None])[..., 0]
-        return found, valid & (np.abs(value) < 1e-10) & (u > 0)
+        again, jacobian, _ = self._distort_with_jacobian(undistorted)
+        undistorted = undistorted - np.linalg.solve(jacobian, (again - ray)[..., None])[..., 0]
+        return undistorted, valid & (np.abs(value) < 1e-10) & (u > 0)
 
 
 CAHVOR_FIELDS = (

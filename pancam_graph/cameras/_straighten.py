@@ -103,9 +103,9 @@ def _looked_up(
     for begin in range(0, len(rows), step):
         grid = _grid(columns, rows[begin : begin + step])
         uv = grid.reshape(-1, 2)
-        found, valid = camera.project(range_m * straight.unproject(uv).direction)
+        pixels, valid = camera.project(range_m * straight.unproject(uv).direction)
         # Past where a lens folds back, a direction has an image too, but of a pixel that looks elsewhere.
-        again, _, known = straight_pixels(camera, straight, found, np.full(len(uv), range_m))
+        again, _, known = straight_pixels(camera, straight, pixels, np.full(len(uv), range_m))
         valid &= known & (np.linalg.norm(again - uv, axis=1) < _AGAIN_PX)
-        out[begin : begin + step] = np.where(valid[:, None], found, np.nan).reshape(grid.shape)
+        out[begin : begin + step] = np.where(valid[:, None], pixels, np.nan).reshape(grid.shape)
     return out

@@ -89,9 +89,9 @@ def _doubled_key(value: object, doubled: dict[int, str], location: tuple[int | s
     else:
         children = list(enumerate(value)) if isinstance(value, list) else []
     for key, child in children:
-        found = _doubled_key(child, doubled, (*location, key))
-        if found is not None:
-            return found
+        doubled_in_child = _doubled_key(child, doubled, (*location, key))
+        if doubled_in_child is not None:
+            return doubled_in_child
     return None
 
 

@@ -33,20 +33,20 @@ def mask_file(traverse: Traverse, row: int) -> Path | None:
         return traverse.folder / image.mask
     folder = traverse.folder / MASKS
     try:
-        found = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
+        masks = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
     except OSError:
         return None
     frame = traverse.frames[traverse.image_frame[row]]
-    exact = [p for p in found if p.stem == image.id]
+    exact = [p for p in masks if p.stem == image.id]
     pointed = []
-    for path in found:
+    for path in masks:
         name = _POINTING.fullmatch(path.stem)
         if name is not None and name["camera"] == image.camera:
             pan, tilt = (np.deg2rad(float(name[k])) for k in ("pan", "tilt"))
             off = max(abs(float(wrap_angle(pan - frame.pan_rad))), abs(float(tilt - frame.tilt_rad)))
             if off <= _SAME_POINTING_RAD:
                 pointed.append((off, path))
-    camera = [p for p in found if p.stem == image.camera]
+    camera = [p for p in masks if p.stem == image.camera]
     return next(iter([*exact, *(p for _, p in sorted(pointed)), *camera]), None)
 
 

@@ -113,10 +113,10 @@ def _camera_model(group: LabelGroup, width_px: int, height_px: int) -> CAHV:
 
 def _linearity(group: LabelGroup, order: list[str], vectors: dict[str, FloatArray]) -> float:
     """By T: 1 perspective, 2 fish-eye, 3 general with the linearity in P."""
-    found = {1: 1.0, 2: 0.0, 3: float(vectors["P"][0])}.get(int(vectors["T"][0]))
-    if found is None:
+    linearity = {1: 1.0, 2: 0.0, 3: float(vectors["P"][0])}.get(int(vectors["T"][0]))
+    if linearity is None:
         raise InputError(
             f"{group.where}: MODEL_COMPONENT_{order.index('T') + 1}: expected a CAHVORE type of 1, 2 or 3, "
             f"found {vectors['T'][0]:g}"
         )
-    return found
+    return linearity

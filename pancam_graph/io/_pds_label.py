@@ -89,11 +89,11 @@ class ImageLayout:
         """Raise ImageError if the file is missing or shorter than its label says."""
         if not self.file.is_file():
             raise ImageError(f"{self.file}: expected an image file, found none")
-        found = self.file.stat().st_size
-        if found < self.end_bytes:
+        size = self.file.stat().st_size
+        if size < self.end_bytes:
             raise ImageError(
                 f"{self.file}: ^IMAGE: expected {self.end_bytes} bytes or more for {self.height_px} lines of "
-                f"{self.width_px} samples, found {found}: the file is truncated"
+                f"{self.width_px} samples, found {size}: the file is truncated"
             )
 
 
@@ -122,10 +122,10 @@ class LabelGroup:
         """An integer of 0 or above."""
         if default is not None and key not in self.items:
             return default
-        found = _plain(self.value(key))
-        if isinstance(found, bool) or not isinstance(found, int) or found < 0:
-            self._fail(key, "an integer of 0 or above", repr(found))
-        return found
+        number = _plain(self.value(key))
+        if isinstance(number, bool) or not isinstance(number, int) or number < 0:
+            self._fail(key, "an integer of 0 or above", repr(number))
+        return number
 
     def names(self, key: str) -> list[str]:
         """A list of words."""
@@ -133,17 +133,17 @@ class LabelGroup:
 
     def numbers(self, key: str, count: int | None = None) -> FloatArray:
         """Finite numbers, (count,) if a count is given, units dropped (angles: see `angles`)."""
-        found = [_plain(v) for v in _as_list(self.value(key))]
-        if count is not None and len(found) != count:
-            self._fail(key, f"{count} numbers", found)
-        return np.array([self._number(key, v) for v in found])
+        values = [_plain(v) for v in _as_list(self.value(key))]
+        if count is not None and len(values) != count:
+            self._fail(key, f"{count} numbers", values)
+        return np.array([self._number(key, v) for v in values])
 
-    def _number(self, key: str, found: Any) -> float:
-        if isinstance(found, bool) or not isinstance(found, int | float):
-            self._fail(key, "a number", repr(found))
-        if not np.isfinite(found) or abs(found) > _NO_VALUE:
-            self._fail(key, "a finite number", found)
-        return float(found)
+    def _number(self, key: str, value: Any) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            self._fail(key, "a number", repr(value))
+        if not np.isfinite(value) or abs(value) > _NO_VALUE:
+            self._fail(key, "a finite number", value)
+        return float(value)
 
     def angles_rad(self, key: str = "ARTICULATION_DEVICE_ANGLE") -> dict[str, float]:
         """Angles by the name that the entry's _NAME list gives them; those without a value left out.

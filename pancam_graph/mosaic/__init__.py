@@ -7,7 +7,7 @@ from pancam_graph.mosaic._files import write_mosaics as write_mosaics
 from pancam_graph.mosaic._make import Mosaic as Mosaic
 from pancam_graph.mosaic._make import StopMosaics as StopMosaics
 from pancam_graph.mosaic._make import make_mosaics as make_mosaics
-from pancam_graph.mosaic._options import MosaicOptions as MosaicOptions
+from pancam_graph.mosaic._mosaic_options import MosaicOptions as MosaicOptions
 from pancam_graph.mosaic._projections import Cylinder as Cylinder
 from pancam_graph.mosaic._projections import Ground as Ground
 from pancam_graph.mosaic._seam_error import Overlap as Overlap

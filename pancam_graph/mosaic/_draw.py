@@ -187,11 +187,11 @@ def close_ups(mosaics: StopMosaics, most: int) -> list[tuple[int, dict[Pointing,
         (k for k, o in enumerate(mosaics.seams.overlaps) if o.close_up),
         key=lambda k: -len(mosaics.seams.overlaps[k].azimuth_deg),
     )
-    found = []
+    magnified = []
     for k in sorted(order[:most]):
         pieces = mosaics.seams.overlaps[k].close_up
-        found.append((k, {p: _magnified(pieces[p][..., ::-1]) for p in POINTINGS}))
-    return found
+        magnified.append((k, {p: _magnified(pieces[p][..., ::-1]) for p in POINTINGS}))
+    return magnified
 
 
 def _magnified(piece: Picture) -> Picture:

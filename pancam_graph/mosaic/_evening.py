@@ -124,10 +124,10 @@ def even_out(layers: Sequence[Small]) -> Evening:
         shape = np.power(_RADII[:, None] ** 2, _POWERS)
         change = (without - without.mean(axis=0)) @ shape.T
         spread = np.sqrt((len(parts) - 1) / len(parts) * np.sum(change**2, axis=0))
-        found = shape @ full[n:]
+        darkening = shape @ full[n:]
         if spread.max() < _KNOWN:
             sigma = float(spread[-1])
-            if np.any(np.abs(found) > np.maximum(_SIGNIFICANT * spread, _LEAST)):
+            if np.any(np.abs(darkening) > np.maximum(_SIGNIFICANT * spread, _LEAST)):
                 solution, vignetting = full, full[n:]
     gains = np.exp(solution[:n]).tolist()
     return Evening(gain=dict(zip(numbers, gains, strict=True)), vignetting=vignetting, sigma=sigma)

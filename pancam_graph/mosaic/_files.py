@@ -16,7 +16,7 @@ from pancam_graph.data import Solution
 from pancam_graph.io import MOSAIC_FORMAT, VERSION, same_pictures
 from pancam_graph.mosaic._draw import close_ups, comparison, with_axes
 from pancam_graph.mosaic._make import Mosaic, StopGround, StopMosaics, make_mosaics, stop_ground
-from pancam_graph.mosaic._options import MosaicOptions
+from pancam_graph.mosaic._mosaic_options import MosaicOptions
 from pancam_graph.mosaic._placed import POINTINGS, Pointing
 from pancam_graph.mosaic._projections import Cylinder
 from pancam_graph.mosaic._seam_error import CASES, Case
@@ -117,9 +117,9 @@ def _in_words(made: StopMosaics) -> str:
     seams = made.seams
     if not seams.used:
         return "no overlap with texture enough to measure a seam error"
-    own = seams.median_px("telemetry_own_surface")
+    own_surface = seams.median_px("telemetry_own_surface")
     return (
-        f"seam error {seams.median_px('telemetry'):.2f} px with telemetry ({own:.2f} px on the surface that "
+        f"seam error {seams.median_px('telemetry'):.2f} px with telemetry ({own_surface:.2f} px on the surface that "
         f"its own landmarks span), {seams.median_px('refined'):.2f} px refined; median of {seams.used} "
         f"windows in {len(seams.overlaps)} overlaps"
     )
@@ -182,8 +182,8 @@ def _brightness(made: StopMosaics) -> Json:
 
 def _seam_error(made: StopMosaics) -> Json:
     def medians(median_px: Callable[[Case], float]) -> Json:
-        found = {case: median_px(case) for case in CASES}
-        return {f"{case}_px": None if math.isnan(px) else px for case, px in found.items()}
+        median = {case: median_px(case) for case in CASES}
+        return {f"{case}_px": None if math.isnan(px) else px for case, px in median.items()}
 
     overlaps: list[Json] = []
     for o in made.seams.overlaps:
@@ -205,7 +205,7 @@ def _encoded(picture: NDArray[np.uint8] | NDArray[np.uint16], suffix: str, quali
 
 def _blinks(made: StopMosaics, group: str) -> list[Blink]:
     """The panorama, pieces of its overlaps, and the view from above."""
-    found = [_blink_of(made.cylinder, group, "panorama", _BLINK_WIDTH_PX)]
+    blinks = [_blink_of(made.cylinder, group, "panorama", _BLINK_WIDTH_PX)]
     for k, pieces in close_ups(made, _CLOSE_UPS):
         overlap = made.seams.overlaps[k]
         captions: dict[Pointing, str] = {
@@ -213,10 +213,10 @@ def _blinks(made: StopMosaics, group: str) -> list[Blink]:
             "refined": f"refined: displaced by {overlap.median_px('refined'):.2f} px (median)",
         }
         title = f"overlap of {overlap.images[0]} and {overlap.images[1]}"
-        found.append(_blink(group, title, captions, pieces))
+        blinks.append(_blink(group, title, captions, pieces))
     if made.ground is not None:
-        found.append(_blink_of(made.ground, group, "from above", _BLINK_GROUND_PX))
-    return found
+        blinks.append(_blink_of(made.ground, group, "from above", _BLINK_GROUND_PX))
+    return blinks
 
 
 def _blink_of(mosaic: Mosaic, group: str, title: str, width_px: int) -> Blink:

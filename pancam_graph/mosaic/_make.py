@@ -12,7 +12,7 @@ from pancam_graph.data import Solution
 from pancam_graph.io import same_pictures
 from pancam_graph.mosaic._blend import blend, choose_look
 from pancam_graph.mosaic._evening import Evening
-from pancam_graph.mosaic._options import MosaicOptions
+from pancam_graph.mosaic._mosaic_options import MosaicOptions
 from pancam_graph.mosaic._placed import (
     POINTINGS,
     PlacedImage,

@@ -15,9 +15,9 @@ from pancam_graph.io import GreyImage, mask_file, read_mask, read_picture
 
 __all__ = [
     "POINTINGS",
+    "PlacedCamera",
     "PlacedImage",
     "Pointing",
-    "Station",
     "View",
     "placed_images",
     "view_from_stop",
@@ -28,7 +28,7 @@ POINTINGS: tuple[Pointing, ...] = ("telemetry", "refined")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Station:
+class PlacedCamera:
     """A camera at a pose in the world."""
 
     camera: Camera
@@ -44,7 +44,7 @@ class Station:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlacedImage:
-    """An image with its two stations."""
+    """An image with its two cameras."""
 
     id: str
     grey: GreyImage
@@ -52,7 +52,7 @@ class PlacedImage:
     """Where the image has data, of the image's shape."""
     wanted: BoolArray
     """Where the user's mask is white, of the same shape; everywhere without one."""
-    at: dict[Pointing, Station]
+    at: dict[Pointing, PlacedCamera]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -126,15 +126,15 @@ def placed_images(
             warnings.append(f"mosaic: image {entry.id} is left out: {error}")
             continue
         camera = traverse.rig.eyes[eye].camera
-        stations = {}
+        cameras = {}
         for pointing, view in views.items():
-            own = camera
+            adjusted = camera
             if pointing == "refined" and np.any(solution.calibration[row] != traverse.calibration[row]):
-                own = camera.with_calibration(solution.calibration[row])
-            stations[pointing] = Station(
-                camera=own, world_R_camera=view.world_R_camera[row], centre_m=view.world_t_camera[row]
+                adjusted = camera.with_calibration(solution.calibration[row])
+            cameras[pointing] = PlacedCamera(
+                camera=adjusted, world_R_camera=view.world_R_camera[row], centre_m=view.world_t_camera[row]
             )
         images.append(
-            PlacedImage(id=entry.id, grey=grey, usable=usable_mask(grey), wanted=wanted, at=stations)
+            PlacedImage(id=entry.id, grey=grey, usable=usable_mask(grey), wanted=wanted, at=cameras)
         )
     return images, warnings

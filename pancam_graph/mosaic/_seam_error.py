@@ -113,7 +113,7 @@ def seam_error(
     cylinder = overview.projection
     assert isinstance(cylinder, Cylinder)
     seen = [overview.seen_by(image.at["refined"])[1] for image in images]
-    found = []
+    overlaps = []
     for i, first in enumerate(images):
         for j in range(i + 1, len(images)):
             both = seen[i] & seen[j]
@@ -121,8 +121,8 @@ def seam_error(
                 around = _around(cylinder, both, px_per_degree)
                 overlap = _overlap(first, images[j], surfaces, around)
                 if overlap is not None:
-                    found.append(overlap)
-    return SeamError(overlaps=tuple(found))
+                    overlaps.append(overlap)
+    return SeamError(overlaps=tuple(overlaps))
 
 
 def _around(overview: Cylinder, cells: BoolArray, px_per_degree: float) -> Cylinder:

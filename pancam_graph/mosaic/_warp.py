@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pancam_graph.base.geometry import BoolArray, FloatArray
-from pancam_graph.mosaic._placed import PlacedImage, Pointing, Station
+from pancam_graph.mosaic._placed import PlacedCamera, PlacedImage, Pointing
 from pancam_graph.mosaic._projections import Ground, Projection
 from pancam_graph.mosaic._surface import Surface
 
@@ -60,35 +60,35 @@ class Lattice:
         points = projection.points_m(surface, column.ravel().astype(float), row.ravel().astype(float))
         return Lattice(projection=projection, points_m=points.reshape(rows, columns, 3))
 
-    def seen_by(self, station: Station) -> tuple[NDArray[np.float32], BoolArray]:
+    def seen_by(self, placed: PlacedCamera) -> tuple[NDArray[np.float32], BoolArray]:
         """Where a camera sees the lattice, (rows, columns, 2), NaN far from its image; and which cells.
 
         Cells (rows - 1, columns - 1) count as seen if a corner of them is, or if the image could reach in.
         """
         rows, columns = self.points_m.shape[:2]
         pixels = np.full((rows * columns, 2), np.nan, dtype=np.float32)
-        to_point = self.points_m.reshape(-1, 3) - station.centre_m
-        axis, half_rad = _cone(station)
+        to_point = self.points_m.reshape(-1, 3) - placed.centre_m
+        axis, half_rad = _cone(placed)
         range_m = np.maximum(np.linalg.norm(to_point, axis=1), 1e-9)
         near = np.flatnonzero(to_point @ axis > np.cos(min(half_rad, 3.0)) * range_m)
-        uv, valid = station.project(self.points_m.reshape(-1, 3)[near])
+        uv, valid = placed.project(self.points_m.reshape(-1, 3)[near])
         pixels[near[valid]] = uv[valid]
         seen = np.zeros(rows * columns, dtype=bool)
-        seen[near] = valid & station.camera.contains(uv)
+        seen[near] = valid & placed.camera.contains(uv)
         grown = cv2.dilate(seen.reshape(rows, columns).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
         cells = grown[:-1, :-1] | grown[1:, :-1] | grown[:-1, 1:] | grown[1:, 1:]
         return pixels.reshape(rows, columns, 2), cells
 
 
-def _cone(station: Station) -> tuple[FloatArray, float]:
+def _cone(placed: PlacedCamera) -> tuple[FloatArray, float]:
     """Axis (3,) in the world and half angle of a cone that holds a camera's field, with room to spare."""
-    camera = station.camera
+    camera = placed.camera
     right, bottom = camera.width_px - 1.0, camera.height_px - 1.0
     edge = np.array([[x, y] for x in (0, right / 2, right) for y in (0, bottom / 2, bottom)])
     ray = camera.unproject(edge).direction
     axis = ray[4]
     half = float(np.arccos(np.clip((ray @ axis).min(), -1.0, 1.0)))
-    return station.world_R_camera @ axis, 1.2 * half + np.deg2rad(2.0)
+    return placed.world_R_camera @ axis, 1.2 * half + np.deg2rad(2.0)
 
 
 def largest_gap(covered: BoolArray) -> tuple[int, int]:

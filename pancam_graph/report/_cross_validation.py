@@ -30,21 +30,21 @@ _SCORE_CAPTION = (
 )
 
 
-def cross_validation_section(found: CrossValidation | None, traverse: Traverse) -> str:
+def cross_validation_section(validation: CrossValidation | None, traverse: Traverse) -> str:
     """The section as HTML; nothing without a cross-validation."""
-    if found is None:
+    if validation is None:
         return ""
-    warnings = "".join(f"<li>{escape(w)}</li>" for w in found.warnings)
+    warnings = "".join(f"<li>{escape(w)}</li>" for w in validation.warnings)
     notes = f'<ul class="notes">{warnings}</ul>\n' if warnings else ""
     return (
         "<section>\n<h2>Cross-validation</h2>\n"
-        f"<p>{escape(_MEANING)}</p>\n{notes}{_sigma_table(found, traverse)}\n"
-        f'<p class="caption">{escape(_CAPTION)}</p>\n{_score_table(found)}\n'
+        f"<p>{escape(_MEANING)}</p>\n{notes}{_sigma_table(validation, traverse)}\n"
+        f'<p class="caption">{escape(_CAPTION)}</p>\n{_score_table(validation)}\n'
         f'<p class="caption">{escape(_SCORE_CAPTION)}</p>\n</section>'
     )
 
 
-def _sigma_table(found: CrossValidation, traverse: Traverse) -> str:
+def _sigma_table(validation: CrossValidation, traverse: Traverse) -> str:
     columns = (
         ("quantity", "what the sigmas are of"),
         ("of", "ids of the frames or of the stop"),
@@ -57,12 +57,12 @@ def _sigma_table(found: CrossValidation, traverse: Traverse) -> str:
         ("upper to lower", "size of the difference between the solutions of the upper and the lower halves"),
     )
     ids = [f.id for f in traverse.frames]
-    pairs = [f"{ids[i]} → {ids[j]}" for i, j in found.pairs.tolist()]
+    pairs = [f"{ids[i]} → {ids[j]}" for i, j in validation.pairs.tolist()]
     axes = ("roll", "pitch", "heading", "position x", "position y", "position z")
     rows = [
-        *_rows(("relative pan", "relative tilt"), ("mrad",) * 2, pairs, found.relative_pointing),
-        *_rows(("pan", "tilt"), ("mrad",) * 2, ids, found.pointing),
-        *_rows(axes, ("mrad",) * 3 + ("mm",) * 3, [s.id for s in traverse.stops], found.stops),
+        *_rows(("relative pan", "relative tilt"), ("mrad",) * 2, pairs, validation.relative_pointing),
+        *_rows(("pan", "tilt"), ("mrad",) * 2, ids, validation.pointing),
+        *_rows(axes, ("mrad",) * 3 + ("mm",) * 3, [s.id for s in traverse.stops], validation.stops),
     ]
     return table("Formal and honest sigmas", columns, rows, texts=3)
 
@@ -88,7 +88,7 @@ def _rows(
             yield kind, name, unit, *cells, fixed(sigmas.ratio[i, k], 1), apart
 
 
-def _score_table(found: CrossValidation) -> str:
+def _score_table(validation: CrossValidation) -> str:
     columns = (
         ("half", "which half of the points"),
         ("points", "points of this half"),
@@ -105,6 +105,6 @@ def _score_table(found: CrossValidation) -> str:
             f"{s.scored}",
             *(fixed(n, 3) for n in (s.own_px, s.own_expected_px, s.other_px, s.other_expected_px)),
         )
-        for s in found.scores
+        for s in validation.scores
     ]
     return table("Halves scored by each other", columns, rows, texts=1)

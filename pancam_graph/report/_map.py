@@ -9,7 +9,7 @@ from pancam_graph.data import Solution
 from pancam_graph.report._look import AFTER, BEFORE, INK, RESIDUAL_SCALE, Figure, axis, layout
 from pancam_graph.report._numbers import Json, decimals_for, polyline, round_factor, rounded, short, thinned
 from pancam_graph.report._scene import near_spacing
-from pancam_graph.report._terrain import Terrain
+from pancam_graph.report._shown_terrain import ShownTerrain
 
 __all__ = ["ellipse_outlines", "make_map", "place_labels", "translation_covariance_in_world"]
 
@@ -62,7 +62,7 @@ def place_labels(at_m: FloatArray, sizes_m: list[FloatArray], *, clear_m: float)
     return placed
 
 
-def _landmark_trace(terrain: Terrain) -> Json:
+def _landmark_trace(terrain: ShownTerrain) -> Json:
     keep = thinned(len(terrain.points_m), _MAX_LANDMARKS)
     decimals = decimals_for(terrain.extent_m)
     return {
@@ -83,7 +83,7 @@ def _landmark_trace(terrain: Terrain) -> Json:
     }
 
 
-def _direction_trace(solution: Solution, terrain: Terrain, length_m: float) -> Json:
+def _direction_trace(solution: Solution, terrain: ShownTerrain, length_m: float) -> Json:
     """A line from the mast along each frame's mean line of sight."""
     traverse = solution.traverse
     sight = np.zeros((len(traverse.frames), 2))
@@ -107,7 +107,7 @@ def _direction_trace(solution: Solution, terrain: Terrain, length_m: float) -> J
     }
 
 
-def make_map(solution: Solution, terrain: Terrain) -> Figure:
+def make_map(solution: Solution, terrain: ShownTerrain) -> Figure:
     """The map of a solution, over the ground plan of the scene's box.
 
     Ellipses hold 95 % of the formal uncertainty, body covariances turned to the world; where they are too
@@ -184,7 +184,7 @@ def make_map(solution: Solution, terrain: Terrain) -> Figure:
     )
 
 
-def _caption(terrain: Terrain, enlarged: float, largest_m: float, *, held: int) -> str:
+def _caption(terrain: ShownTerrain, enlarged: float, largest_m: float, *, held: int) -> str:
     parts = ["Seen from above; landmarks in the colours of the scene."]
     if largest_m > 0:
         size = f"{short(largest_m * 1000)} mm" if largest_m < 1 else f"{short(largest_m)} m"

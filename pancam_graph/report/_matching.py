@@ -23,14 +23,14 @@ _STOP_CAPTION = (
 
 def matching_section(traverse: Traverse) -> str:
     """The section as HTML; nothing for observations from elsewhere."""
-    found = traverse.matching
-    if found is None:
+    matching = traverse.matching
+    if matching is None:
         return ""
-    notes = "".join(f"<li>{escape(line)}</li>" for line in found.summary())
-    between = _stop_table(found, traverse) + _caption(_STOP_CAPTION) if found.stops else ""
+    notes = "".join(f"<li>{escape(line)}</li>" for line in matching.summary())
+    between = _stop_table(matching, traverse) + _caption(_STOP_CAPTION) if matching.stops else ""
     return (
         f'<section>\n<h2>Matching</h2>\n<ul class="notes">{notes}</ul>\n{between}'
-        f"{_pair_table(found, traverse)}{_caption(_PAIR_CAPTION)}</section>"
+        f"{_pair_table(matching, traverse)}{_caption(_PAIR_CAPTION)}</section>"
     )
 
 
@@ -38,7 +38,7 @@ def _caption(text: str) -> str:
     return f'\n<p class="caption">{escape(text)}</p>\n'
 
 
-def _pair_table(found: Matching, traverse: Traverse) -> str:
+def _pair_table(matching: Matching, traverse: Traverse) -> str:
     columns = (
         ("image", "id of the first image"),
         ("image", "id of the second image"),
@@ -55,12 +55,12 @@ def _pair_table(found: Matching, traverse: Traverse) -> str:
             p.refusal.text,
             *(str(n) for n in (p.candidates, p.kept, p.off_line, p.rover)),
         )
-        for p in found.pairs
+        for p in matching.pairs
     ]
     return table("Pairs of images", columns, rows, texts=3)
 
 
-def _stop_table(found: Matching, traverse: Traverse) -> str:
+def _stop_table(matching: Matching, traverse: Traverse) -> str:
     columns = (
         ("terrain of", "id of the stop that places the terrain"),
         ("in images of", "id of the stop whose images are searched"),
@@ -82,6 +82,6 @@ def _stop_table(found: Matching, traverse: Traverse) -> str:
             *(str(n) for n in (s.sought, s.kept, s.unlike, s.ambiguous, s.unstable, s.masked, s.off_pose)),
             fixed(s.noise_px, 3) if s.kept else "",
         )
-        for s in found.stops
+        for s in matching.stops
     ]
     return table("Pairs of stops", columns, rows, texts=3)

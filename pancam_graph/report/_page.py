@@ -14,12 +14,12 @@ from pancam_graph.report._matching import matching_section
 from pancam_graph.report._mosaics import mosaic_section
 from pancam_graph.report._numbers import Json, fixed, short
 from pancam_graph.report._packed import packed, packed_plotly
-from pancam_graph.report._scene import make_masts, make_scene
+from pancam_graph.report._scene import make_masts, scene_figure
 from pancam_graph.report._script import SCRIPT
+from pancam_graph.report._shown_terrain import shown_terrain
 from pancam_graph.report._style import STYLE
 from pancam_graph.report._tables import image_table, observation_table, rig_table, stop_table
 from pancam_graph.report._template import NO_VECTORS, PAGE, RIG, SCENE_CONTROLS, VECTOR_CONTROLS
-from pancam_graph.report._terrain import make_terrain
 
 __all__ = ["headline", "lead", "make_page"]
 
@@ -40,8 +40,8 @@ _REASONS = {
 def make_page(solution: Solution, mosaics: WrittenMosaics | None = None) -> str:
     """The whole page of a solution as HTML, with its mosaics where there are any."""
     table, rows_of = image_residuals(solution)
-    terrain = make_terrain(solution)
-    scene, views = make_scene(solution, terrain, make_masts(solution))
+    terrain = shown_terrain(solution)
+    scene, views = scene_figure(solution, terrain, make_masts(solution))
     map_figure, histogram = make_map(solution, terrain), make_histogram(solution)
     corrections = make_corrections(solution)
     panels = vector_panels(solution, table, rows_of)

@@ -9,10 +9,10 @@ from pancam_graph.base.geometry import FloatArray, IntArray, pose_arrays
 from pancam_graph.data import Solution
 from pancam_graph.report._look import EYES, GRID, INK, RESIDUAL_SCALE, Figure, layout
 from pancam_graph.report._numbers import Json, decimals_for, polyline, round_factor, rounded, short, thinned
-from pancam_graph.report._terrain import Terrain
+from pancam_graph.report._shown_terrain import ShownTerrain
 from pancam_graph.rigs import Rig
 
-__all__ = ["Masts", "eye_circles", "frustums", "label_stops", "make_masts", "make_scene", "near_spacing"]
+__all__ = ["Masts", "eye_circles", "frustums", "label_stops", "make_masts", "near_spacing", "scene_figure"]
 
 _MAX_LANDMARKS = 20_000
 _MAX_FRUSTUMS = 1_000
@@ -124,7 +124,7 @@ def label_stops(stops_m: FloatArray, apart_m: float) -> list[int]:
 
 
 def _mast_traces(
-    solution: Solution, masts: Masts, terrain: Terrain, enlarged: float, *, near: bool
+    solution: Solution, masts: Masts, terrain: ShownTerrain, enlarged: float, *, near: bool
 ) -> list[Json]:
     """Circles and frustums, one trace of each per eye, enlarged about their masts' origins."""
     traverse = solution.traverse
@@ -167,7 +167,7 @@ def _mast_traces(
     return traces
 
 
-def _stop_traces(solution: Solution, terrain: Terrain) -> list[Json]:
+def _stop_traces(solution: Solution, terrain: ShownTerrain) -> list[Json]:
     """Poles down to the ground, and a mark with its name on each mast's origin."""
     stops_R, stops_m = pose_arrays(solution.final.world_T_mast)
     at = stops_m - terrain.origin_m
@@ -200,7 +200,7 @@ def _stop_traces(solution: Solution, terrain: Terrain) -> list[Json]:
     return [pole, mark]
 
 
-def _stop_labels(solution: Solution, terrain: Terrain) -> list[Json]:
+def _stop_labels(solution: Solution, terrain: ShownTerrain) -> list[Json]:
     """Names above the masts, on a ground of their own."""
     _, stops_m = pose_arrays(solution.final.world_T_mast)
     at = (stops_m - terrain.origin_m).round(4).tolist()
@@ -222,7 +222,7 @@ def _stop_labels(solution: Solution, terrain: Terrain) -> list[Json]:
     ]
 
 
-def _landmark_trace(solution: Solution, terrain: Terrain) -> Json:
+def _landmark_trace(solution: Solution, terrain: ShownTerrain) -> Json:
     """Landmarks coloured by their residual."""
     keep = thinned(len(terrain.points_m), _MAX_LANDMARKS)
     decimals = decimals_for(terrain.extent_m)
@@ -280,7 +280,7 @@ def _camera(side: FloatArray) -> Json:
     }
 
 
-def make_scene(solution: Solution, terrain: Terrain, masts: Masts) -> tuple[Figure, list[Json]]:
+def scene_figure(solution: Solution, terrain: ShownTerrain, masts: Masts) -> tuple[Figure, list[Json]]:
     """The scene, and its views: everything, and each mast at true size.
 
     Masts are centimetres in a scene of tens of metres, so in the view of everything circles and frustums
@@ -332,7 +332,7 @@ def make_scene(solution: Solution, terrain: Terrain, masts: Masts) -> tuple[Figu
     return figure, views
 
 
-def _caption(solution: Solution, terrain: Terrain, masts: Masts, enlarged: float) -> str:
+def _caption(solution: Solution, terrain: ShownTerrain, masts: Masts, enlarged: float) -> str:
     """What the scene shows and leaves out, in words."""
     shown = min(len(terrain.points_m), _MAX_LANDMARKS)
     parts = [

@@ -101,12 +101,14 @@ def observation_table(solution: Solution) -> str:
         ("several stops", several),
         ("all", np.full_like(several, True)),
     ):
-        own = which[track]
-        used, found = int(np.sum(solution.used & own)), int(own.sum())
-        counts = [int(np.sum(own & (reason == why))) for why in ("outlier", "single", "behind", "outside")]
-        share = fixed(100 * used / found, 1) if found else ""
-        counts.append(int(np.sum(came_back & own)))
-        numbers = [str(int(which.sum())), str(found), str(used), share, *(str(c) for c in counts)]
+        of_tracks = which[track]
+        used, total = int(np.sum(solution.used & of_tracks)), int(of_tracks.sum())
+        counts = [
+            int(np.sum(of_tracks & (reason == why))) for why in ("outlier", "single", "behind", "outside")
+        ]
+        share = fixed(100 * used / total, 1) if total else ""
+        counts.append(int(np.sum(came_back & of_tracks)))
+        numbers = [str(int(which.sum())), str(total), str(used), share, *(str(c) for c in counts)]
         rows.append((name, *numbers))
     return table("Observations", columns, rows, texts=1)
 

@@ -47,11 +47,11 @@ def brightness_of(solution: Solution) -> Brightness:
         if deep:
             whites.append(float(np.percentile(image, _WHITE_PERCENT)))
         if observations is not None:
-            own = used & (observations.image == i)
+            in_image = used & (observations.image == i)
             total[deep] += np.bincount(
-                row[own], weights=_sampled(image, observations.uv_px[own]), minlength=n
+                row[in_image], weights=_sampled(image, observations.uv_px[in_image]), minlength=n
             )
-            count[deep] += np.bincount(row[own], minlength=n)
+            count[deep] += np.bincount(row[in_image], minlength=n)
     # The median: a part of the rover that shines in one image must not darken all others.
     shape = Brightness(white=float(np.median(whites or [0.0])) or 1.0, grey=None)
     if not seen:

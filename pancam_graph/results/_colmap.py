@@ -168,12 +168,12 @@ def _images(solution: Solution, placed: Placed, numbers: _Numbers) -> Iterable[s
     final = solution.final
     limits = np.searchsorted(placed.image, np.arange(len(solution.traverse.images) + 1))
     for i, camera in numbers.of_image.items():
-        own = slice(limits[i], limits[i + 1])
+        rows = slice(limits[i], limits[i + 1])
         pose = _inverse(final.world_R_camera[i], final.world_t_camera[i])
         yield f"{i + 1} {pose} {camera} {numbers.name[i]}"
-        pixels = (placed.uv_px[own] + _FIRST_PIXEL).tolist()
+        pixels = (placed.uv_px[rows] + _FIRST_PIXEL).tolist()
         yield " ".join(
-            f"{u!r} {v!r} {j + 1}" for (u, v), j in zip(pixels, placed.landmark[own].tolist(), strict=True)
+            f"{u!r} {v!r} {j + 1}" for (u, v), j in zip(pixels, placed.landmark[rows].tolist(), strict=True)
         )
 
 
@@ -285,7 +285,7 @@ def _about(
     for number, i in sorted(first.items()):
         s = straight[i]
         assert s is not None  # the image is numbered, so its pose is finite
-        own = np.isin(placed.image, [j for j, c in numbers.of_image.items() if c == number])
+        of_camera = np.isin(placed.image, [j for j, c in numbers.of_image.items() if c == number])
         moving = s.camera.pupil_moves
         cameras.append(
             {
@@ -293,7 +293,7 @@ def _about(
                 "camera": solution.traverse.images[i].camera,
                 "model": lens_of(s.camera).name,
                 "range_m": s.range_m if moving else None,
-                "largest_shift_px": float(placed.shift_px[own].max(initial=0.0)) if moving else 0.0,
+                "largest_shift_px": float(placed.shift_px[of_camera].max(initial=0.0)) if moving else 0.0,
             }
         )
     images, kept = solution.traverse.images, set(written)

@@ -134,21 +134,23 @@ def place_observations(solution: Solution, straight: list[Straight | None]) -> P
     enlargement, valid = np.zeros((n, 2, 2)), np.zeros(n, dtype=bool)
     limits = np.searchsorted(image, np.arange(len(straight) + 1))
     for i, s in enumerate(straight):
-        own = slice(limits[i], limits[i + 1])
+        rows = slice(limits[i], limits[i + 1])
         if s is None or observations is None or limits[i] == limits[i + 1]:
             continue
-        raw = observations.uv_px[row[own]]
-        uv[own], enlargement[own], valid[own] = straight_pixels(s.camera, s.pinhole, raw, range_m[own])
+        raw = observations.uv_px[row[rows]]
+        uv[rows], enlargement[rows], valid[rows] = straight_pixels(s.camera, s.pinhole, raw, range_m[rows])
         if s.camera.pupil_moves:
             level = np.full(len(raw), s.range_m)
-            shift[own] = np.linalg.norm(uv[own] - straight_pixels(s.camera, s.pinhole, raw, level)[0], axis=1)
-        points = (final.landmarks_m[landmark[own]] - final.world_t_camera[i]) @ final.world_R_camera[i]
+            shift[rows] = np.linalg.norm(
+                uv[rows] - straight_pixels(s.camera, s.pinhole, raw, level)[0], axis=1
+            )
+        points = (final.landmarks_m[landmark[rows]] - final.world_t_camera[i]) @ final.world_R_camera[i]
         projected, in_front = s.pinhole.project(points)
-        residual[own] = projected - uv[own]
-        valid[own] &= in_front & (points[:, 2] > _MIN_DEPTH)
-    found = np.einsum("nij,nj->ni", enlargement, solution.residual_final_px[row])
-    bound = _DIFFERENCE_PX + _DIFFERENCE_SHARE * np.linalg.norm(found, axis=1)
-    other = valid & (np.linalg.norm(residual - found, axis=1) > bound)
+        residual[rows] = projected - uv[rows]
+        valid[rows] &= in_front & (points[:, 2] > _MIN_DEPTH)
+    expected_px = np.einsum("nij,nj->ni", enlargement, solution.residual_final_px[row])
+    bound = _DIFFERENCE_PX + _DIFFERENCE_SHARE * np.linalg.norm(expected_px, axis=1)
+    other = valid & (np.linalg.norm(residual - expected_px, axis=1) > bound)
     beyond = np.unique(landmark[other])
     valid &= ~np.isin(landmark, beyond)
     views = np.bincount(landmark[valid], minlength=len(solution.landmark_track))

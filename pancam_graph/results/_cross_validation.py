@@ -87,26 +87,29 @@ class CrossValidationEntry(Entry):
     warnings: list[str]
 
     @staticmethod
-    def of(found: CrossValidation, traverse: Traverse) -> "CrossValidationEntry":
+    def of(validation: CrossValidation, traverse: Traverse) -> "CrossValidationEntry":
         """The entry of a cross-validation of a traverse."""
         ids = [f.id for f in traverse.frames]
         return CrossValidationEntry(
-            halvings=found.halvings,
-            seed=found.seed,
-            seconds=found.seconds,
+            halvings=validation.halvings,
+            seed=validation.seed,
+            seconds=validation.seconds,
             frames=[
                 FrameSigmasEntry(id=name, pan_rad=pan, tilt_rad=tilt)
-                for name, (pan, tilt) in zip(ids, _entries(found.pointing), strict=True)
+                for name, (pan, tilt) in zip(ids, _entries(validation.pointing), strict=True)
             ],
             pairs=[
                 PairSigmasEntry(frames=[ids[i], ids[j]], tracks=int(n), pan_rad=pan, tilt_rad=tilt)
                 for (i, j), n, (pan, tilt) in zip(
-                    found.pairs.tolist(), found.pair_tracks, _entries(found.relative_pointing), strict=True
+                    validation.pairs.tolist(),
+                    validation.pair_tracks,
+                    _entries(validation.relative_pointing),
+                    strict=True,
                 )
             ],
             stops=[
                 StopSigmasEntry(id=stop.id, rotation_rad=list(row[:3]), translation_m=list(row[3:]))
-                for stop, row in zip(traverse.stops, _entries(found.stops), strict=True)
+                for stop, row in zip(traverse.stops, _entries(validation.stops), strict=True)
             ],
             scores=[
                 HalfScoreEntry(
@@ -121,9 +124,9 @@ class CrossValidationEntry(Entry):
                     other_px=_number(s.other_px),
                     other_expected_px=_number(s.other_expected_px),
                 )
-                for s in found.scores
+                for s in validation.scores
             ],
-            warnings=list(found.warnings),
+            warnings=list(validation.warnings),
         )
 
 

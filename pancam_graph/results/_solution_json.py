@@ -104,12 +104,12 @@ class IncrementalEntry(Entry):
     relinearised_per_stop: list[int]
 
     @staticmethod
-    def of(found: Incremental) -> "IncrementalEntry":
+    def of(steps: Incremental) -> "IncrementalEntry":
         """The entry of what a smoother did."""
         return IncrementalEntry(
-            seconds_per_stop=[float(s) for s in found.seconds_per_stop],
-            cost_per_stop=[float(c) for c in found.cost_per_stop],
-            relinearised_per_stop=[int(n) for n in found.relinearised_per_stop],
+            seconds_per_stop=[float(s) for s in steps.seconds_per_stop],
+            cost_per_stop=[float(c) for c in steps.cost_per_stop],
+            relinearised_per_stop=[int(n) for n in steps.relinearised_per_stop],
         )
 
 

@@ -17,8 +17,8 @@ from pancam_graph.report._figures import histogram_edges, make_corrections, make
 from pancam_graph.report._images import choose_images, image_residuals, vector_panels
 from pancam_graph.report._map import ellipse_outlines, make_map, translation_covariance_in_world
 from pancam_graph.report._page import headline, lead, make_page
-from pancam_graph.report._scene import eye_circles, make_masts, make_scene
-from pancam_graph.report._terrain import landmark_residuals, make_terrain
+from pancam_graph.report._scene import eye_circles, make_masts, scene_figure
+from pancam_graph.report._shown_terrain import landmark_residuals, shown_terrain
 from pancam_graph.rigs import mer_navcam
 from support.made_solutions import fabricate
 from support.report_pages import figures_of, parsed, unpacked
@@ -75,11 +75,11 @@ def test_words_of_the_head(solution: Solution) -> None:
 
 
 def test_scene_and_map_hold_every_landmark_inside(solution: Solution) -> None:
-    terrain = make_terrain(solution)
+    terrain = shown_terrain(solution)
     usable = np.isfinite(landmark_residuals(solution))
     assert len(terrain.points_m) + terrain.outside == usable.sum()
     assert terrain.unusable == np.sum(~usable)
-    scene, views = make_scene(solution, terrain, make_masts(solution))
+    scene, views = scene_figure(solution, terrain, make_masts(solution))
     (landmarks,) = [t for t in scene.traces if t["name"] == "landmark"]
     assert len(landmarks["x"]) == len(landmarks["marker"]["color"]) == len(terrain.points_m)
     (on_map,) = [t for t in make_map(solution, terrain).traces if t["name"] == "landmark"]
@@ -101,7 +101,7 @@ def test_landmark_residuals_are_of_their_used_observations(solution: Solution) -
 
 
 def test_all_axes_of_a_view_have_one_scale(solution: Solution) -> None:
-    _, views = make_scene(solution, make_terrain(solution), make_masts(solution))
+    _, views = scene_figure(solution, shown_terrain(solution), make_masts(solution))
     for view in views:
         side = [high - low for low, high in view["range"]]
         scale = [view["ratio"][name] / s for name, s in zip("xyz", side, strict=True)]
@@ -112,10 +112,10 @@ def test_landmarks_on_the_horizon_do_not_shrink_the_scene(solution: Solution) ->
     points = solution.final.landmarks_m.copy()
     points[::20] *= 500.0
     far = replace(solution, final=replace(solution.final, landmarks_m=points))
-    near_terrain, terrain = make_terrain(solution), make_terrain(far)
+    near_terrain, terrain = shown_terrain(solution), shown_terrain(far)
     assert terrain.extent_m < 1.5 * near_terrain.extent_m
     assert terrain.outside > near_terrain.outside
-    scene, _ = make_scene(far, terrain, make_masts(far))
+    scene, _ = scene_figure(far, terrain, make_masts(far))
     assert f"{terrain.outside} more lie outside the box" in scene.caption
 
 
@@ -159,7 +159,7 @@ def test_body_covariance_agrees_with_gtsam() -> None:
 
 
 def test_ellipses_are_enlarged_by_the_factor_that_is_stated(solution: Solution) -> None:
-    figure = make_map(solution, make_terrain(solution))
+    figure = make_map(solution, shown_terrain(solution))
     (trace,) = [t for t in figure.traces if "ellipse" in t["name"]]
     factor = float(trace["name"].split(", ")[1].split()[0].replace(",", ""))
     assert f"drawn {factor:,.0f} times larger" in figure.caption
@@ -251,7 +251,7 @@ def test_no_residuals_at_all() -> None:
     still = replace(solution, residual_initial_px=zero, residual_final_px=zero)
     parsed(make_page(still))
     assert vector_panels(still, *image_residuals(still))[0]["factor"] == [1, 1]
-    assert make_terrain(replace(solution, residual_final_px=zero)).residual_limit_px == 1.0
+    assert shown_terrain(replace(solution, residual_final_px=zero)).residual_limit_px == 1.0
 
 
 def test_nothing_used_and_no_landmark() -> None:
@@ -306,11 +306,11 @@ def test_a_world_far_from_its_origin_keeps_its_digits() -> None:
         landmarks_m=solution.final.landmarks_m + offset,
     )
     moved = replace(solution, final=final)
-    terrain = make_terrain(moved)
+    terrain = shown_terrain(moved)
     np.testing.assert_allclose(
-        terrain.points_m.mean(axis=0), make_terrain(solution).points_m.mean(axis=0), atol=3
+        terrain.points_m.mean(axis=0), shown_terrain(solution).points_m.mean(axis=0), atol=3
     )
-    scene, _ = make_scene(moved, terrain, make_masts(moved))
+    scene, _ = scene_figure(moved, terrain, make_masts(moved))
     assert "Coordinates count from (432,100, 5,678,900, -1,998) m" in scene.caption
 
 

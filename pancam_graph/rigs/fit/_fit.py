@@ -169,7 +169,7 @@ def fit_rig(
     _require(n >= needed, "cameras", f"{needed} or more", str(n))
     _require(len(names) == n, "eyes", f"{n} names, one per camera", str(len(names)))
     angles = _checked_angles(pan_tilt_rad, n)
-    own, poses = _split(cameras, names)
+    models, poses = _split(cameras, names)
     order = tuple(dict.fromkeys(names))
     rotation, centre = pose_arrays(poses)
     posed = PosedCameras(
@@ -185,7 +185,7 @@ def fit_rig(
         unknowns=Unknowns.of(order, options),
         options=options,
     )
-    means, words = _mean_cameras(own, names, order), _words(reference, world_T_mast, pan_T_tilt)
+    means, words = _mean_cameras(models, names, order), _words(reference, world_T_mast, pan_T_tilt)
     with blas_on_one_thread():  # many small matrices
         return _result(equations, optimum(equations), order, means, words)
 
@@ -219,7 +219,7 @@ def _split(
     cameras: Sequence[gtsam.Pose3 | CAHV], names: Sequence[str]
 ) -> tuple[list[CAHV | None], list[gtsam.Pose3]]:
     """Models in their own frames (None for a pose), and poses. Checks that an eye's models are of a kind."""
-    own: list[CAHV | None] = []
+    models: list[CAHV | None] = []
     poses: list[gtsam.Pose3] = []
     kinds: dict[str, str] = {}
     for i, (camera, name) in enumerate(zip(cameras, names, strict=True)):
@@ -235,9 +235,9 @@ def _split(
         _require(
             kind == expected, f"cameras[{i}]", f"a {expected} like the others of eye {name}", f"a {kind}"
         )
-        own.append(model)
+        models.append(model)
         poses.append(pose)
-    return own, poses
+    return models, poses
 
 
 def _reference(
@@ -270,13 +270,13 @@ def _words(rig: Rig | None, world_T_mast: gtsam.Pose3 | None, pan_T_tilt: gtsam.
 
 
 def _mean_cameras(
-    own: Sequence[CAHV | None], names: Sequence[str], eyes: tuple[str, ...]
+    models: Sequence[CAHV | None], names: Sequence[str], eyes: tuple[str, ...]
 ) -> tuple[CAHV | None, ...]:
     """Mean of each eye's models, vector by vector; labels of one camera differ in their last digits."""
     out: list[CAHV | None] = []
     for eye in eyes:
-        models = [m for m, name in zip(own, names, strict=True) if name == eye and m is not None]
-        out.append(_mean_model(models) if models else None)
+        of_eye = [m for m, name in zip(models, names, strict=True) if name == eye and m is not None]
+        out.append(_mean_model(of_eye) if of_eye else None)
     return tuple(out)
 
 

@@ -59,7 +59,7 @@ def free_directions(equations: Equations, optimum: Optimum) -> tuple[FreeDirecti
     """
     sought, sigma = equations.unknowns.sought, equations.unknowns.sigma
     jacobian, free = optimum.system.jacobian, optimum.directions[optimum.rank :]
-    found: list[FreeDirection] = []
+    directions: list[FreeDirection] = []
     basis = np.zeros((len(free), 0))
 
     def accept(text: str, in_units: FloatArray) -> None:
@@ -70,7 +70,7 @@ def free_directions(equations: Equations, optimum: Optimum) -> tuple[FreeDirecti
             basis = np.column_stack([basis, rest / np.linalg.norm(rest)])
             step = np.zeros(len(sigma))
             step[sought] = sigma[sought] * in_units
-            found.append(FreeDirection(text=text, step=step))
+            directions.append(FreeDirection(text=text, step=step))
 
     for text, step in _ambiguities(equations, optimum):
         if np.any(step[~sought] != 0):  # what is held cannot undo anything
@@ -84,7 +84,7 @@ def free_directions(equations: Equations, optimum: Optimum) -> tuple[FreeDirecti
         direction = left[:, np.argmax(np.linalg.norm(left, axis=0))]
         direction = direction / np.linalg.norm(direction)
         accept(_described(equations, direction), direction)
-    return tuple(found)
+    return tuple(directions)
 
 
 def _ambiguities(equations: Equations, optimum: Optimum) -> list[tuple[str, FloatArray]]:

@@ -52,8 +52,8 @@ def first_chain(
         design = np.zeros((len(rest), 3, 1 + n_eyes, 3))
         design[:, :, 0] = np.eye(3)
         design[np.arange(len(rest)), :, 1 + cameras.eye] = lever
-        found = np.linalg.lstsq(design.reshape(3 * len(rest), -1), (rest - middle).ravel(), rcond=1e-9)[0]
-        mast_t, mount_t = middle + found[:3], found[3:].reshape(n_eyes, 3)
+        centres = np.linalg.lstsq(design.reshape(3 * len(rest), -1), (rest - middle).ravel(), rcond=1e-9)[0]
+        mast_t, mount_t = middle + centres[:3], centres[3:].reshape(n_eyes, 3)
     return Chain.of((mast_R, mast_t), axis, (mount_R, mount_t))
 
 

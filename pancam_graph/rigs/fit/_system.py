@@ -216,11 +216,11 @@ class Equations:
             of = np.flatnonzero(count == size)
             images = order[begin[of, None] + np.arange(size)]
             measured = np.broadcast_to(np.eye(2) / self.options.angle_sigma_rad, (len(of), 2, 2))
-            own = np.concatenate([by_angle[images].reshape(len(of), -1, 2), measured], axis=1)
+            by_own_angles = np.concatenate([by_angle[images].reshape(len(of), -1, 2), measured], axis=1)
             shared = jacobian[images].reshape(len(of), -1, columns)
             shared = np.concatenate([shared, np.zeros((len(of), 2, columns))], axis=1)
             value = np.concatenate([residual[images].reshape(len(of), -1), prior[of]], axis=1)
-            q, r = np.linalg.qr(own, mode="complete")
+            q, r = np.linalg.qr(by_own_angles, mode="complete")
             q_T = np.swapaxes(q, 1, 2)
             shared, value = q_T @ shared, (q_T @ value[..., None])[..., 0]
             gain[of] = -np.linalg.solve(r[:, :2], shared[:, :2])

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from pancam_graph.base.geometry import FloatArray, IntArray, pose_arrays
 from pancam_graph.data import Solution
 
-__all__ = ["Terrain", "landmark_residuals", "make_terrain"]
+__all__ = ["ShownTerrain", "landmark_residuals", "shown_terrain"]
 
 _FAR_WORLD_M = 1e4
 _LEAST_EXTENT_M = 2.0
@@ -16,7 +16,7 @@ _PAD = 0.08
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Terrain:
+class ShownTerrain:
     """The landmarks inside the box that the scene and the map show, relative to an origin."""
 
     origin_m: FloatArray
@@ -55,14 +55,14 @@ def landmark_residuals(solution: Solution) -> FloatArray:
     order = np.argsort(solution.landmark_track, kind="stable")
     known = solution.landmark_track[order]
     at = np.minimum(np.searchsorted(known, observations.track[rows]), n - 1)
-    found = known[at] == observations.track[rows]
-    landmark, rows = order[at[found]], rows[found]
+    has_landmark = known[at] == observations.track[rows]
+    landmark, rows = order[at[has_landmark]], rows[has_landmark]
     count = np.bincount(landmark, minlength=n)
     total = np.bincount(landmark, weights=square[rows], minlength=n)
     return np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)
 
 
-def make_terrain(solution: Solution) -> Terrain:
+def shown_terrain(solution: Solution) -> ShownTerrain:
     """Choose origin, box and landmarks of a solution.
 
     The box holds every stop and the landmarks up to three times the median distance from their nearest
@@ -93,7 +93,7 @@ def make_terrain(solution: Solution) -> Terrain:
     inside = np.all((points_m >= low) & (points_m <= high), axis=1)
     shown_px = residual_px[rows[inside]]
     limit_px = float(np.quantile(shown_px, 0.98)) if len(shown_px) else 0.0
-    return Terrain(
+    return ShownTerrain(
         origin_m=origin_m,
         points_m=points_m[inside] - origin_m,
         rows=rows[inside],
