@@ -68,7 +68,7 @@ class CAHVOR(CAHV):
                 break
         value = r2 * t**2 * u**5 + r1 * t * u**3 + (1 + r0) * u - 1
         undistorted = ray - (1 - u)[:, None] * lateral
-        # The polynomial takes O for a unit vector; one Newton step on the model itself takes it as it is.
+        # The polynomial assumes that O is a unit vector; one Newton step on the model itself does not.
         again, jacobian, _ = self._distort_with_jacobian(undistorted)
         undistorted = undistorted - np.linalg.solve(jacobian, (again - ray)[..., None])[..., 0]
         return undistorted, valid & (np.abs(value) < 1e-10) & (u > 0)

@@ -106,7 +106,7 @@ class CAHVORE(CAHVOR):
         slope = -sin * length - cos * (z - s) + sin * d_s
         distance = np.maximum(np.hypot(length, z), 1e-300)
         converged = (np.abs(value) < 1e-12 * (1 + distance)) & (theta >= -1e-12) & (theta < np.pi)
-        # The pupil's shift grows without bound to the side; points nearer to C than it are outside the model.
+        # The shift of the pupil grows without bound with the angle; points nearer to C than it are not valid.
         converged &= sin * length + cos * z > np.abs(s) + _MIN_RANGE_M
         slope = np.where(np.abs(slope) < 1e-300, 1.0, slope)
         x, d_x, inside = self._radius_of(theta)
@@ -114,7 +114,7 @@ class CAHVORE(CAHVOR):
         k = x * (1 + r0 + x**2 * (r1 + x**2 * r2))
         d_k = (1 + r0 + x**2 * (3 * r1 + x**2 * 5 * r2)) * d_x  # by theta
 
-        # On the axis the lateral direction is undefined, and so is nothing else: k / |l| has a limit.
+        # On the axis only the lateral direction is undefined: k / |l| has a limit.
         on_axis = length < 1e-12 * distance
         unit = lateral / np.where(on_axis, 1.0, length)[:, None]
         ray = axis + k[:, None] * unit
@@ -172,7 +172,7 @@ class CAHVORE(CAHVOR):
         d_origin = axis[None, :, None] * ((d_s * d_theta)[:, None] * d_k)[:, None, :]
         return Rays(origin_m=origin, direction=direction, valid=valid), d_origin, d_direction
 
-    # The pupil moves: directions alone do not describe this camera, and nothing may use these by mistake.
+    # Directions alone do not describe a camera whose pupil moves: these two must not be inherited.
     def _undistort_direction(self, ray: FloatArray) -> tuple[FloatArray, BoolArray]:
         raise AssertionError("CAHVORE is not central")
 

@@ -1,4 +1,4 @@
-"""The contract of every camera model, and the pinhole that is left of each without its distortion."""
+"""The contract of every camera model, and the pinhole, which each is without its distortion."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
@@ -61,7 +61,7 @@ class Camera(ABC):
     @property
     @abstractmethod
     def pinhole(self) -> "Pinhole":
-        """The pinhole of the same camera: what is left without distortion, with the same axes."""
+        """The pinhole of the same camera: its projection without distortion, with the same axes."""
 
     @abstractmethod
     def with_calibration(self, calibration: FloatArray) -> "Camera":
@@ -103,7 +103,7 @@ class Pinhole(Camera):
     cy_px: float
     """Row of the principal point (y0 of the thesis)."""
     skew_px: float = 0.0
-    """How far a unit of y moves the column (s of the thesis)."""
+    """Change of the column with a unit of y (s of the thesis)."""
 
     def __post_init__(self) -> None:
         """Check the focal lengths."""

@@ -15,10 +15,11 @@ __all__ = ["carry_to_pinhole"]
 def carry_to_pinhole(
     camera: Camera, uv_px: FloatArray, range_m: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Pixels (n, 2) as the camera's pinhole would have measured them, and how residuals turn back.
+    """Pixels (n, 2) as the camera's pinhole would have measured them, and how to turn residuals back.
 
     The camera is in its own frame. `range_m` (n,) is the distance from its centre to what each pixel sees; it
-    matters only where the entrance pupil moves (CAHVORE); there a rough value does unless the point is near.
+    matters only where the entrance pupil moves (CAHVORE); a rough value is enough there unless the point is
+    near.
 
     Returns the pinhole's pixels (n, 2), matrices (n, 2, 2) that take small residuals of the pinhole to
     residuals of the image, and validity (n,): False outside either model's domain.

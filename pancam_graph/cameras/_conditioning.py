@@ -20,20 +20,20 @@ __all__ = ["Conditioning"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Conditioning:
-    """Transformations of n images; everything here is linear in the matrices, and undone to rounding."""
+    """Transformations of n images; all methods are linear in the matrices and exact but for rounding."""
 
     centre_px: FloatArray
-    """(n, 2) (u, v)"""
+    """(n, 2) u and v of the formula."""
     extent_px: FloatArray
-    """(n,) 1 / s: pixels in a unit"""
+    """(n,) 1 / s: pixels in a unit."""
     origin_m: FloatArray
-    """(n, 3) o, in the world"""
+    """(n, 3) o of the formula, in the world."""
     extent_m: FloatArray
-    """(n,) l: metres in a unit"""
+    """(n,) l: metres in a unit."""
 
     @staticmethod
     def none(n: int) -> "Conditioning":
-        """Matrices as they are, about the world's origin."""
+        """No conditioning: pixels and metres about the world's origin."""
         return Conditioning(
             centre_px=np.zeros((n, 2)),
             extent_px=np.ones(n),
@@ -42,7 +42,7 @@ class Conditioning:
         )
 
     def of(self, images: IntArray) -> "Conditioning":
-        """Those of some images."""
+        """The transformations of some of the images, by row."""
         return Conditioning(
             centre_px=self.centre_px[images],
             extent_px=self.extent_px[images],

@@ -65,14 +65,15 @@ def decompose_projection(projection: ArrayLike) -> tuple[FloatArray, FloatArray,
 def split_projections(projections: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """K (n, 3, 3), R (n, 3, 3), C (n, 3) and the factor s (n,) of P = s K R [I | -C], (n, 3, 4).
 
-    s is above 0, K[2, 2] is 1 and K[1, 1] above 0: what the third row has in front stays there, and K[0, 0]
-    has the sign of the left block's determinant, below 0 for a mirrored camera. So all four move smoothly
-    with P, but for where the third row vanishes or the second is along it; there they are not finite.
+    s is above 0, K[2, 2] is 1 and K[1, 1] above 0: a point with a positive depth by the third row stays in
+    front. K[0, 0] has the sign of the left block's determinant, below 0 for a mirrored camera. So all four
+    are smooth functions of P, except where the third row vanishes or the second is parallel to it; there they
+    are not finite.
 
     RQ decomposition by Gram and Schmidt, from the last row upwards.
     """
     left = projections[:, :, :3]
-    with np.errstate(all="ignore"):  # what is no camera gives numbers that are not finite
+    with np.errstate(all="ignore"):  # a matrix of no camera gives numbers that are not finite
         factor = np.linalg.norm(left[:, 2], axis=1)
         m1, m2 = left[:, 0] / factor[:, None], left[:, 1] / factor[:, None]
         r3 = left[:, 2] / factor[:, None]
@@ -99,7 +100,7 @@ def split_projections(projections: FloatArray) -> tuple[FloatArray, FloatArray, 
 def projection_tangents(
     calibration: FloatArray, camera_R_world: FloatArray, centre_m: FloatArray, factor: FloatArray
 ) -> FloatArray:
-    """How what `split_projections` finds moves with the entries of P, row by row: (n, 12, 12).
+    """Derivatives of the results of `split_projections` by the entries of P, row by row: (n, 12, 12).
 
     Rows: the camera's twist (its own frame, rotation first, then translation in metres), changes of fx, fy,
     skew, cx and cy in pixels, and the relative change of the factor. With M the left block,
@@ -114,7 +115,7 @@ def projection_tangents(
     K_inverse[:, 1, 2] = -K[:, 1, 2] / K[:, 1, 1]
     K_inverse[:, 0, 2] = (K[:, 0, 1] * K[:, 1, 2] / K[:, 1, 1] - K[:, 0, 2]) / K[:, 0, 0]
     per_factor = K_inverse / factor[:, None, None]
-    # By entry (a, b) of P: A[i, j] is K^-1[i, a] R[j, b] / s, and no part of it where b is 3.
+    # By entry (a, b) of P: A[i, j] is K^-1[i, a] R[j, b] / s, and 0 where b is 3.
     A = np.zeros((n, 3, 3, 3, 4))
     A[..., :3] = np.einsum("nia,njb->nijab", per_factor, camera_R_world)
     out = np.empty((n, 12, 3, 4))

@@ -17,7 +17,7 @@ _AGAIN_PX = 1e-3
 _GRID_PX = 8
 _CHUNK_PX = 1 << 18
 _MOST_GROWTH = 0.5
-"""Largest part of the width, or height, that an image grows by on each side."""
+"""Largest growth of an image on each side, as a share of its width or height."""
 
 
 def straightened(camera: Camera, range_m: float) -> Pinhole:
@@ -25,7 +25,8 @@ def straightened(camera: Camera, range_m: float) -> Pinhole:
 
     Focal lengths are those of the camera's pinhole. Size and principal point are such that the centres of all
     pixels are within, grown or cropped to whole pixels; but no side moves out by more than half of the
-    image's own size: what a very wide lens sees beyond is lost. A pinhole without skew is returned as it is.
+    image's own size, and what a very wide lens sees beyond is lost. A pinhole without skew is returned as it
+    is.
 
     `range_m` is the distance of what the images show; it matters only where the entrance pupil moves. Raises
     CameraError where no pixel has a line of sight in front of the pinhole.
@@ -37,7 +38,7 @@ def straightened(camera: Camera, range_m: float) -> Pinhole:
     columns, rows = np.arange(w, dtype=float), np.arange(h, dtype=float)
     edges = [np.column_stack([columns, np.full(w, y)]) for y in (0.0, h - 1.0)]
     edges += [np.column_stack([np.full(h, x), rows]) for x in (0.0, w - 1.0)]
-    # Within too: the corners of a wide lens may see nothing that a pinhole can show.
+    # Inner pixels too: the corners of a wide lens may see nothing that a pinhole can show.
     inner = np.meshgrid(np.linspace(0, w - 1, 65), np.linspace(0, h - 1, 65))
     uv = np.concatenate([*edges, np.column_stack([i.ravel() for i in inner])])
     plain = replace(pinhole, skew_px=0.0)
@@ -104,7 +105,7 @@ def _looked_up(
         grid = _grid(columns, rows[begin : begin + step])
         uv = grid.reshape(-1, 2)
         pixels, valid = camera.project(range_m * straight.unproject(uv).direction)
-        # Past where a lens folds back, a direction has an image too, but of a pixel that looks elsewhere.
+        # Where a lens folds back, a direction may get a pixel whose own line of sight is another.
         again, _, known = straight_pixels(camera, straight, pixels, np.full(len(uv), range_m))
         valid &= known & (np.linalg.norm(again - uv, axis=1) < _AGAIN_PX)
         out[begin : begin + step] = np.where(valid[:, None], pixels, np.nan).reshape(grid.shape)

@@ -29,9 +29,9 @@ _MODEL = re.compile(r"(CAHVORE|CAHVOR|CAHV)([123]?)(?:\s*,\s*([^\s=]+))?\s*(?:=.
 def cahvor_text(model: CAHV, comments: Iterable[str] = ()) -> str:
     """A camera model as the content of a `.cahvor` file, in the frame of its vectors.
 
-    `comments` are lines to stand in front; they must hold no equals sign, for which JPL's readers look.
-    Hs, Hc, Vs, Vc are focal lengths and principal point in pixels, Theta the angle from the row axis to the
-    column axis. The covariances S are zeros, which the tools take for unknown.
+    `comments` are lines to stand in front; they must hold no equals sign, as JPL's readers take lines with
+    one for entries. Hs, Hc, Vs, Vc are focal lengths and principal point in pixels, Theta the angle from the
+    row axis to the column axis. The covariances S are zeros, by which the tools know that they are unknown.
     """
     letters = type(model).__name__
     lines = [f"# {comment}" for comment in comments]

@@ -24,7 +24,7 @@ class ImageContent:
     """What an image file holds."""
 
     samples: GreyImage
-    """(rows, columns)"""
+    """(rows, columns), 8 or 16 bits."""
     colour: bool
     """Whether there were bands that differ; their luma is what `samples` has."""
     host: str | None
@@ -101,7 +101,7 @@ def _decode(data: bytes) -> NDArray[Any] | None:
     """The image, or None for bytes that OpenCV cannot read."""
     if not data:
         return None
-    # OpenCV writes lines of its own about broken files; the caller's one sentence replaces them.
+    # OpenCV logs lines about broken files; the sentence of the caller replaces them.
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
@@ -114,7 +114,7 @@ def _decode(data: bytes) -> NDArray[Any] | None:
 
 
 def _require_whole(path: Path, data: bytes) -> None:
-    # OpenCV decodes what there is of a truncated PNG or JPEG and fills the rest.
+    # OpenCV decodes the first part of a truncated PNG or JPEG and fills the rest with grey.
     for start, end, kind in ((b"\x89PNG", b"IEND", "PNG"), (b"\xff\xd8\xff", b"\xff\xd9", "JPEG")):
         if data.startswith(start) and end not in data[-65536:]:
             raise ImageError(

@@ -1,4 +1,4 @@
-"""Strict JSON: one sentence for whatever is wrong with a file, naming the entry."""
+"""Strict JSON: one sentence for any fault of a file, naming the entry."""
 
 import json
 from collections import Counter
@@ -44,7 +44,8 @@ def short(value: object) -> str:
 def entry_name(location: Sequence[int | str]) -> str:
     """Path of an entry as an error message names it: `frames[3].pan_rad`.
 
-    Pieces in angle brackets are the tags by which a schema tells the members of a union apart: left out.
+    Pieces in angle brackets are left out: they are the tags by which a schema tells the members of a union
+    apart.
     """
     name = ""
     for piece in location:
@@ -59,7 +60,7 @@ def entry_name(location: Sequence[int | str]) -> str:
 def prefixed(where: object) -> Iterator[None]:
     """Put `where` (a file, an entry) before the sentence of any error of ours that leaves the block.
 
-    What leaves is an InputError, or the subclass of it that was raised; on one line.
+    The error that leaves is an InputError, or the subclass of it that was raised, with a text of one line.
     """
     try:
         yield
@@ -81,7 +82,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def _doubled_key(value: object, doubled: dict[int, str], location: tuple[int | str, ...] = ()) -> str | None:
-    """Path of the first object of which a key stands twice; `doubled` maps its identity to that key."""
+    """Path of the first doubled key; `doubled` maps identities of objects with one to that key."""
     if isinstance(value, dict):
         if id(value) in doubled:
             return entry_name((*location, doubled[id(value)]))
@@ -98,7 +99,7 @@ def _doubled_key(value: object, doubled: dict[int, str], location: tuple[int | s
 def read_json(path: Path, format_name: str, version: int) -> dict[str, Any]:
     """The object in a JSON file of one of our formats.
 
-    NaN and infinite numbers pass: the schema refuses them, and knows which entry they are.
+    NaN and infinite numbers are let through: the schema refuses them and names the entry.
 
     Raises InputError for a file that cannot be read or is not JSON, for anything else than an object, for a
     key that stands twice, and for another format or version.

@@ -13,7 +13,7 @@ from pancam_graph.io._image_files import read_image
 __all__ = ["MASKS", "mask_file", "read_mask"]
 
 MASKS = "masks"
-"""Name of the folder, beside the images, whose masks go by their names."""
+"""Name of the folder, beside the images, of masks that are assigned to images by their names."""
 
 _POINTING = re.compile(r"(?P<camera>.+)_pan(?P<pan>[+-]?\d+(?:\.\d+)?)_tilt(?P<tilt>[+-]?\d+(?:\.\d+)?)")
 _SAME_POINTING_RAD = np.deg2rad(0.5)

@@ -2,7 +2,7 @@
 
 Columns `image` (row in the traverse's images), `track`, `uv_px` (n, 2; in CSV `u_px` and `v_px`) and
 `sigma_px`, or `covariance_px2` (n, 2, 2; in CSV `cov_uu_px2`, `cov_uv_px2`, `cov_vv_px2`), or both where they
-agree. Rows count from 0; other columns are left alone.
+agree. Rows count from 0; other columns are ignored.
 """
 
 import csv
@@ -52,7 +52,7 @@ def _read_npz(path: Path) -> Observations:
     content = io.BytesIO(read_bytes(path))
     try:
         archive: Any = np.load(content, allow_pickle=False)
-    except Exception as error:  # whatever zipfile and NumPy raise at bytes that are not theirs
+    except Exception as error:  # zipfile and NumPy raise many types at bytes that are no archive
         raise InputError(f"{path}: expected an .npz archive of arrays, found something else") from error
     if not isinstance(archive, np.lib.npyio.NpzFile):
         raise InputError(f"{path}: expected an .npz archive of arrays, found a single array")
@@ -78,7 +78,7 @@ def _read_npz(path: Path) -> Observations:
 
 
 def _observations(columns: dict[str, NDArray[Any]]) -> Observations:
-    """Observations of columns; where covariances stand alone, with the sigmas that go with them."""
+    """Observations of columns; without sigmas, those that follow from the covariances."""
     covariance = columns.get("covariance_px2")
     return Observations(
         image=columns["image"],
@@ -155,7 +155,7 @@ def _read_csv(path: Path) -> Observations:
 
 
 def _csv_columns(header: list[str]) -> dict[str, int]:
-    """Where the columns are that are read: sigma, or the three of a covariance, or all of them."""
+    """Indices of the columns that are read: with sigma, the three of a covariance, or both."""
     has_covariance = any(name in header for name in _COVARIANCE)
     wanted = [*_CSV_COLUMNS, *(_COVARIANCE if has_covariance else ())]
     if not has_covariance or "sigma_px" in header:

@@ -54,7 +54,7 @@ _AS_LABELLED = RigFitOptions(
 _SAME_FOCAL = 2e-4
 _SAME_PRINCIPAL_POINT_PX = 1.0
 _SAME_POSE = 1e-3
-"""Metres and radians by which rover poses within a stop may differ unnoticed."""
+"""Metres and radians by which rover poses within a stop may differ without a warning."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,11 +62,11 @@ class LocalisationSigma:
     """How well a later stop is known relative to the first, one standard deviation."""
 
     rotation_rad: float = 0.01
-    """Of each rotation component."""
+    """Standard deviation of each rotation component."""
     translation_m: float = 0.1
-    """Of each translation component, at no distance."""
+    """Standard deviation of each translation component at distance 0."""
     translation_per_m: float = 0.05
-    """More of it for each metre from the first stop: wheel odometry on loose ground."""
+    """Its increase with each metre from the first stop: wheel odometry on loose ground."""
 
 
 LOCALISATION_SIGMA = LocalisationSigma()
@@ -79,9 +79,9 @@ def read_pds(folder: Path | str) -> Traverse:
     rig misses a label's camera by more than 0.1 mm or 0.1 mrad, and where labels of one stop disagree.
 
     Raises InputError naming file and entry for a folder without .IMG files, a label that is missing, no
-    label, or lacks an entry (camera model, rover pose, mast angles), a camera that is not on the mast,
-    images of two rovers or two site frames, and ImageError if all files are shorter than their labels say; if
-    only some are, they are warned of and left out.
+    label, or without an entry (camera model, rover pose, mast angles), a camera that is not on the mast,
+    images of two rovers or two site frames, and ImageError if all files are shorter than their labels say.
+    If only some are, they are left out with a warning.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -100,7 +100,7 @@ def read_pds(folder: Path | str) -> Traverse:
     stop_ids, stops = _sort_stops(images, kinematics, warnings)
     frame_of, frames_first = _sort_frames(images, eye_of)
     fit = _fit_rig(images, kinematics, frame_of, eye_of, eye_names, frames_first, warnings)
-    # The chain's own mast frame replaces the design's where the axes were fitted.
+    # Where the axes were fitted, the mast frame of the fitted chain replaces that of the design.
     stops = tuple(
         replace(s, world_T_mast=images[i].world_T_rover * fit.world_T_mast)
         for s, i in zip(stops, stop_ids.values(), strict=True)
@@ -273,7 +273,7 @@ def _sort_frames(images: Sequence[LabelledImage], eye_of: IntArray) -> tuple[Int
 
 
 def _frame_ids(images: Sequence[LabelledImage], firsts: Sequence[int]) -> list[str]:
-    """Site, drive and mast counter; a number more where that is not unique."""
+    """Ids of frames: site, drive and mast counter, and a number where these are not unique."""
     ids: list[str] = []
     for row, i in enumerate(firsts):
         site, drive = images[i].stop
@@ -340,8 +340,8 @@ def _warn_of_angles(
     frame_of: IntArray,
     warnings: list[str],
 ) -> None:
-    # A joint's zero point may differ from the design by the same amount in all frames; a frame that
-    # moves alone was labelled with another pointing than was measured.
+    # The zero point of a joint may differ from the design, by the same amount in all frames. Where the angles
+    # of one frame alone differ, its label was made with another pointing than was measured.
     alone = np.abs(change - np.median(change, axis=0))
     sigma = np.array([mast.pointing_sigma.pan_rad, mast.pointing_sigma.tilt_rad])
     frames = np.flatnonzero((alone > 3 * sigma).any(axis=1))

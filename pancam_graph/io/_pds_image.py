@@ -22,21 +22,21 @@ _ROVER_GROUPS = ("ROVER_COORDINATE_SYSTEM", "ROVER_COORDINATE_SYSTEM_PARMS", "RO
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LabelledImage:
-    """What a label says, z up, before images are sorted into stops, frames and eyes."""
+    """An image as its label describes it, z up; not yet sorted into stops, frames and eyes."""
 
     label: PdsLabel
     host: str
     instrument: str
     stop: tuple[int, int]
-    """Site and drive."""
+    """Site and drive of the motion counter."""
     rover: LabelledRover
     mast_counter: int | None
-    """How often the mast had moved; None where the label does not count."""
+    """Number of motions of the mast so far; None where the label has no such counter."""
     pan_tilt_rad: tuple[float, float]
-    """Measured, of the chain."""
+    """Measured pan and tilt of the chain."""
     world_T_rover: gtsam.Pose3
     model: CAHV
-    """In the rover frame."""
+    """The camera in the rover frame."""
 
 
 def read_labelled_image(file: Path) -> LabelledImage:
@@ -112,7 +112,7 @@ def _camera_model(group: LabelGroup, width_px: int, height_px: int) -> CAHV:
 
 
 def _linearity(group: LabelGroup, order: list[str], vectors: dict[str, FloatArray]) -> float:
-    """By T: 1 perspective, 2 fish-eye, 3 general with the linearity in P."""
+    """Linearity of a CAHVORE by its type T: 1 perspective, 2 fish-eye, 3 general with the linearity in P."""
     linearity = {1: 1.0, 2: 0.0, 3: float(vectors["P"][0])}.get(int(vectors["T"][0]))
     if linearity is None:
         raise InputError(

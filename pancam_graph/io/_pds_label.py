@@ -34,7 +34,7 @@ _WANTED = re.compile(
     r"|(PMA|RSM)_ARTICULATION_STATE(_PARMS)?"
 )
 _NO_VALUE = 1e29
-"""Labels write 1e30 where telemetry has no number."""
+"""Numbers above this mean none: labels have 1e30 where telemetry has no value."""
 
 _SAMPLE_KINDS = {
     "INTEGER": ">i",
@@ -59,9 +59,9 @@ class ImageLayout:
     """Where the pixels of a PDS image are, and how they are written."""
 
     file: Path
-    """The file that holds them; not the label's own where the label is detached."""
+    """The file with the pixels; another than the label's where the label is detached."""
     offset_bytes: int
-    """Of the first line from the start of that file."""
+    """Offset of the first line from the start of that file."""
     width_px: int
     height_px: int
     bands: int
@@ -81,7 +81,7 @@ class ImageLayout:
 
     @property
     def end_bytes(self) -> int:
-        """Where the last line ends, from the start of the file."""
+        """Offset of the end of the last line from the start of the file."""
         bands = 1 if self.storage == "SAMPLE_INTERLEAVED" else self.bands
         return self.offset_bytes + self.height_px * bands * self.line_bytes
 
@@ -132,7 +132,7 @@ class LabelGroup:
         return [str(v).strip() for v in _as_list(self.value(key))]
 
     def numbers(self, key: str, count: int | None = None) -> FloatArray:
-        """Finite numbers, (count,) if a count is given, units dropped (angles: see `angles`)."""
+        """Finite numbers, (count,) if a count is given, units dropped (angles: see `angles_rad`)."""
         values = [_plain(v) for v in _as_list(self.value(key))]
         if count is not None and len(values) != count:
             self._fail(key, f"{count} numbers", values)
@@ -146,9 +146,9 @@ class LabelGroup:
         return float(value)
 
     def angles_rad(self, key: str = "ARTICULATION_DEVICE_ANGLE") -> dict[str, float]:
-        """Angles by the name that the entry's _NAME list gives them; those without a value left out.
+        """Angles by the name that the entry's _NAME list gives them; those without a value are left out.
 
-        Raises InputError where names and angles differ in number or a unit is no angle.
+        Raises InputError where names and angles differ in number or a unit is not one of angles.
         """
         names, entries = self.names(f"{key}_NAME"), _as_list(self.value(key))
         if len(names) != len(entries):
@@ -176,7 +176,7 @@ class PdsLabel:
     """Entries outside any group."""
 
     def group(self, *names: str) -> LabelGroup:
-        """The first group there is of these names. Raises InputError if there is none."""
+        """The first group that exists of these names. Raises InputError if there is none."""
         for name in names:
             items = self.top.items.get(name)
             if isinstance(items, Mapping):
@@ -288,7 +288,7 @@ def read_label(file: Path) -> PdsLabel:
 def _split_groups(label_file: Path, text: str) -> tuple[str, dict[str, str]]:
     """Text outside all groups and objects, and the text of each one that is used, nested ones apart.
 
-    pvl's own parser does not come to an end on some broken groups, and takes 0.4 s for a whole label.
+    The parser of pvl never returns on some broken groups, and takes 0.4 s for a whole label.
     """
     top: list[str] = []
     used: dict[str, list[str]] = {}
@@ -318,7 +318,7 @@ def _split_groups(label_file: Path, text: str) -> tuple[str, dict[str, str]]:
 
 
 def _parsed(where: Path | str, text: str) -> dict[str, Any]:
-    """Entries of text without groups; of an entry that is there twice, the first."""
+    """Entries of a text without groups; the first of two entries of one name."""
     try:
         module = _parser().parse(text + "\nEND\n")
     except (ParseError, LexerError, QuantityError, ValueError, StopIteration) as error:
@@ -330,9 +330,9 @@ def _parsed(where: Path | str, text: str) -> dict[str, Any]:
 
 
 def _parser() -> Any:
-    """A parser that accepts all dialects, but raises where the lenient one of pvl would loop for ever.
+    """A parser that accepts all dialects, but raises where the lenient parser of pvl would loop for ever.
 
-    It leaves dates as text: trying all their formats takes most of a label's time.
+    It leaves dates as text, as trying all formats of dates takes most of the time.
     """
 
     def no_date(value: str) -> NoReturn:

@@ -1,4 +1,4 @@
-"""What the PDS labels of one rover call things; each rover's module fills in one `LabelledRover`."""
+"""The names in the PDS labels of one rover; each rover's module fills in one `LabelledRover`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ class LabelledRover:
     joints_rad: Callable[[PdsLabel], tuple[float, float]]
     """Measured readings of the azimuth and the elevation joint. Raises InputError naming the entry."""
     mast_of: Callable[[PdsLabel], MastKinematics] | None = None
-    """The mast with what a label says better; None: labels say nothing of it."""
+    """The mast with those numbers that a label has; None: labels have none."""
 
 
 def reference_frame(group: LabelGroup, expected: set[str]) -> str:

@@ -1,4 +1,4 @@
-"""Pictures of a traverse: the one way from an image's row to its samples, and when two are the same."""
+"""Pictures of a traverse: from the row of an image to its samples, and which pictures are the same."""
 
 import hashlib
 from collections.abc import Mapping
@@ -54,7 +54,7 @@ def read_picture(traverse: Traverse, row: int) -> ImageContent:
 def readable_picture(traverse: Traverse, row: int) -> GreyImage | None:
     """The samples of an image; None without a file, or with one that cannot be read any more.
 
-    Reading the traverse has refused broken files: one that broke since must not cost the results of a solve.
+    Reading the traverse has refused broken files; a file that broke during a solve must not cost its results.
     """
     try:
         return read_picture(traverse, row).samples
@@ -97,7 +97,7 @@ def same_pictures(traverse: Traverse) -> dict[int, int]:
 
 
 def left_out(errors: Mapping[str, ImageError]) -> list[str]:
-    """Warnings of images, by id, whose files cannot be used: one of each, and how many more there are."""
+    """Warnings of images, by id, whose files cannot be used: the first five, and a count of the others."""
     named = [f"image {name} is left out: {error}" for name, error in list(errors.items())[:_NAMED]]
     more = len(errors) - _NAMED
     if more > 0:

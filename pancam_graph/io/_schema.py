@@ -85,12 +85,12 @@ class ImageEntry(Entry):
 
 
 class FreedomEntry(Entry):
-    """How free a quantity of the rig is."""
+    """Which entries of a quantity of the rig are free, and their priors."""
 
     scope: str
     free: list[str] | None = None
     sigma: dict[str, float | None] = {}  # noqa: RUF012  pydantic copies it
-    """Of the priors; null: none."""
+    """Sigmas of the priors by entry; null: no prior."""
 
     def freedom(self) -> Freedom:
         """The freedom. `Sharing` checks it."""
@@ -112,7 +112,7 @@ class FreedomEntry(Entry):
 
 
 class SharingEntry(Entry):
-    """What of the rig is free, and who shares it."""
+    """Which quantities of the rig are free, and which images share one value."""
 
     calibration: FreedomEntry | None = None
     mounts: FreedomEntry | None = None
@@ -120,13 +120,13 @@ class SharingEntry(Entry):
     radius: FreedomEntry | None = None
 
     def sharing(self) -> Sharing:
-        """The sharing. Raises InputError for what contradicts itself."""
+        """The sharing. Raises InputError for entries that contradict each other."""
         given = {field.name: getattr(self, field.name) for field in fields(Sharing)}
         return Sharing(**{name: entry.freedom() for name, entry in given.items() if entry is not None})
 
     @staticmethod
     def of(sharing: Sharing) -> "SharingEntry":
-        """The entry of a sharing; it names what is not as it would be without."""
+        """The entry of a sharing; it has only the quantities that differ from the default."""
         quantities = [field.name for field in fields(Sharing)]
         given = {name: FreedomEntry.of(getattr(sharing, name)) for name in quantities}
         usual = {name: FreedomEntry.of(getattr(Sharing(), name)) for name in quantities}
@@ -151,10 +151,10 @@ class TraverseFile(Entry):
 
 
 def rig_entry(rig: Rig) -> OwnRigEntry:
-    """The entry of a rig, with its own numbers even where a template made it.
+    """The entry of a rig, with all its numbers even where a template made it.
 
-    So the file says the same with every version of the package. What only simulations and drawings use
-    (the mast's height) and the sources are not in the format.
+    So the file means the same with every version of the package. The mast's height, which only simulations
+    and drawings use, and the sources are not in the format.
     """
     return OwnRigEntry(
         name=rig.name,

@@ -35,10 +35,10 @@ _IN_OBSERVATIONS = "observations: "
 def read_traverse(folder: Path | str) -> Traverse:
     """Read a traverse folder: `traverse.json`, the observations and image files that it names.
 
-    Every image file and mask is decoded once, to know that it is there, whole, of its camera's size and,
-    where labels tell, of the same rover; nothing is kept of it. Image files that are not are warned of, and
-    what reads them later does without. `observations` is None where the file says null: they are then to be
-    found in the images.
+    Every image file and mask is decoded once, to check that it exists, is whole, has its camera's size and,
+    where it has a label, is of the same rover as the others; its samples are not kept. Image files that fail
+    are warned of, and later steps leave them out. `observations` is None where the file says null: they are
+    then to be found in the images.
 
     Raises InputError with one sentence naming file, entry, what was expected and what was found; ImageError
     for a mask that cannot be used, and if no image file can be: unless observations are given and all image
@@ -68,7 +68,7 @@ def read_traverse(folder: Path | str) -> Traverse:
     observations = None if source is None else read_observations(source)
     traverse = _checked(entries, path, observations, source)
     unusable = _unusable_images(files, traverse)
-    # Where observations are to be found in images, that warns of them.
+    # Without observations, the search for them in images gives the same warnings.
     return traverse if source is None else traverse.with_warnings(left_out(unusable))
 
 
@@ -77,7 +77,7 @@ def _checked(
 ) -> Traverse:
     """The traverse of a file. Raises InputError naming the file at fault: itself, or that of observations."""
     try:
-        # Absurdly large numbers overflow; the constructors refuse what that leaves, in one line and not two.
+        # Numbers that are too large overflow. The constructors refuse the result; NumPy need not warn too.
         with np.errstate(all="ignore"):
             return traverse_of(entries, path.parent, observations)
     except PancamGraphError as error:
@@ -117,7 +117,7 @@ def write_traverse(traverse: Traverse, folder: Path | str, *, overwrite: bool = 
             shutil.copyfile(source, target)
         if observations is not None:
             whole_file(folder / _OBSERVATIONS, observations_npz(observations))
-        whole_file(path, f"{text}\n".encode())  # last: a folder with it is complete
+        whole_file(path, f"{text}\n".encode())  # last, so that a folder with it is complete
     except OSError as error:
         raise InputError(f"{folder}: expected a folder to write to, found: {error}") from error
 
@@ -217,7 +217,7 @@ def _unusable_images(files: list[Path | None], traverse: Traverse) -> dict[str, 
         camera = traverse.rig.eyes[int(traverse.image_eye[row])].camera
         mask = mask_file(traverse, row)
         try:
-            # One mask most often serves many images.
+            # Most often one mask serves many images; it is read once.
             if mask is not None and (mask, camera.width_px, camera.height_px) not in masks:
                 read_mask(mask, camera.width_px, camera.height_px, file.name)
                 masks.add((mask, camera.width_px, camera.height_px))
@@ -262,7 +262,7 @@ def _copies(traverse: Traverse, folder: Path) -> list[tuple[Path, Path]]:
     ]
     files = {folder / name: _inside(traverse.folder, name, entry) for entry, name in named}
     for row in range(len(traverse.images)):
-        mask = mask_file(traverse, row)  # it may be known by its name alone
+        mask = mask_file(traverse, row)  # also a mask that no entry names
         if mask is not None:
             files[folder / mask.relative_to(traverse.folder)] = mask
     for source in files.values():

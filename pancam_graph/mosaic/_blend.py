@@ -1,4 +1,4 @@
-"""From layers to one picture: equal brightness, seams where they show least, and soft transitions."""
+"""From layers to one picture: equal brightness, seams where they are least visible, and soft transitions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,12 +20,13 @@ _DARK, _BRIGHT = 0.003, 0.997
 """Shares of the pixels that become the darkest and the brightest of 8 bits."""
 _BANDS = 7
 _LEVELS = 12000.0
-"""What the blender's integers of 16 bits have for the brightest sample; they need room for differences."""
+"""Value of the brightest sample in the blender's 16-bit integers; the rest of their range is for
+differences."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Look:
-    """What two mosaics must share to be compared: whose pixels are taken where, and how bright they are."""
+    """What two mosaics must share to be compared: the image that each pixel is taken from, and brightness."""
 
     labels: NDArray[np.int32]
     """(rows, columns) number of the image that is shown; -1 where there is none."""
@@ -33,9 +34,9 @@ class Look:
     """How images are made equally bright."""
     dark: float
     bright: float
-    """Brightness, evened out, that becomes 1 and 255 of 8 bits."""
+    """Brightness, after gains and vignetting, that becomes 1 and 255 in 8 bits."""
     brightest: float
-    """The greatest that there is."""
+    """The greatest brightness in any layer."""
 
     def to_8_bits(self, samples: NDArray[np.float32]) -> NDArray[np.uint8]:
         """A blended mosaic (rows, columns) in 8 bits: from dark to bright, 0 where there is none."""
@@ -49,8 +50,8 @@ def choose_look(
 ) -> Look:
     """Evening, seams and contrast for the layers of a mosaic, each with the number of its image.
 
-    The evening is estimated in overlaps, unless it is known. Seams are those of least difference (graph cut,
-    Kwatra and others 2003, OpenCV's finder), sought in shrunken layers.
+    Gains and vignetting are estimated in overlaps, unless they are given. Seams are those of least difference
+    (graph cut, Kwatra and others 2003, OpenCV's finder), sought in shrunken layers.
     """
     area = sum(layer.grey.size for _, layer in layers)
     shrink = 1
@@ -103,9 +104,9 @@ def _labels(
 
 
 def _filled(labels: NDArray[np.int32], layers: Sequence[tuple[int, Layer]]) -> NDArray[np.int32]:
-    """Labels in which whatever a layer covers has one, and no pixel one of an image that is not there.
+    """Labels in which every covered pixel has the number of a layer that covers it.
 
-    What a user's mask covers is shown only where no other image is.
+    A pixel that a user's mask covers is taken from that image only where no other image is.
     """
     out = labels.copy()
     there = np.zeros(labels.shape, dtype=bool)
@@ -120,10 +121,11 @@ def _filled(labels: NDArray[np.int32], layers: Sequence[tuple[int, Layer]]) -> N
 
 
 def blend(layers: Sequence[tuple[int, Layer]], look: Look) -> NDArray[np.float32]:
-    """The mosaic (rows, columns) of layers, in samples of the images evened out; NaN where there is none.
+    """The mosaic (rows, columns) of layers, samples after gains and vignetting; NaN where there is none.
 
-    Transitions are as wide as what they blend is coarse (multi-band: Burt and Adelson 1983, OpenCV's
-    blender). Where a layer does not reach the seam that `look` has for it, another one is taken.
+    Coarse detail is blended over wide transitions, fine detail over narrow ones (multi-band: Burt and Adelson
+    1983, OpenCV's blender). Where a layer does not reach the seam that `look` gives it, another layer is
+    taken.
     """
     labels = _filled(look.labels, layers)
     height, width = labels.shape
@@ -136,7 +138,7 @@ def blend(layers: Sequence[tuple[int, Layer]], look: Look) -> NDArray[np.float32
             continue
         grey = _evened(number, layer, look.evening) * np.float32(scale)
         fine = np.clip(np.rint(grey), 0, _LEVELS).astype(np.int16)
-        # Beyond its edge a layer goes on as at its edge, or the transition would be towards black.
+        # A layer is continued beyond its edge with its value there: else it would be blended with black.
         blender.feed(cv2.merge([_continued(fine, layer.valid)] * 3), mask, (layer.left_px, layer.top_px))
     picture, _ = blender.blend(None, None)
     samples = np.maximum(picture[:, :, 0], 0).astype(np.float32) / np.float32(scale)
@@ -144,7 +146,7 @@ def blend(layers: Sequence[tuple[int, Layer]], look: Look) -> NDArray[np.float32
 
 
 def _continued(grey: NDArray[np.int16], valid: NDArray[np.bool_]) -> NDArray[np.int16]:
-    """Brightness with that of the nearest valid pixel where there is none."""
+    """Brightness, filled with that of the nearest valid pixel where there is none."""
     if valid.all():
         return grey
     _, nearest = cv2.distanceTransformWithLabels(

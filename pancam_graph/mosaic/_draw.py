@@ -1,4 +1,4 @@
-"""Mosaics with axes, and a figure that shows what the refined pointing is worth."""
+"""Mosaics with axes, and a figure that compares the refined pointing with telemetry."""
 
 from collections.abc import Sequence
 
@@ -24,7 +24,7 @@ _LABEL_ROOM_PX, _LINE_ROOM_PX = 90, 45
 
 
 def shrunk(picture: Picture, width_px: int) -> Picture:
-    """A picture no wider than `width_px`, its empty part light grey: no black holes on a white page."""
+    """A picture no wider than `width_px`, its empty part light grey, not black on a white page."""
     filled = picture > 0
     factor = min(1.0, width_px / picture.shape[1])
     size = (max(1, round(picture.shape[1] * factor)), max(1, round(picture.shape[0] * factor)))
@@ -69,7 +69,7 @@ def with_axes(mosaic: Mosaic, pointing: Pointing, title: str, width_px: int | No
 
 
 class _Axis:
-    """Ticks of an axis: where they are, in pixels of the drawn picture, and what they say."""
+    """Ticks of an axis: their places, in pixels of the drawn picture, and their labels."""
 
     def __init__(self, at_px: list[float], text: list[str]) -> None:
         self.at_px, self.text = at_px, text
@@ -149,7 +149,7 @@ def _draw_circles(picture: Picture, projection: Ground, scale: float) -> None:
         cv2.line(layer, ends[0], ends[1], (60, 190, 255), 1, cv2.LINE_AA)
     cv2.addWeighted(layer, 0.6, picture, 0.4, 0, dst=picture)
     cv2.drawMarker(picture, middle, (0, 94, 213), cv2.MARKER_CROSS, 18, 2)
-    for r in rings:  # between two lines of azimuth, where nothing else is written
+    for r in rings:  # between two lines of azimuth, where no other label is
         d = np.array([np.cos(np.deg2rad(-15)), -np.sin(np.deg2rad(-15))]) * (float(r) * per_m - 22)
         _write_over(picture, f"{r:g} m", np.array(centre) + d)
     for azimuth in range(0, 360, 30):
@@ -158,7 +158,7 @@ def _draw_circles(picture: Picture, projection: Ground, scale: float) -> None:
 
 
 def _plain(text: str) -> str:
-    """OpenCV's own letters are ASCII."""
+    """The text in ASCII, which is all that OpenCV can draw."""
     return text.encode("ascii", "replace").decode("ascii")
 
 
@@ -174,7 +174,7 @@ def _write(
 
 
 def _write_over(picture: Picture, text: str, at: NDArray[np.float64]) -> None:
-    """Words in the middle of a place of a picture, on a light ground."""
+    """Draw words on a light ground, their middle at a place of a picture."""
     (width, height), _ = cv2.getTextSize(text, _FONT, 0.5, 1)
     x, y = round(float(at[0]) - width / 2), round(float(at[1]) + height / 2)
     cv2.rectangle(picture, (x - 3, y - height - 3), (x + width + 3, y + 4), (245, 245, 245), cv2.FILLED)

@@ -13,26 +13,27 @@ from pancam_graph.mosaic._warp import Layer
 __all__ = ["Evening", "Small", "even_out"]
 
 _POWERS = np.array([1, 2, 3])
-"""Of the squared radius, in the logarithm of the vignetting."""
+"""Powers of the squared radius in the logarithm of the vignetting."""
 _PRIOR_PX = 1.0
-"""How many pixels of an overlap the prior for a gain of 1 counts as much as."""
+"""Weight of the prior for a gain of 1, as a number of pixels of an overlap."""
 _PRIOR_VIGNETTING = 1.0
 """Standard deviation of the prior for each coefficient of the vignetting about 0."""
 _LEAST_COMMON = 50
-"""Pixels, in shrunken layers, from which an overlap tells a ratio of brightness."""
+"""Least number of pixels, in shrunken layers, of an overlap that is used."""
 _LEAST_PAIRS = 4
-"""Overlaps from which the scatter of what they say tells how far the vignetting is known."""
+"""Least number of overlaps from whose scatter the uncertainty of the vignetting is estimated."""
 _RADII = np.linspace(0.25, 1.0, 7)
-"""Of the half diagonal: where a vignetting must be known, and be more than its uncertainty, to count."""
+"""Radii, as shares of the half diagonal, at which a vignetting is compared with its uncertainty."""
 _KNOWN = 0.03
-"""Uncertainty, as a share of the brightness, from which a vignetting counts as not determined."""
+"""Uncertainty of the vignetting, as a share of the brightness, from which it is not used."""
 _SIGNIFICANT = 4.0
-"""By how many of its sigmas a vignetting must differ from none somewhere."""
+"""By how many of its sigmas a vignetting must differ from none at one of the radii."""
 _LEAST = 0.01
-"""And what share of the brightness it must take there: less is what blending hides, and what moved fakes."""
+"""Share of the brightness that it must take there at least. Blending hides less than that, and things that
+move between two images produce as much by themselves."""
 _ROUNDS = 5
 _DARK = 0.02
-"""Share of the brightest, below which logarithms are mostly noise."""
+"""Share of the brightest sample below which logarithms are mostly noise."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -40,15 +41,15 @@ class Evening:
     """What makes images of one camera equally bright."""
 
     gain: dict[int, float]
-    """By image, what its brightness is multiplied with."""
+    """By image, the factor that its brightness is multiplied with."""
     vignetting: FloatArray
     """(3,) coefficients of r^2, r^4 and r^6 in the logarithm of the brightness that is left at r half
-    diagonals from the middle of an image; zeros where overlaps do not tell it."""
+    diagonals from the middle of an image; zeros where overlaps do not determine it."""
     sigma: float | None
     """Standard deviation of that logarithm in the corners; None where it is not estimated."""
 
     def factor(self, number: int, radius_squared: NDArray[np.floating]) -> NDArray[np.float32]:
-        """What brightness of an image is multiplied with, at squared radii of any shape."""
+        """The factor of an image's brightness at squared radii, an array of any shape."""
         gain = np.float32(self.gain[number])
         if not self.vignetting.any():
             return np.full(radius_squared.shape, gain, dtype=np.float32)
@@ -62,12 +63,12 @@ class Small:
     """A layer at a fraction of its size."""
 
     number: int
-    """Of its image."""
+    """Number of its image."""
     left_px: int
     top_px: int
     grey: NDArray[np.float32]
     chosen: BoolArray
-    """Where all of the pixel has data that no mask covers."""
+    """Where the whole pixel has data that no mask covers."""
     radius_squared: NDArray[np.float32]
 
     @staticmethod
@@ -99,7 +100,7 @@ class _Overlap:
     """Pixels that two images share."""
 
     rows: tuple[int, int]
-    """Of the two images among the unknown gains."""
+    """Indices of the two images among the unknown gains."""
     ratio: FloatArray
     """(n,) logarithm of the second's brightness over the first's"""
     powers: FloatArray
@@ -109,9 +110,10 @@ class _Overlap:
 def even_out(layers: Sequence[Small]) -> Evening:
     """Gains, and the vignetting where overlaps determine it, by robust least squares on logarithms.
 
-    Brightness is exposure times vignetting times scene: ratios in overlaps hold no scene. Gains keep to about
-    1, all together and in groups without overlap. A vignetting counts if overlaps agree on it: its
-    uncertainty is the scatter of solutions that leave out one overlap each (jackknife). Else it is none.
+    Brightness is exposure times vignetting times scene: in the ratio of two images that overlap the scene
+    cancels. A prior keeps gains near 1, which fixes their common factor, and that of each group of images
+    without overlap with others. Vignetting is used if overlaps agree on it: its uncertainty is the scatter of
+    solutions that leave out one overlap each (jackknife). Else it is taken to be none.
     """
     numbers = sorted({layer.number for layer in layers})
     n = len(numbers)
@@ -136,7 +138,7 @@ def even_out(layers: Sequence[Small]) -> Evening:
 def _robust(
     overlaps: Sequence[_Overlap], n: int, *, free: int
 ) -> tuple[FloatArray, list[tuple[FloatArray, FloatArray]]]:
-    """Gains and vignetting (n + 3,), and the equations of each overlap with the weights that led there."""
+    """Gains and vignetting (n + 3,), and the equations of each overlap with the final weights."""
     solution = np.zeros(n + len(_POWERS))
     parts: list[tuple[FloatArray, FloatArray]] = []
     for _ in range(_ROUNDS):
@@ -167,7 +169,7 @@ def _overlaps(layers: Sequence[Small], row: dict[int, int]) -> Iterator[_Overlap
 
 
 def _common(a: Small, b: Small) -> tuple[tuple[slice, slice], tuple[slice, slice]] | None:
-    """What two layers share, as slices of each; None for nothing."""
+    """The overlap of two layers, as slices of each; None if they do not overlap."""
     corners = [(layer.left_px, layer.top_px) for layer in (a, b)]
     low = np.max(corners, axis=0)
     high = np.min([np.add(c, s.grey.shape[::-1]) for c, s in zip(corners, (a, b), strict=True)], axis=0)
@@ -185,7 +187,8 @@ def _equations(
 ) -> tuple[FloatArray, FloatArray]:
     """Normal matrix and right-hand side of an overlap, over gains (n) and vignetting (3).
 
-    Cauchy weights about the solution so far: what moved, glints and what is masked nowhere count little.
+    Cauchy weights about the solution so far give little weight to glints, and to things that moved and that
+    no mask covers.
     """
     i, j = overlap.rows
     miss = overlap.ratio - overlap.powers @ vignetting - (gains[i] - gains[j])
@@ -201,7 +204,7 @@ def _equations(
 
 
 def _solved(parts: Sequence[tuple[FloatArray, FloatArray]], n: int, free: int) -> FloatArray:
-    """Gains and vignetting (n + 3,), logarithms; of `free` leading unknowns, the others 0."""
+    """Gains and vignetting (n + 3,), as logarithms: the first `free` are estimated, the others are 0."""
     size = n + len(_POWERS)
     prior = np.concatenate([np.full(n, _PRIOR_PX), np.full(len(_POWERS), 1 / _PRIOR_VIGNETTING**2)])
     normal, right = np.diag(prior), np.zeros(size)

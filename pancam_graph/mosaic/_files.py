@@ -40,7 +40,7 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, kw_only=True)
 class Blink:
-    """Two pictures of the same, one with each pointing, that the report shows in turn."""
+    """Two pictures of one place, one with each pointing, that the report shows in turn."""
 
     group: str
     """Stop and camera."""
@@ -71,8 +71,8 @@ def write_mosaics(
 ) -> WrittenMosaics:
     """Write the mosaics of every eye at every stop into a folder, which must exist (docs/files.md).
 
-    What cannot be shown, an image or all images of an eye at a stop, becomes a warning. `progress` is called
-    with a stage, how many of its parts are done, and how many there are.
+    An image that cannot be shown, or an eye without any image at a stop, becomes a warning. `progress` is
+    called with a stage, how many of its parts are done, and how many there are.
     """
     traverse = solution.traverse
     pairs = sorted(set(zip(traverse.image_stop.tolist(), traverse.image_eye.tolist(), strict=True)))
@@ -109,7 +109,7 @@ def write_mosaics(
 
 
 def _plain(name: str) -> str:
-    """A name as every file system takes it; numbers before it keep files apart."""
+    """A name that every file system takes; two ids may get one name, and the numbers before it differ."""
     return re.sub(r"[^A-Za-z0-9]+", "-", name).strip("-")[:_MAX_NAME] or "x"
 
 
@@ -119,14 +119,14 @@ def _in_words(made: StopMosaics) -> str:
         return "no overlap with texture enough to measure a seam error"
     own_surface = seams.median_px("telemetry_own_surface")
     return (
-        f"seam error {seams.median_px('telemetry'):.2f} px with telemetry ({own_surface:.2f} px on the surface that "
-        f"its own landmarks span), {seams.median_px('refined'):.2f} px refined; median of {seams.used} "
-        f"windows in {len(seams.overlaps)} overlaps"
+        f"seam error {seams.median_px('telemetry'):.2f} px with telemetry ({own_surface:.2f} px on the "
+        f"surface that its own landmarks span), {seams.median_px('refined'):.2f} px refined; "
+        f"median of {seams.used} windows in {len(seams.overlaps)} overlaps"
     )
 
 
 def _write(made: StopMosaics, folder: Path, name: str, title: str) -> list[Json]:
-    """Write the pictures of a stop's eye; their entries in the index."""
+    """Write the pictures of one eye at one stop; returns their entries in the index."""
     entries = []
     for kind, mosaic in (("cylinder", made.cylinder), ("ground", made.ground)):
         if mosaic is None:

@@ -37,7 +37,7 @@ class Mosaic:
     """One picture of all images, with each pointing."""
 
     projection: Projection
-    """Where its pixels are in the world."""
+    """Where the pixels are in the world."""
     pictures: dict[Pointing, NDArray[np.uint8]]
     """(rows, columns) grey, stretched for the eye; 0 where there is no image."""
     samples: dict[Pointing, NDArray[np.uint16]] | None
@@ -50,7 +50,7 @@ class Mosaic:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StopMosaics:
-    """What one eye saw from one stop."""
+    """The mosaics of one eye at one stop."""
 
     stop: str
     camera: str
@@ -75,9 +75,9 @@ class StopGround:
     """(3,) mean of the cameras' refined centres; directions and ranges count from there."""
     views: dict[Pointing, View]
     surfaces: dict[Pointing, Surface]
-    """What the landmarks of each pointing span."""
+    """The surface that the landmarks of each pointing span."""
     twice: Mapping[int, int]
-    """Rows of images whose picture is the same as another's, and of which."""
+    """Rows of images whose picture is the same as that of an image before, and that image's row."""
 
 
 def stop_ground(solution: Solution, stop: int, twice: Mapping[int, int] | None = None) -> StopGround:
@@ -109,9 +109,9 @@ def make_mosaics(
 
     Both show the surface that the adjusted landmarks span, with the same exposures, seams and contrast, so
     that only the pointing differs. Image files are read from the traverse's folder. `ground` is what
-    `stop_ground` gives, where it is at hand.
+    `stop_ground` gives, if it is known.
 
-    Raises InputError for a stop or a camera that is not in the traverse, and where no image can be had.
+    Raises InputError for a stop or a camera that is not in the traverse, and where no image can be shown.
     """
     traverse = solution.traverse
     stops = {s.id: row for row, s in enumerate(traverse.stops)}
@@ -152,9 +152,9 @@ def _mosaic(
     projection: Projection,
     evening: Evening | None = None,
 ) -> tuple[Mosaic | None, Lattice, Evening | None]:
-    """A mosaic, None where no image shows anything of it, its lattice, and what makes images equally bright.
+    """A mosaic (None where no image shows any of it), its lattice, and gains and vignetting.
 
-    That is estimated, unless it is given.
+    Gains and vignetting are estimated, unless they are given.
     """
     lattice = Lattice.over(projection, surface)
     layers = _layers(images, "refined", lattice)
@@ -199,7 +199,7 @@ def _cylinder(
     top_deg = sphere.top_deg - float(rows[0]) * cell_deg
     height_deg = min((int(rows[-1] - rows[0]) + 1) * cell_deg, top_deg + 90)
     width_deg = 360 - gap * cell_deg
-    # What is seen is known to a few cells; drawn once, it is known to the pixel.
+    # The cells that images see bound the mosaic to a few cells; drawing it once bounds it to the pixel.
     scale = min(options.px_per_degree or native, options.max_width_px / max(width_deg, height_deg))
     rough = _part(surface.origin_m, scale, left_deg, width_deg, top_deg, height_deg, closed=gap == 0)
     lattice = Lattice.over(rough, surface)
@@ -236,7 +236,7 @@ def _part(
     *,
     closed: bool,
 ) -> Cylinder:
-    """A cylinder of about a scale; one that goes round has whole cells of the lattice."""
+    """A cylinder of about the given scale; one that goes round has a whole number of lattice cells."""
     if closed:
         width = max(STEP_PX * int(360 * scale / STEP_PX), STEP_PX)
         scale, left_deg = width / 360, 180.0

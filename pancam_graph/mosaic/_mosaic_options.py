@@ -9,7 +9,7 @@ __all__ = ["MosaicOptions"]
 
 @dataclass(frozen=True, kw_only=True)
 class MosaicOptions:
-    """How large mosaics are. The defaults show what the images show, as far as a file of 8 bits can.
+    """How large mosaics are. The defaults show all the detail of the images.
 
     Raises InputError for a number that is not above 0, and for a mosaic of more than 32 million pixels.
     """

@@ -14,19 +14,19 @@ WINDOW_PX = 64
 """Side of a window."""
 
 _HIGHEST_FREQUENCY = 0.25
-"""Cycles per pixel: above, cameras' optics and lossy compression leave little but noise."""
+"""Highest frequency used, cycles per pixel: above it optics and lossy compression leave mostly noise."""
 _STEPS = 5
 _TURNS = 3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Displacements:
-    """How far n windows of one image are from where another has the same texture."""
+    """Displacements of n windows of one image against the same windows of another."""
 
     shift_px: FloatArray
     """(n, 2) by which the second image's texture is displaced, right and down."""
     sigma_px: FloatArray
-    """(n,) formal standard deviation of its less certain direction; large where texture is missing."""
+    """(n,) formal standard deviation of the shift in its less certain direction; large without texture."""
     coherence: FloatArray
     """(n,) 1 where the windows differ by a shift only, near 0 where they have nothing in common."""
 
@@ -48,7 +48,7 @@ def displacements(first: NDArray[Any], second: NDArray[Any]) -> Displacements:
 
     shift: FloatArray = np.zeros((len(first), 2))
     for turn in range(_TURNS):
-        # Tapers go along with the texture: between two that stand still it would seem to move less.
+        # The tapers move with the texture: tapers that stand still would make it seem to move less.
         cross = np.conj(_spectrum(first, -0.5 * shift)) * _spectrum(second, 0.5 * shift)
         if turn == 0:
             shift = _peak(np.where(low, cross, 0.0))
@@ -64,8 +64,8 @@ def displacements(first: NDArray[Any], second: NDArray[Any]) -> Displacements:
             shift = shift - np.clip(step[..., 0], -1.0, 1.0)
     left = cross * np.exp(1j * (shift @ omega.T))
     coherence = np.abs(left.sum(axis=1)) / total
-    # A phase's variance is taken to be as its weight's inverse. Half of the frequencies mirror the other
-    # half, and the taper ties neighbours together: about one in four counts.
+    # The variance of a phase is taken to be the inverse of its weight. Half of the frequencies mirror the
+    # other half, and the taper correlates neighbours: about one in four is independent.
     scatter = np.einsum("nk,nk->n", weight, np.angle(left) ** 2) / total
     variance = (scatter / (np.count_nonzero(low) / 4))[:, None, None] * np.linalg.inv(normal)
     return Displacements(
@@ -76,7 +76,7 @@ def displacements(first: NDArray[Any], second: NDArray[Any]) -> Displacements:
 
 
 def _spectrum(windows: NDArray[Any], shift_px: FloatArray) -> NDArray[np.complex128]:
-    """Spectra (n, 64, 64) of windows about the means of what their tapers, moved by shifts (n, 2), show."""
+    """Spectra (n, 64, 64) of windows less their means, under tapers moved by shifts (n, 2)."""
     middle, half = 0.5 * (WINDOW_PX - 1), 0.5 * (WINDOW_PX + 1)
     away = np.arange(WINDOW_PX) - middle - np.clip(shift_px, -0.5 * half, 0.5 * half)[..., None]
     hann = np.where(np.abs(away) < half, np.cos(0.5 * np.pi * away / half) ** 2, 0.0)

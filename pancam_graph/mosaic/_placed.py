@@ -33,9 +33,9 @@ class PlacedCamera:
 
     camera: Camera
     world_R_camera: FloatArray
-    """(3, 3)"""
+    """(3, 3) rotation of the camera in the world."""
     centre_m: FloatArray
-    """(3,)"""
+    """(3,) centre in the world."""
 
     def project(self, points_m: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Pixels (n, 2) of world points (n, 3) and their validity; see `Camera.project`."""
@@ -44,7 +44,7 @@ class PlacedCamera:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlacedImage:
-    """An image with its two cameras."""
+    """An image with its camera as telemetry and as the adjustment place it."""
 
     id: str
     grey: GreyImage
@@ -68,7 +68,7 @@ class View:
 
 
 def view_from_stop(solution: Solution, stop: int, pointing: Pointing) -> View:
-    """What a pointing says, with the stop's mast where the adjustment has it.
+    """Cameras and landmarks of a pointing, with the stop's mast where the adjustment has it.
 
     Telemetry, and the landmarks that it gives, are carried along with the stop's mast: where a mosaic stands
     in the world is then the same for both pointings, and only what the stop's images say of each other
@@ -93,9 +93,9 @@ def view_from_stop(solution: Solution, stop: int, pointing: Pointing) -> View:
 def placed_images(
     solution: Solution, stop: int, eye: int, views: dict[Pointing, View], twice: Mapping[int, int]
 ) -> tuple[list[PlacedImage], list[str]]:
-    """The images that an eye took at a stop, and a warning for each that cannot be had.
+    """The images that an eye took at a stop, and a warning for each that cannot be shown.
 
-    `twice` is what `same_pictures` gives: one picture cannot be of two places.
+    `twice` is what `same_pictures` gives: a picture that is there twice is shown at its first place.
     Where the rig was adjusted, its calibration belongs to the refined pointing only.
     """
     traverse = solution.traverse

@@ -47,11 +47,11 @@ class Cylinder:
         return surface.points_m(ray)
 
     def pixels(self, points_m: FloatArray) -> FloatArray:
-        """Pixels (n, 2), column and row, of world points (n, 3); columns from the first on, once around."""
+        """Pixels (n, 2), column and row, of world points (n, 3); columns of one turn from the first on."""
         d = points_m - self.origin_m
         azimuth = np.rad2deg(np.arctan2(d[:, 1], d[:, 0]))
         elevation = np.rad2deg(np.arctan2(d[:, 2], np.hypot(d[:, 0], d[:, 1])))
-        # Half a pixel before the first column is still its own.
+        # The first column begins half a pixel before its centre.
         half = 0.5 / self.px_per_degree
         column = ((self.left_deg - azimuth + half) % 360 - half) * self.px_per_degree
         return np.column_stack([column, (self.top_deg - elevation) * self.px_per_degree])
@@ -73,7 +73,7 @@ class Ground:
 
     @property
     def closed(self) -> bool:
-        """Never: the last column is not followed by the first."""
+        """False: the last column is not followed by the first."""
         return False
 
     @staticmethod

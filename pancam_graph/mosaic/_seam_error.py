@@ -19,17 +19,18 @@ __all__ = ["CASES", "Case", "Overlap", "SeamError", "native_px_per_degree", "sea
 
 Case = Literal["telemetry", "telemetry_own_surface", "refined"]
 CASES: tuple[Case, ...] = ("telemetry", "telemetry_own_surface", "refined")
-"""Telemetry on the surface that the adjusted landmarks span, as mosaics are drawn; telemetry on the surface
-that landmarks span which were triangulated with it, the best it can do by itself; refined pointing on the
-first surface."""
+"""`telemetry`: telemetry's pointing on the surface that the adjusted landmarks span, as mosaics are drawn.
+`telemetry_own_surface`: the same pointing on the surface of landmarks that were triangulated with it, the
+best that telemetry can do by itself. `refined`: the refined pointing on the adjusted surface."""
 
 _STRIDE_PX = WINDOW_PX // 2
 _MAX_WINDOWS = 600
 _MAX_SIDE_PX = 4096
 _GREATEST_SIGMA_PX = 0.1
-"""A window whose displacement is known less well has too little texture."""
+"""Largest formal sigma of a window's displacement, pixels; a window above it has too little texture."""
 _LEAST_COHERENCE = 0.5
-"""A window with less has different things in it: a shadow that moved, a far and a near thing."""
+"""Least coherence of a window; below it the two images differ by more than a shift (a shadow that moved, a
+near thing before a far one)."""
 _DRAWN: tuple[tuple[Case, Pointing, Pointing], ...] = (
     ("telemetry", "telemetry", "refined"),
     ("telemetry_own_surface", "telemetry", "telemetry"),
@@ -38,7 +39,7 @@ _DRAWN: tuple[tuple[Case, Pointing, Pointing], ...] = (
 """Each case with its pointing, and the pointing whose landmarks span its surface."""
 _BLOCK = 128
 _CLOSE_UP_PX = (168, 112)
-"""Width and height."""
+"""Width and height of a close-up, pixels."""
 _DETAIL_PX = 12.0
 _STEEPEST_DEG = 65.0
 """Above and below, columns of a panorama converge too fast for windows to keep their shape."""
@@ -46,14 +47,14 @@ _STEEPEST_DEG = 65.0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Overlap:
-    """Two images that show the same, and how far apart they show it."""
+    """Two images that overlap, and how far apart they show the same texture."""
 
     images: tuple[str, str]
-    """Ids."""
+    """Ids of the two images."""
     azimuth_deg: FloatArray
-    """(n,) of the middle of each used window."""
+    """(n,) azimuth of the middle of each used window."""
     elevation_deg: FloatArray
-    """(n,) the same."""
+    """(n,) elevation of the middle of each used window."""
     shift_px: dict[Case, FloatArray]
     """(n, 2) by which the second image is displaced in each window, right and down, in pixels of the images
     at their centre."""
@@ -128,7 +129,7 @@ def seam_error(
 def _around(overview: Cylinder, cells: BoolArray, px_per_degree: float) -> Cylinder:
     """The cylinder that holds cells (rows, columns) of another's lattice, at another scale."""
     rows, columns = np.flatnonzero(np.any(cells, axis=1)), np.any(cells, axis=0)
-    if overview.closed:  # its lattice goes one cell beyond the last column
+    if overview.closed:  # the lattice of a mosaic goes one cell beyond its last column
         columns = columns[: overview.width_px // STEP_PX]
         start, gap = largest_gap(columns)
         first, count = (start + gap) % len(columns), len(columns) - gap
@@ -215,7 +216,7 @@ def _close_up(first: _Canvas, second: _Canvas, common: BoolArray, middle: FloatA
     shown = common[part]
     channels = []
     for canvas in (first, second):
-        # Unequal exposure and vignetting would colour all of it: detail alone is compared.
+        # Only detail is compared: unequal exposure and vignetting would colour the whole picture.
         weight = cv2.GaussianBlur(shown.astype(np.float32), (0, 0), _DETAIL_PX)
         smooth = cv2.GaussianBlur(np.where(shown, canvas.grey[part], 0), (0, 0), _DETAIL_PX)
         detail = canvas.grey[part] - smooth / np.maximum(weight, 1e-6)
@@ -238,7 +239,7 @@ def _windows(common: BoolArray, around: Cylinder) -> IntArray:
 
 
 def _displaced(first: _Canvas, second: _Canvas, at: IntArray) -> Displacements:
-    # In blocks, so that many windows of complex numbers never lie in memory together.
+    # In blocks, so that not all windows are in memory as complex numbers at once.
     parts = []
     for block in np.array_split(at, max(1, -(-len(at) // _BLOCK))):
         cut = [

@@ -14,34 +14,36 @@ from pancam_graph.mosaic._placed import View
 __all__ = ["FAR_M", "Surface", "directions", "surface_of_stop"]
 
 FAR_M = 1e5
-"""Where the sky and everything beyond the last landmark is put."""
+"""Range of the sky and of everything beyond the last landmark, metres."""
 
 _CELL_DEG = 1.0
 _COLUMNS = 360
 _ROWS = 181
 _OBSERVED_PX = 0.15
-"""Noise that landmarks' parallaxes are weighted with."""
+"""Standard deviation of a landmark's parallax, pixels."""
 _ROBUST_PX = 0.5
-"""A landmark whose parallax misses the surface by this much counts half."""
+"""Residual of a landmark's parallax at which its weight is halved."""
 _RELIEF_PER_CELL = 0.1
-"""By what share the range changes, beyond the plane's, from one cell to the next."""
+"""Standard deviation of the change of range from one cell to the next, as a share of it, besides the
+plane's."""
 _LEAST_INVERSE_RANGE = 0.01
 """Per metre; the scale of that share where the plane is far away or above the horizon."""
 _FADE_CELLS = 10.0
 """Distance from the last landmark over which the surface returns to the plane."""
 _PLANE_SIGMA = 0.05
-"""Of the plane's slopes about the horizontal, and of its distance as a share."""
+"""Standard deviations of the priors of the plane: its slopes about 0, and its distance as a share of the
+nominal one."""
 _NEIGHBOURS = 8
 _ALIKE = 0.15
-"""By what share ranges of neighbours may differ, two of which must be alike."""
+"""Share by which the ranges of two neighbours may differ from a landmark's own at the most."""
 _SPIKE = 2.0
 """How many times nearer or farther a cell may be than the median of its surroundings."""
 _ROUNDS = 5
 _MOST_GRADIENTS = 50
 _FARTHEST_GROUND_M = 300.0
-"""Where the ground is no longer told from the sky."""
+"""Inverse range below which ground is not told from sky."""
 _HIDDEN = 1.5
-"""A place is hidden if what is seen in its direction is this many times nearer, or farther, than it."""
+"""A place is hidden if the surface in its direction is nearer or farther than it by this factor."""
 
 
 def directions(azimuth_rad: FloatArray, elevation_rad: FloatArray) -> FloatArray:
@@ -53,7 +55,7 @@ def directions(azimuth_rad: FloatArray, elevation_rad: FloatArray) -> FloatArray
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Surface:
-    """What is seen in every direction from `origin_m`, a point of the world."""
+    """The inverse range of the terrain in every direction from `origin_m`, a point of the world."""
 
     origin_m: FloatArray
     """(3,) world point that directions start from."""
@@ -75,8 +77,8 @@ class Surface:
     def ground_m(self, xy_m: FloatArray) -> FloatArray:
         """World points (n, 3) of the surface at places (n, 2), world x and y minus the origin's.
 
-        NaN where the origin does not see the place: behind what rises in front of it, and beyond the last
-        that the surface knows.
+        NaN where the place is not seen from the origin: behind terrain that rises in front of it, and farther
+        than the surface reaches.
         """
         azimuth = np.deg2rad(_CELL_DEG) * np.arange(_COLUMNS)
         elevation = np.deg2rad(np.linspace(-89.9, 89.9, 4 * _ROWS))
@@ -103,10 +105,10 @@ def surface_of_stop(solution: Solution, stop: int, origin_m: FloatArray, view: V
     """The surface that a view's landmarks span around `origin_m` (3,), a point near the stop's cameras.
 
     Taken are landmarks with used observations in images of the stop. The surface is the ground plane that
-    fits them, and relief on it: the smoothest inverse ranges that agree with the landmarks, each weighted
-    by how far its inverse range moves it in the images that saw it (what cannot be told from parallax does
-    not matter to a mosaic either), robustly. Away from landmarks the relief fades to the plane, and above
-    the plane's horizon to a far sphere. Without landmarks it is the rig's nominal ground.
+    fits them, and relief on it: the smoothest inverse ranges that agree with the landmarks, each weighted by
+    how far its inverse range moves it in the images that saw it (a range that parallax does not determine
+    does not matter to a mosaic either), robustly. Away from landmarks the relief fades to the plane, and
+    above the plane's horizon to a far sphere. Without landmarks it is the rig's nominal ground.
     """
     rows, weight = _parallax_weights(solution, stop, origin_m, view)
     to_point = view.landmarks_m[rows] - origin_m
@@ -119,7 +121,7 @@ def surface_of_stop(solution: Solution, stop: int, origin_m: FloatArray, view: V
     at = _interpolation(ray)
     smooth = _smoothness(plane)
     relief = np.zeros(_ROWS * _COLUMNS)
-    # What the plane misses is relief, not error: all landmarks count in full at first.
+    # All landmarks have full weight at first: their distance from the plane is relief, not error.
     robust = np.ones(len(rows))
     first = None
     for _ in range(_ROUNDS if len(rows) else 0):
@@ -129,7 +131,7 @@ def surface_of_stop(solution: Solution, stop: int, origin_m: FloatArray, view: V
         if first is None:
             first = splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
             relief = first.solve(right)
-        else:  # weights change little: the first factorisation makes a few conjugate gradients enough
+        else:  # weights change little: the first factorisation is a good preconditioner
             solver = LinearOperator(system.shape, matvec=first.solve, dtype=np.float64)
             relief, _ = cg(system, right, x0=relief, rtol=1e-6, maxiter=_MOST_GRADIENTS, M=solver)
         robust = _robust(weight, inverse - base - at @ relief)
@@ -139,9 +141,9 @@ def surface_of_stop(solution: Solution, stop: int, origin_m: FloatArray, view: V
 
 
 def _supported(ray: FloatArray, inverse: FloatArray, weight: FloatArray) -> BoolArray:
-    """Which landmarks (n,) have two neighbours of about their range, as far as parallax tells it.
+    """Which landmarks (n,) have two neighbours of about their range, as far as parallax determines it.
 
-    One without is a wrong match most often: patterns of the rover's deck repeat.
+    A landmark without is most often a wrong match: patterns of the rover's deck repeat.
     """
     if len(ray) <= _NEIGHBOURS:
         return np.ones(len(ray), dtype=bool)
@@ -154,9 +156,9 @@ def _supported(ray: FloatArray, inverse: FloatArray, weight: FloatArray) -> Bool
 
 
 def _without_spikes(plane: FloatArray, relief: FloatArray) -> FloatArray:
-    """Relief without single cells that are far nearer or farther than all around: wrong matches, most often.
+    """Relief without single cells that are far nearer or farther than all around: most often wrong matches.
 
-    One that is too far would hide all the ground before it from the mosaic from above.
+    A cell that is too far would leave out all ground before it in the mosaic from above.
     """
     elevation, azimuth = np.deg2rad(np.arange(_ROWS) - 90.0), np.deg2rad(np.arange(_COLUMNS))
     ray = directions(azimuth[None, :], elevation[:, None])
@@ -169,7 +171,7 @@ def _without_spikes(plane: FloatArray, relief: FloatArray) -> FloatArray:
 
 
 def _nominal_height_m(solution: Solution, stop: int, origin_m: FloatArray) -> float:
-    """Height of the origin above the ground by the rig's own word."""
+    """Height of the origin above the ground as the rig states it."""
     mast_z = float(solution.final.world_T_mast[stop].translation()[2])
     return max(float(origin_m[2]) - mast_z + solution.traverse.rig.mast_height_m, 0.1)
 
@@ -210,22 +212,22 @@ def _parallax_weights(
     rows = np.flatnonzero(here & (count >= 2))
     if not len(rows):
         return none
-    # What all images see move alike is a shift across the line of sight: no parallax.
+    # A motion that is the same in all images is a shift across the line of sight, not parallax.
     spread = square[rows] - np.einsum("ni,ni->n", slope[rows], slope[rows]) / count[rows]
     return rows, np.maximum(spread, 0.0) / _OBSERVED_PX**2
 
 
 def _robust(weight: FloatArray, miss: FloatArray) -> FloatArray:
-    """Cauchy weights (n,) of inverse ranges that are missed by `miss` (n,)."""
+    """Cauchy weights (n,) of inverse ranges with residuals `miss` (n,)."""
     return np.asarray(1 / (1 + weight * miss**2 * (_OBSERVED_PX / _ROBUST_PX) ** 2))
 
 
 def _fit_plane(ray: FloatArray, inverse: FloatArray, weight: FloatArray, height_m: float) -> FloatArray:
     """The plane (3,) that most landmarks are near.
 
-    A share of the range counts, not pixels of parallax, in which the nearest landmarks would be all; those
-    without parallax count little. Nothing above the plane's horizon counts: the plane is not seen there, and
-    hills would pull it down to where they are.
+    Residuals are shares of the range: in pixels of parallax the nearest landmarks would decide alone.
+    Landmarks without parallax have little weight. Those above the plane's horizon have none, as hills would
+    pull the plane down.
     """
     nominal = np.array([0.0, 0.0, -1 / height_m])
     information = np.eye(3) * (height_m / _PLANE_SIGMA) ** 2
@@ -267,13 +269,16 @@ def _bilinear(column: FloatArray, row: FloatArray, *, columns: int, rows: int) -
 
 
 def _smoothness(plane: FloatArray) -> sparse.csr_array:
-    """What relief costs: changes from cell to cell, as shares of the plane's inverse range, and itself."""
+    """Matrix of the prior of the relief.
+
+    It holds the relief itself near 0, and changes from cell to cell, as shares of the plane's inverse range.
+    """
     elevation = np.deg2rad(_CELL_DEG * np.arange(_ROWS) - 90.0)
     azimuth = np.deg2rad(_CELL_DEG) * np.arange(_COLUMNS)
     base = _plane_inverse_range(plane, directions(azimuth[None, :], elevation[:, None]).reshape(-1, 3))
     scale = 1 / (_RELIEF_PER_CELL * np.maximum(base, _LEAST_INVERSE_RANGE))
     number = np.arange(_ROWS * _COLUMNS).reshape(_ROWS, _COLUMNS)
-    # Cells are narrow near nadir and zenith, and neighbours there alike.
+    # Near nadir and zenith cells are narrow, so that neighbours differ less.
     narrow = 1 / np.maximum(np.cos(elevation), np.sin(np.deg2rad(_CELL_DEG)))
     parts = []
     for a, b, stiff in (

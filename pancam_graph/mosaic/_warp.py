@@ -1,4 +1,4 @@
-"""Images drawn where a mosaic has them."""
+"""Images resampled to the pixels of a mosaic."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,17 +15,17 @@ from pancam_graph.mosaic._surface import Surface
 __all__ = ["STEP_PX", "Lattice", "Layer", "largest_gap", "warp"]
 
 STEP_PX = 8
-"""Every how many pixels of a mosaic points are projected; between, pixels are interpolated, which is good to
-some thousandths of a pixel."""
+"""Distance of lattice points in pixels of a mosaic. Points of the lattice are projected, pixels between are
+interpolated, which is accurate to some thousandths of a pixel."""
 
 _GREATEST_LEVEL = 6
 _EDGE_PX = 4
-"""Outermost pixels of an image that are not drawn: raw frames are bright or dark there, and would show."""
+"""Width of the border of an image that is not drawn, pixels: raw frames are too bright or too dark there."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Layer:
-    """One image as a mosaic has it, in the box that it covers."""
+    """One image at the pixels of a mosaic, in the box that it covers."""
 
     left_px: int
     top_px: int
@@ -39,18 +39,18 @@ class Layer:
 
     @property
     def box(self) -> tuple[slice, slice]:
-        """Rows and columns of the mosaic."""
+        """Rows and columns of the box in the mosaic."""
         height, width = self.grey.shape
         return slice(self.top_px, self.top_px + height), slice(self.left_px, self.left_px + width)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Lattice:
-    """Every eighth pixel of a mosaic with the world points there, and a column and a row beyond the last."""
+    """World points at every eighth pixel of a mosaic, and in one column and one row beyond the last."""
 
     projection: Projection
     points_m: FloatArray
-    """(rows, columns, 3)"""
+    """(rows, columns, 3) world points."""
 
     @staticmethod
     def over(projection: Projection, surface: Surface) -> "Lattice":
@@ -61,7 +61,7 @@ class Lattice:
         return Lattice(projection=projection, points_m=points.reshape(rows, columns, 3))
 
     def seen_by(self, placed: PlacedCamera) -> tuple[NDArray[np.float32], BoolArray]:
-        """Where a camera sees the lattice, (rows, columns, 2), NaN far from its image; and which cells.
+        """Pixels (rows, columns, 2) of the lattice in a camera, NaN far from its image; and seen cells.
 
         Cells (rows - 1, columns - 1) count as seen if a corner of them is, or if the image could reach in.
         """
@@ -81,7 +81,7 @@ class Lattice:
 
 
 def _cone(placed: PlacedCamera) -> tuple[FloatArray, float]:
-    """Axis (3,) in the world and half angle of a cone that holds a camera's field, with room to spare."""
+    """Axis (3,) in the world and half angle of a cone that holds a camera's field, with a margin."""
     camera = placed.camera
     right, bottom = camera.width_px - 1.0, camera.height_px - 1.0
     edge = np.array([[x, y] for x in (0, right / 2, right) for y in (0, bottom / 2, bottom)])
@@ -105,7 +105,7 @@ def largest_gap(covered: BoolArray) -> tuple[int, int]:
 def warp(image: PlacedImage, pointing: Pointing, lattice: Lattice) -> list[Layer]:
     """An image in a mosaic: one layer, two where it lies across the ends of a closed one, or none.
 
-    On the ground, what the user's mask covers is left out: it is no ground.
+    On the ground, what the user's mask covers is left out: it is taken not to be ground.
     """
     projection = lattice.projection
     pixels, cells = lattice.seen_by(image.at[pointing])
@@ -128,7 +128,7 @@ def warp(image: PlacedImage, pointing: Pointing, lattice: Lattice) -> list[Layer
         at_u, at_v = np.meshgrid(
             np.arange(width, dtype=np.float32) / STEP_PX, np.arange(height, dtype=np.float32) / STEP_PX
         )
-        # Eighths are exact in the fixed-point fractions of OpenCV.
+        # Eighths are exact in the fixed-point fractions with which OpenCV interpolates.
         uv = cv2.remap(
             np.ascontiguousarray(part), at_u, at_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
@@ -141,7 +141,7 @@ def warp(image: PlacedImage, pointing: Pointing, lattice: Lattice) -> list[Layer
 
 
 def _trimmed(layer: Layer) -> Layer:
-    """The layer without the cells around it in which it has no data."""
+    """The layer cropped to the cells in which it has data."""
     kept = []
     for axis in (1, 0):
         filled = np.flatnonzero(layer.valid.any(axis=axis))
@@ -179,7 +179,7 @@ def _sample(image: PlacedImage, uv: NDArray[np.float32], left_px: int, top_px: i
             grey[part] = np.where(level[part] == k, drawn, grey[part])
         if min(source.shape) < 2:
             break
-        # Even sizes, so that pixels of a coarser level are whole pairs of a finer one's.
+        # Even sizes, so that a pixel of a coarser level is made of whole pixels of the finer one.
         padded = cv2.copyMakeBorder(
             source, 0, source.shape[0] % 2, 0, source.shape[1] % 2, cv2.BORDER_REPLICATE
         )

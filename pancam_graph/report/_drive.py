@@ -26,22 +26,22 @@ _WANTED = 0.25
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DriveStep:
-    """What was known after a stop."""
+    """The estimate after a stop."""
 
     update: Update
     position_m: FloatArray
-    """(stops so far, 3)"""
+    """(stops so far, 3) positions of the stops in the world."""
     covariance_m2: FloatArray
-    """(stops so far, 3, 3) in world axes"""
+    """(stops so far, 3, 3) covariances of the positions, in world axes."""
     driven_m: float
     error_m: float
-    """Of the newest stop, against truth."""
+    """Distance of the newest stop from its true position."""
     odometry_error_m: float
-    """The same by odometry alone."""
+    """The same distance by odometry alone."""
 
     @staticmethod
     def of(smoother: TraverseSmoother, update: Update, simulation: Simulation) -> "DriveStep":
-        """What a smoother knows of a simulated drive, whose stops it has in their order."""
+        """The estimate of a smoother in a simulated drive, all of whose stops it has, in their order."""
         estimate, n = smoother.estimate(), len(smoother.stops)
         rotation, position = pose_arrays(estimate.world_T_mast)
         covariance = np.array([smoother.covariance(stop) for stop in smoother.stops])

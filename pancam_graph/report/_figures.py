@@ -13,7 +13,8 @@ __all__ = ["histogram_edges", "make_corrections", "make_histogram"]
 
 _BINS = 48
 _LOG_RATIO = 6.0
-"""From this ratio of the medians on, a linear axis would squeeze one of both histograms into a bar."""
+"""Ratio of the two medians from which the axis is logarithmic; a linear one would squeeze one histogram into
+a bar."""
 _MAX_STOP_NAMES = 10
 
 
@@ -21,7 +22,7 @@ def histogram_edges(before_px: FloatArray, after_px: FloatArray) -> tuple[FloatA
     """Common bin edges (49,) of two sets of lengths, and whether they grow geometrically.
 
     Equal steps up to the larger 99th percentile; geometric steps where their medians are far apart.
-    Lengths outside are few; they are counted into the outermost bins by the caller.
+    The caller counts the few lengths outside into the outermost bins.
     """
     both = np.concatenate([before_px, after_px])
     top = max((float(np.quantile(s, 0.99)) for s in (before_px, after_px) if len(s)), default=1.0)
@@ -37,7 +38,7 @@ def histogram_edges(before_px: FloatArray, after_px: FloatArray) -> tuple[FloatA
 
 
 def make_histogram(solution: Solution) -> Figure:
-    """How long the residuals of the used observations were before, and are after."""
+    """Histogram of the lengths of residuals of the used observations, before and after."""
     before = lengths(solution.residual_initial_px[solution.used])
     after = lengths(solution.residual_final_px[solution.used])
     edges, geometric = histogram_edges(before, after)
@@ -107,7 +108,9 @@ def make_corrections(solution: Solution) -> Figure:
     for row, angle in enumerate(("pan", "tilt")):
         suffix = "" if row == 0 else "2"
         top = _top(correction[:, row], sigma[:, row], prior[:, row])
-        band = np.minimum(prior[:, row], 10 * top)  # what leaves the figure need not be drawn to its end
+        band = np.minimum(
+            prior[:, row], 10 * top
+        )  # bars that leave the figure are cut off a little beyond it
         edge = np.repeat(band, 2)
         corner = np.column_stack([number - 0.5, number + 0.5]).ravel()
         at = {"xaxis": "x", "yaxis": f"y{suffix}"}

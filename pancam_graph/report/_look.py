@@ -1,4 +1,4 @@
-"""The look of all figures: one set of colours that stays apart for colour-blind readers, one layout."""
+"""The look of all figures: one set of colours that colour-blind readers can tell apart, one layout."""
 
 from dataclasses import dataclass
 
@@ -25,14 +25,14 @@ BEFORE = "#8b98a5"
 AFTER = "#0072b2"
 REJECTED = "#d55e00"
 EYES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-"""Okabe and Ito's colours, one per eye, again from the start beyond the sixth."""
+"""Okabe and Ito's colours, one per eye; the seventh eye has the first colour again."""
 RESIDUAL_SCALE = ((0.0, "#0d0887"), (0.3, "#6a00a8"), (0.6, "#b12a90"), (0.8, "#e16462"), (1.0, "#fca636"))
-"""Plasma without its pale end, which a white page would swallow."""
+"""The colour scale Plasma without its pale end, which cannot be seen on a white page."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Figure:
-    """A Plotly figure and what the page says under it."""
+    """A Plotly figure and its caption."""
 
     id: str
     """Id of the page element it is drawn in."""
@@ -42,7 +42,7 @@ class Figure:
     """Plain text; the page escapes it."""
 
     def json(self) -> Json:
-        """As the page's script takes it."""
+        """The figure in the form that the script of the page takes."""
         return {"id": self.id, "data": list(self.traces), "layout": self.layout}
 
 

@@ -46,7 +46,7 @@ def place_labels(at_m: FloatArray, sizes_m: list[FloatArray], *, clear_m: float)
     """Centres of the labels of stops (n, 2), by row, so that none covers a stop or another label.
 
     A label of size (width, height) goes below, above, right or left of its stop, `clear_m` away; one
-    that has room nowhere is left out.
+    that would cover something on every side is left out.
     """
     placed: dict[int, FloatArray] = {}
     for row, (stop, size) in enumerate(zip(at_m, sizes_m, strict=True)):
@@ -89,7 +89,7 @@ def _direction_trace(solution: Solution, terrain: ShownTerrain, length_m: float)
     sight = np.zeros((len(traverse.frames), 2))
     np.add.at(sight, traverse.image_frame, solution.final.world_R_camera[:, :2, 2])
     norm = np.linalg.norm(sight, axis=1)
-    seen = norm > 1e-6  # False for NaN too
+    seen = norm > 1e-6  # this is False for NaN too
     _, stops_m = pose_arrays(solution.final.world_T_mast)
     start = (stops_m - terrain.origin_m)[traverse.frame_stop[seen], :2]
     end = start + length_m * sight[seen] / norm[seen, None]

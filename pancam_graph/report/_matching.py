@@ -1,4 +1,4 @@
-"""The section of what was found in images: how much was thrown away, and why."""
+"""The section on matching: how many matches were refused, and why."""
 
 from html import escape
 

@@ -1,4 +1,4 @@
-"""Mosaics in the page: the same picture with either pointing, in turn or faded by hand."""
+"""Mosaics in the page: the picture of one place with each pointing, shown in turn or faded by a slider."""
 
 import base64
 from html import escape

@@ -49,7 +49,7 @@ def polyline(strips: FloatArray, decimals: int) -> list[list[float | None]]:
 
 
 def thinned(n: int, limit: int) -> IntArray:
-    """Rows of at most `limit` evenly spaced ones among n; always the same ones."""
+    """Rows of n, evenly spaced and at most `limit` of them; the same ones in every call."""
     if n <= limit:
         return np.arange(n)
     return np.linspace(0, n - 1, limit).astype(np.int64)
@@ -75,7 +75,7 @@ def fixed(value: float, decimals: int) -> str:
 
 
 def short(value: float) -> str:
-    """A number with three digits that count, thousands separated; a dash where not finite."""
+    """A number with three significant digits, thousands separated; a dash where not finite."""
     if not np.isfinite(value):
         return _ABSENT
     size = abs(value)

@@ -1,4 +1,4 @@
-"""How every page begins, and what it carries inside: text compressed and in letters."""
+"""The beginning of every page, and text inside it, compressed and written in letters (gzip and base64)."""
 
 import base64
 import gzip
@@ -23,17 +23,17 @@ script-src 'unsafe-inline' 'unsafe-eval'; img-src data: blob:; connect-src data:
 <h1>{title}</h1>
 <p class="lead">{lead}</p>
 """
-"""To be filled with a title, a style and a sentence that leads in."""
+"""Template of the beginning of a page, with places for a title, a style and an introduction."""
 UNPACKED = """async function unpacked(id) {
   const packed = Uint8Array.from(atob(document.getElementById(id).textContent), (c) => c.charCodeAt(0));
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
   return new Response(stream).text();
 }"""
-"""The script that undoes `packed`, of the element with an id."""
+"""Script function that returns the text that `packed` made into the content of an element, by its id."""
 
 
 def packed(text: str) -> str:
-    """Text compressed and in letters; the same letters for the same text."""
+    """Text compressed and written in letters; the same text always gives the same letters."""
     return base64.b64encode(gzip.compress(text.encode("utf-8"), 9, mtime=0)).decode("ascii")
 
 

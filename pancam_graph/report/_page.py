@@ -1,4 +1,4 @@
-"""The page: words, headline figures, and everything put together in one file."""
+"""The page: introduction, headline figures, and all sections put together in one file."""
 
 import json
 from html import escape

@@ -23,7 +23,7 @@ _TILT_STEP_RAD = np.deg2rad(2.0)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Masts:
-    """What stands on each mast, in the world and at true size."""
+    """Circles and frustums of all masts, in the world and at true size."""
 
     circles: FloatArray
     """(circles, steps, 3) closed circles of eye centres."""
@@ -36,15 +36,15 @@ class Masts:
     frustum_image: IntArray
     """(frustums,) row of the image of each."""
     reach_m: float
-    """How far circles and frustums reach from the mast's origin."""
+    """Largest distance of a circle or frustum from its mast's origin."""
 
 
 def eye_circles(solution: Solution) -> tuple[FloatArray, IntArray, IntArray]:
     """Circles on which the eyes' centres run (thesis eq. 4.8), as adjusted.
 
-    One circle per stop, eye and group of tilts within two degrees: about the pan axis of the adjusted
-    mast, with the mean radius and height of the adjusted centres. So it holds for every model; where
-    the model ties the centres to the mast, they lie on it. Returns outlines (n, steps, 3) in the world,
+    One circle per stop, eye and group of tilts within two degrees: about the pan axis of the adjusted mast,
+    with the mean radius and height of the adjusted centres. So there is a circle for every model; with models
+    that bind the centres to the mast, the centres lie on it. Returns outlines (n, steps, 3) in the world,
     stops (n,) and eyes (n,).
     """
     traverse, state = solution.traverse, solution.final
@@ -106,7 +106,7 @@ def make_masts(solution: Solution) -> Masts:
 
 
 def near_spacing(stops_m: FloatArray) -> float:
-    """Distance of the two nearest stops (n, 3) that are not in one place; infinite for a single one."""
+    """Least distance between two stops (n, 3) that are not in one place; infinite for a single stop."""
     best = np.inf
     for i in range(len(stops_m) - 1):
         distance = np.linalg.norm(stops_m[i + 1 :] - stops_m[i], axis=1)
@@ -115,7 +115,7 @@ def near_spacing(stops_m: FloatArray) -> float:
 
 
 def label_stops(stops_m: FloatArray, apart_m: float) -> list[int]:
-    """Rows of stops whose labels have room: each keeps the distance from all labelled before it."""
+    """Rows of stops that get a label: each is at the least distance or farther from those labelled before."""
     labelled: list[int] = []
     for row, stop in enumerate(stops_m):
         if all(np.linalg.norm((stops_m[other] - stop)[:2]) >= apart_m for other in labelled):
@@ -156,7 +156,7 @@ def _mast_traces(
                     "x": x,
                     "y": y,
                     "z": z,
-                    # Circles of eyes at one height and radius coincide: dashes let the first show through.
+                    # Circles of eyes at one height and radius coincide: between dashes the first can be seen.
                     "line": {"color": colour, "width": width, "dash": dash if kind == "circle" else "solid"},
                     "opacity": opacity,
                     "name": f"{name}: images" if kind == "camera" else f"{name}: circle of its centre",
@@ -201,7 +201,7 @@ def _stop_traces(solution: Solution, terrain: ShownTerrain) -> list[Json]:
 
 
 def _stop_labels(solution: Solution, terrain: ShownTerrain) -> list[Json]:
-    """Names above the masts, on a ground of their own."""
+    """Names above the masts, each on a background that hides what is behind it."""
     _, stops_m = pose_arrays(solution.final.world_T_mast)
     at = (stops_m - terrain.origin_m).round(4).tolist()
     return [
@@ -257,7 +257,7 @@ def _landmark_trace(solution: Solution, terrain: ShownTerrain) -> Json:
 def _view(name: str, low: FloatArray, high: FloatArray, *, true_size: bool) -> Json:
     """Ranges and shape of a view, all axes to one scale."""
     side = high - low
-    # A long and narrow scene is seen across and has room to be larger.
+    # A long and narrow scene is looked at across its length and can be drawn larger.
     wide = 0.8 if true_size else 1.25 + 0.4 * (1 - side[:2].min() / side[:2].max())
     ratio = wide * side / side.max()
     return {
@@ -333,7 +333,7 @@ def scene_figure(solution: Solution, terrain: ShownTerrain, masts: Masts) -> tup
 
 
 def _caption(solution: Solution, terrain: ShownTerrain, masts: Masts, enlarged: float) -> str:
-    """What the scene shows and leaves out, in words."""
+    """The caption: what the scene shows and leaves out."""
     shown = min(len(terrain.points_m), _MAX_LANDMARKS)
     parts = [
         f"{shown:,} landmarks, coloured by the RMS residual of their observations after the adjustment "

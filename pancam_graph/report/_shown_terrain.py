@@ -1,4 +1,4 @@
-"""Which landmarks are shown, where, and in which box: a ridge on the horizon must not shrink the scene."""
+"""The landmarks that are shown, and the box that holds them: far ones would shrink all others to a dot."""
 
 from dataclasses import dataclass
 
@@ -66,7 +66,7 @@ def shown_terrain(solution: Solution) -> ShownTerrain:
     """Choose origin, box and landmarks of a solution.
 
     The box holds every stop and the landmarks up to three times the median distance from their nearest
-    stop (or nineteen in twenty of them, if that is less far).
+    stop (or 95 % of them, if these are nearer).
     """
     _, stops_m = pose_arrays(solution.final.world_T_mast)
     origin_m = np.round(stops_m[0]) if np.abs(stops_m).max() > _FAR_WORLD_M else np.zeros(3)

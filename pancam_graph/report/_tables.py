@@ -18,7 +18,7 @@ _SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 
 
 def table(name: str, columns: Sequence[tuple[str, str]], rows: Sequence[Sequence[str]], texts: int) -> str:
-    """A scrollable table whose columns sort when their heads are pressed.
+    """A scrollable table whose columns are sorted when their heads are pressed.
 
     `columns` are heads and their explanations; the first `texts` columns hold text, the others numbers.
     Everything is escaped here.
@@ -43,7 +43,7 @@ def table(name: str, columns: Sequence[tuple[str, str]], rows: Sequence[Sequence
 
 
 def image_table(solution: Solution, residuals: Sequence[ImageResiduals]) -> str:
-    """One row per image: what it saw and how well it fits."""
+    """One row per image: its observations and residuals."""
     traverse = solution.traverse
     columns = (
         ("image", "id of the image"),
@@ -114,7 +114,7 @@ def observation_table(solution: Solution) -> str:
 
 
 def stop_table(solution: Solution) -> str:
-    """One row per stop: where it is, how far it moved from its prior, and how sure that is."""
+    """One row per stop: its pose, its change from the prior, and their sigmas."""
     traverse = solution.traverse
     stops_R, stops_m = pose_arrays(solution.final.world_T_mast)
     in_world = translation_covariance_in_world(stops_R, solution.stop_covariance)
@@ -155,11 +155,11 @@ def stop_table(solution: Solution) -> str:
 
 
 _UNITS = {"px": ("px", 1.0, 3), "rad": ("°", float(np.rad2deg(1.0)), 4), "m": ("mm", 1e3, 2)}
-"""By the end of an entry's name: the unit to show, how many of it there are in the entry's own, decimals."""
+"""By the end of an entry's name: the unit that is shown, the factor to it from the entry's unit, decimals."""
 
 
 def rig_table(solution: Solution) -> str:
-    """One row per entry of the rig that was free: what the input says, by how much it is off, how sure."""
+    """One row per entry of the rig that was free: value of the input, change, sigma, sigma of the prior."""
     columns = (
         ("quantity", "what of the rig"),
         ("of", "camera, stop or image that has the number; all: one for the whole traverse"),

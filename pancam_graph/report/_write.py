@@ -14,7 +14,7 @@ def write_report(solution: Solution, path: Path | str, mosaics: WrittenMosaics |
 
     It needs no network: Plotly's script is inside, compressed. The same solution gives the same bytes. An
     existing file is replaced; its folder must exist. Pictures are taken from the traverse's folder where
-    it has image files that can be read; where not, residuals are drawn on an empty frame. `mosaics` are what
-    `write_mosaics` wrote beside; the page has a section of them then.
+    it has image files that can be read; without, residuals are drawn on an empty frame. `mosaics` is what
+    `write_mosaics` returned; with it the page has a section of mosaics.
     """
     Path(path).write_text(make_page(solution, mosaics), encoding="utf-8", newline="\n")

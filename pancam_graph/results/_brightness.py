@@ -18,7 +18,7 @@ _WHITE_8_BIT = 255.0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Brightness:
-    """What white is, and how bright the landmarks are."""
+    """The sample that is shown as white, and the grey of each landmark."""
 
     white: float
     """Sample of images of 16 bits that becomes 255: the median, over images, of their 99.5th percentiles."""
@@ -32,7 +32,7 @@ class Brightness:
 
 
 def brightness_of(solution: Solution) -> Brightness:
-    """White, and the grey of each landmark: the mean over its used observations, samples interpolated."""
+    """The brightness of a solution; a landmark's grey is the mean of samples at its used observations."""
     traverse, observations = solution.traverse, solution.traverse.observations
     n = len(solution.landmark_track)
     total, count = np.zeros((2, n)), np.zeros((2, n))  # images of 8 bits, of 16 bits
@@ -52,7 +52,7 @@ def brightness_of(solution: Solution) -> Brightness:
                 row[in_image], weights=_sampled(image, observations.uv_px[in_image]), minlength=n
             )
             count[deep] += np.bincount(row[in_image], minlength=n)
-    # The median: a part of the rover that shines in one image must not darken all others.
+    # A median, so that a bright part of the rover in one image does not darken all others.
     shape = Brightness(white=float(np.median(whites or [0.0])) or 1.0, grey=None)
     if not seen:
         return shape
@@ -63,7 +63,7 @@ def brightness_of(solution: Solution) -> Brightness:
 
 
 def _sampled(image: GreyImage, uv_px: FloatArray) -> FloatArray:
-    """Samples (n,) of an image at pixels (n, 2), interpolated linearly; at the nearest edge from outside."""
+    """Samples (n,) of an image at pixels (n, 2), interpolated linearly; outside, those of the edge."""
     height, width = image.shape
     u, v = uv_px[:, 0].clip(0, width - 1), uv_px[:, 1].clip(0, height - 1)
     left, top = np.minimum(u.astype(int), max(width - 2, 0)), np.minimum(v.astype(int), max(height - 2, 0))

@@ -29,8 +29,8 @@ def write_cameras(solution: Solution, folder: Path | str) -> None:
     older export is replaced at the end. Images without a finite pose are left out. `export.json` says which
     file is of which image.
 
-    Raises InputError for a Brown lens with p1, p2 or k3, which the family cannot say, for a folder with
-    anything else in it, and where writing fails.
+    Raises InputError for a camera of which the family has no equal (a Brown lens with p1, p2 or k3), for a
+    folder with anything else in it, and where writing fails.
     """
     with whole_export(Path(folder)) as partial:
         fill_cameras(solution, partial)
@@ -66,7 +66,7 @@ def world_models(solution: Solution) -> list[CAHV | None]:
 
 
 def require_cahv_family(traverse: Traverse) -> None:
-    """Raise InputError naming a camera that no CAHV, CAHVOR or CAHVORE model is the equal of."""
+    """Raise InputError naming a camera of which no CAHV, CAHVOR or CAHVORE model is the equal."""
     for eye in traverse.rig.eyes:
         _require(eye.name, eye.camera)
 

@@ -40,10 +40,10 @@ _SOURCE_IMAGES = 20
 
 @dataclass(frozen=True, kw_only=True)
 class _Numbers:
-    """COLMAP's ids: of images and frames their rows, of landmarks theirs, counted from 1."""
+    """COLMAP's ids. Those of images, frames and landmarks are their rows, counted from 1."""
 
     camera: dict[tuple[int, int], int]
-    """By rig and eye."""
+    """Camera id by rig and eye."""
     of_image: dict[int, int]
     """Camera id of each image row."""
     name: dict[int, str]
@@ -54,13 +54,13 @@ def write_colmap(solution: Solution, folder: Path | str) -> None:
     """Write a COLMAP workspace of a solution into the folder `folder`, for dense reconstruction.
 
     `sparse/` is a text model with cameras, rigs, frames, images and points; every camera is a PINHOLE.
-    `images/CAMERA/FRAME.png` are the images, resampled to it where the camera is more than that, in 8 bits.
-    `stereo/` is what `colmap patch_match_stereo` starts from, and `export.json` says what was done.
+    `images/CAMERA/FRAME.png` are the images, in 8 bits, resampled where the camera is not a pinhole without
+    skew. `stereo/` is what `colmap patch_match_stereo` starts from, and `export.json` says what was done.
 
     Observations are those used, each carried along its line of sight to the pinhole, so that COLMAP's
-    residuals are those of the solution, enlarged as the image is. Points that fit best beyond infinity have
-    no place in such a model and are left out. Images whose file is missing have a pose and observations all
-    the same. Whole or not at all: an older export is replaced at the end.
+    residuals are those of the solution times the enlargement of the image. Points that fit best beyond
+    infinity have no place in such a model and are left out. Images whose file is missing have a pose and
+    observations too. Whole or not at all: an older export is replaced at the end.
 
     Raises InputError for a camera of which a pinhole shows nothing, for a folder with anything else in it,
     and where writing fails.
@@ -180,11 +180,13 @@ def _images(solution: Solution, placed: Placed, numbers: _Numbers) -> Iterable[s
 def _points(solution: Solution, placed: Placed, brightness: Brightness) -> Iterable[str]:
     """POINT3D_ID X Y Z R G B ERROR, then IMAGE_ID POINT2D_IDX of each observation."""
     points, grey = solution.final.landmarks_m, brightness.grey
-    first = np.searchsorted(placed.image, placed.image)  # of the image, so that what is left counts within it
+    first = np.searchsorted(
+        placed.image, placed.image
+    )  # first row of the image: the difference counts within the image
     within = np.arange(len(placed.image)) - first
     order = np.argsort(placed.landmark, kind="stable")
     for rows in np.split(order, np.flatnonzero(np.diff(placed.landmark[order])) + 1):
-        if len(rows) == 0:  # no observation at all
+        if len(rows) == 0:  # there is no observation
             return
         j = int(placed.landmark[rows[0]])
         shade = 128 if grey is None else int(grey[j])
@@ -220,7 +222,7 @@ def _write_images(
     folder.mkdir()
     written = []
     previous, lookup = None, None
-    # By camera: its lookup is made once and forgotten after its last image.
+    # In the order of cameras, so that only one lookup is in memory, and each is made once.
     for i in sorted(numbers.of_image, key=lambda i: (numbers.of_image[i], i)):
         image, s = readable_picture(solution.traverse, i), straight[i]
         if image is None or s is None:
@@ -246,7 +248,7 @@ def _resampled(image: NDArray[Any], lookup: FloatArray) -> NDArray[np.float32]:
         (lookup > -_FIRST_PIXEL) & (lookup < [width - _FIRST_PIXEL, height - _FIRST_PIXEL]), axis=-1
     )
     where = np.where(within[..., None], lookup, 0.0).astype(np.float32)
-    # Reflected at its edges, and black only then: else the edge would ring.
+    # The image is reflected at its edges, and blackened outside afterwards: a black edge would ring.
     samples = cv2.remap(
         image.astype(np.float32),
         where[..., 0],
@@ -258,7 +260,7 @@ def _resampled(image: NDArray[Any], lookup: FloatArray) -> NDArray[np.float32]:
 
 
 def _write_stereo(folder: Path, names: list[str]) -> None:
-    """What COLMAP's dense stereo expects beside images and model."""
+    """Write the folders and lists that COLMAP's dense stereo expects beside images and model."""
     for maps in ("depth_maps", "normal_maps", "consistency_graphs"):
         for parent in {Path(name).parent for name in names} or {Path()}:
             (folder / maps / parent).mkdir(parents=True)
@@ -275,7 +277,7 @@ def _about(
     written: list[int],
     brightness: Brightness,
 ) -> dict[str, object]:
-    """What `export.json` says of the workspace."""
+    """The content of `export.json`."""
     length = np.linalg.norm(placed.residual_px, axis=1)
     landmarks = len(solution.landmark_track)
     views = np.bincount(placed.landmark, minlength=landmarks)

@@ -12,11 +12,12 @@ from pancam_graph.data import Solution
 __all__ = ["Placed", "RigGroup", "Straight", "place_observations", "rigs_and_heads", "straight_cameras"]
 
 _FAR_M = 1e4
-"""Range of what images without observations show: the pupil's shift is then below a thousandth of a pixel."""
+"""Range at which images without observations are resampled: the pupil then shifts less than 0.001 px."""
 _SAME_TURN, _SAME_SHIFT = 1e-9, 1e-9
 _MIN_DEPTH = 1e-6
 _DIFFERENCE_PX, _DIFFERENCE_SHARE = 1e-3, 0.02
-"""What a residual may differ by from the solution's: for rounding, for the curvature of distortion."""
+"""Largest difference of a residual from the solution's: pixels, for rounding, and a share of it, for the
+curvature of distortion."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -26,22 +27,22 @@ class Straight:
     camera: Camera
     pinhole: Pinhole
     range_m: float
-    """At which the images are resampled; it matters only where the entrance pupil moves."""
+    """Range at which the images are resampled; it matters only where the entrance pupil moves."""
 
 
 @dataclass(kw_only=True, eq=False)
 class RigGroup:
-    """Cameras that are rigid to each other over some frames."""
+    """Cameras whose poses relative to each other are the same in some frames."""
 
     cameras: dict[int, Camera] = field(default_factory=dict)
-    """By eye."""
+    """Camera by eye."""
     head_T_camera: dict[int, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
-    """By eye: rotation (3, 3) and translation (3,)."""
+    """Mount by eye: rotation (3, 3) and translation (3,)."""
     own: bool = False
     """Whether it serves one frame alone, whose eyes are not where the rig's mounts put them."""
 
     def takes(self, eye: int, camera: Camera, rotation: FloatArray, translation: FloatArray) -> bool:
-        """Whether an eye is not in it yet, or is the same."""
+        """Whether an eye can join: it is not in the group yet, or is there with the same camera and mount."""
         if eye not in self.cameras:
             return True
         R, t = self.head_T_camera[eye]
@@ -65,13 +66,14 @@ class Placed:
     enlargement: FloatArray
     """(m, 2, 2) takes small residuals of the image as taken to residuals of the straightened one."""
     shift_px: FloatArray
-    """(m,) how far the range at which images are resampled moves the pixel; 0 but for a moving pupil."""
+    """(m,) shift of the pixel by resampling at another range than its landmark's; 0 unless the pupil
+    moves."""
     beyond: int
     """How many landmarks were left out because they fit best beyond infinity."""
 
 
 def finite_images(solution: Solution) -> BoolArray:
-    """(images,) which have a finite pose."""
+    """(images,) whether each image has a finite pose."""
     R, t = solution.final.world_R_camera, solution.final.world_t_camera
     return np.asarray(np.isfinite(R).all(axis=(1, 2)) & np.isfinite(t).all(axis=1))
 
@@ -122,8 +124,8 @@ def place_observations(solution: Solution, straight: list[Straight | None]) -> P
     """The used observations on the straightened images.
 
     Left out are those outside a model's domain, of landmarks that are not in front of their camera, of
-    landmarks that fit best beyond infinity (the solution says where they may be at the least; there they have
-    other residuals), and of landmarks that fewer than two images are then left of.
+    landmarks that fit best beyond infinity (the solution has their least range, at which residuals are
+    others), and of landmarks that then have fewer than two images.
     """
     row, image = _usable(solution)
     range_m, _ = _ranges(solution)
@@ -172,7 +174,7 @@ def rigs_and_heads(
 ) -> tuple[list[RigGroup], dict[int, tuple[int, FloatArray, FloatArray]]]:
     """Rigs, and of each frame its rig's index and `world_T_head`: rotation (3, 3), translation (3,).
 
-    Frames whose eyes are where the mounts put them share a rig as far as their cameras and mounts are the
+    Frames whose eyes are where the mounts put them share a rig if their cameras and mounts are the
     same: all frames of the model `mast`, unless stops or images have mounts or calibrations of their own.
     A frame whose eyes moved on their own (models `circle`, `free`, `projective`) gets a rig of its own.
     Frames without an image that has a finite pose are left out.

@@ -14,13 +14,13 @@ __all__ = ["CrossValidationEntry"]
 
 
 class SpreadEntry(Entry):
-    """What one way of halving says of a number."""
+    """Scatter of a number between solutions of halves, for one way of halving."""
 
     sigma: float | None
     ratio: float | None
     """RMS step from the whole solution to a half's over its formal sigma; null where telemetry decides."""
     difference: float | None
-    """Between the two halves; RMS over the halvings."""
+    """Difference between the solutions of the two halves; RMS over the halvings."""
 
 
 class SigmaEntry(Entry):
@@ -44,9 +44,9 @@ class PairSigmasEntry(Entry):
     """Sigmas of the angles of a frame less those of another."""
 
     frames: list[str]
-    """Ids of the two."""
+    """Ids of the two frames."""
     tracks: int
-    """How many tracks both see."""
+    """Number of tracks that both frames see."""
     pan_rad: SigmaEntry
     tilt_rad: SigmaEntry
 
@@ -131,7 +131,7 @@ class CrossValidationEntry(Entry):
 
 
 def _entries(sigmas: Sigmas) -> list[Sequence[SigmaEntry]]:
-    """Entries (n) of (k,) numbers each."""
+    """Entries of n things, each of k numbers."""
 
     def columns(spread: Spread) -> list[FloatArray]:
         return [spread.sigma, spread.ratio, spread.difference]

@@ -26,7 +26,7 @@ def file_names(ids: Sequence[str]) -> list[str]:
     for identity in ids:
         name = re.sub(r"[^A-Za-z0-9._-]", "_", identity).lstrip(".") or "_"
         unique = name
-        while unique.lower() in taken:  # some file systems know no upper case
+        while unique.lower() in taken:  # some file systems do not tell upper from lower case
             taken[name.lower()] += 1
             unique = f"{name}-{taken[name.lower()]}"
         taken[unique.lower()] = 1
@@ -35,7 +35,7 @@ def file_names(ids: Sequence[str]) -> list[str]:
 
 
 def write_export_json(folder: Path, kind: str, about: Mapping[str, object]) -> None:
-    """Write `export.json`: what the export is, what is in `about`, and the files that are in the folder."""
+    """Write `export.json`: the kind of the export, the entries of `about`, and the files in the folder."""
     files = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
     content = {"format": _FORMAT, "version": VERSION, "kind": kind, **about, "files": files}
     text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)

@@ -1,4 +1,4 @@
-"""Outputs of an earlier run: what may be replaced, and what somebody else has put among it."""
+"""Outputs of an earlier run: what may be replaced, and what somebody else has put there."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

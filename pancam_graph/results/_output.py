@@ -17,7 +17,7 @@ __all__ = ["Output", "OutputWriter", "Written"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Written:
-    """What outputs are made from, and what those before have added to it."""
+    """The solution and what earlier outputs have added to it: what an output is made from."""
 
     solution: Solution
     """With the warnings of the outputs so far."""
@@ -52,12 +52,12 @@ class Output:
     """A file or a folder in the folder of results."""
 
     name: str
-    """Of the file or folder; of an export also its choice in options."""
+    """Name of the file or folder; an export is asked for by this name."""
     when: Literal["always", "report", "mosaics", "export"]
-    """What has to be asked for to have it."""
+    """The option with which it is written."""
     writer: Callable[[], OutputWriter]
-    """Imports the module that writes it: only then, as names and choices must be quick to list."""
+    """Imports the module that writes it and returns its writer; names and choices are listed without."""
     says: str = ""
     """What an export is, as the help of an option says it."""
     older: Older = ONE_FILE
-    """How one that an earlier run wrote is recognised."""
+    """How an output of an earlier run is recognised."""

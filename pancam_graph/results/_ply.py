@@ -21,8 +21,8 @@ def points_ply(solution: Solution, grey: NDArray[np.uint8] | None = None) -> byt
     A vertex has x, y, z (double), `track` (its number), `residual_px` (RMS length of the final residuals of
     the observations used; NaN where there is none) and `observations` (how many were used). Where the
     solution has covariances of landmarks, `sigma_m`: the standard deviation along the point's worst
-    direction, formal. With `grey` (landmarks,), 0 to 255: `red`, `green`, `blue`, all three that grey, which
-    is how viewers find colours. Landmarks without a usable point are left out.
+    direction, formal. With `grey` (landmarks,), 0 to 255: `red`, `green`, `blue`, all three equal to the
+    grey: the names by which viewers find colours. Landmarks without a usable point are left out.
     """
     count, rms = _per_landmark(solution)
     points = solution.final.landmarks_m

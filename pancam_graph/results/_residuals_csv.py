@@ -31,7 +31,7 @@ COLUMNS = (
 
 
 COVARIANCE_COLUMNS = ("cov_uu_px2", "cov_uv_px2", "cov_vv_px2")
-"""Last, and only where the observations have covariances: those that each was weighted with in the end."""
+"""The last columns, only where observations have covariances: those of the final weights."""
 
 
 def residuals_csv(solution: Solution) -> bytes:
@@ -60,7 +60,7 @@ def residuals_csv(solution: Solution) -> bytes:
 
 
 def _cells(column: FloatArray) -> list[str]:
-    """Ten significant digits: a micropixel on any image; empty for what is not finite."""
+    """Numbers with ten significant digits (a micropixel on any image); empty where not finite."""
     finite = np.isfinite(column)
     return [f"{x:.10g}" if ok else "" for x, ok in zip(column.tolist(), finite.tolist(), strict=True)]
 

@@ -106,6 +106,6 @@ def _require_results(folder: Path, expected: str) -> None:
         raise InputError(f"{expected}, found other things in it: {strangers[0]}{more}")
     if names and SOLUTION not in names:
         raise InputError(f"{expected}, found {names[0]} but no {SOLUTION}")
-    # That the folder is one of ours is said first, before what is wrong with an export in it.
+    # First that the folder is one of results at all, then that each export in it is whole.
     for name in sorted(names, key=lambda n: n != SOLUTION):
         known[name].require(folder / name, expected)

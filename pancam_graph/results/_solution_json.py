@@ -40,7 +40,7 @@ class SecondsEntry(Entry):
 
 
 class BeforeAfterEntry(Entry):
-    """A number at the start and at the end; null where it is not defined."""
+    """A number before and after the adjustment; null where it is not defined."""
 
     initial: float | None
     final: float | None
@@ -83,7 +83,7 @@ class SolvedImageEntry(Entry):
 
 
 class RefinedEntry(Entry):
-    """An entry of the rig that was free; null where there is none: no such owner, or not finite."""
+    """An entry of the rig that was free. Null: the entry has no such owner, or the number is not finite."""
 
     quantity: Literal["calibration", "mounts", "pan_T_tilt", "radius"]
     entry: str
@@ -97,7 +97,7 @@ class RefinedEntry(Entry):
 
 
 class IncrementalEntry(Entry):
-    """What each stop took, in order."""
+    """Time, cost and relinearised variables of each stop, in order."""
 
     seconds_per_stop: list[float]
     cost_per_stop: list[float]
@@ -105,7 +105,7 @@ class IncrementalEntry(Entry):
 
     @staticmethod
     def of(steps: Incremental) -> "IncrementalEntry":
-        """The entry of what a smoother did."""
+        """The entry of the steps of a smoother."""
         return IncrementalEntry(
             seconds_per_stop=[float(s) for s in steps.seconds_per_stop],
             cost_per_stop=[float(c) for c in steps.cost_per_stop],
@@ -221,7 +221,7 @@ def solution_file(solution: Solution) -> SolutionFile:
             )
             for r in solution.refined
         ],
-        # What the reader noticed comes first, once, whether or not the solver passed it on.
+        # Warnings of the reader come first, and once, also where the solver passed them on.
         warnings=list(dict.fromkeys([*traverse.warnings, *solution.warnings])),
         method=solution.method,
         cross_validation=None if validation is None else CrossValidationEntry.of(validation, traverse),

@@ -1,4 +1,4 @@
-"""The mast's chain for batches of cameras: where it puts them, what it misses them by, and derivatives.
+"""The mast's chain for batches of cameras: predicted poses, misfits to given poses, and derivatives.
 
     world_T_camera = world_T_mast . Rz(pan) . pan_T_tilt . Ry(-tilt) . head_T_camera
 
@@ -32,12 +32,12 @@ _ABOUT_MINUS_Y = np.array([[0.0], [-1.0], [0.0], [0.0], [0.0], [0.0]])
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PosedCameras:
-    """Camera poses of n images, known without the mast."""
+    """Given camera poses of n images."""
 
     rotation: FloatArray
     """(n, 3, 3) world_R_camera."""
     centre_m: FloatArray
-    """(n, 3)."""
+    """(n, 3) centres in the world."""
     eye: IntArray
     """(n,) row of each image's eye."""
     pointing: IntArray
@@ -51,7 +51,7 @@ class Chain:
     rotation: FloatArray
     """(2 + eyes, 3, 3): of world_T_mast, pan_T_tilt, head_T_camera of each eye."""
     translation_m: FloatArray
-    """(2 + eyes, 3): of the same."""
+    """(2 + eyes, 3): translations of the same poses."""
 
     @staticmethod
     def of(mast: Pose, axis: Pose, mounts: Pose) -> "Chain":
@@ -86,7 +86,7 @@ class Chain:
         return compose(*self.mast, *self._from_camera(pan_tilt_rad, eye)[-1])
 
     def misfit(self, cameras: PosedCameras, pan_tilt_rad: FloatArray) -> FloatArray:
-        """What the chain misses each camera by at pan and tilt (n, 2): (n, 6).
+        """Misfit (n, 6) of the chain to each camera at pan and tilt (n, 2).
 
         The rotation vector from the camera to the chain's, in the camera's frame, radians, below half a
         turn; then the shift in the world's frame, metres.
@@ -125,7 +125,7 @@ class Chain:
         by_pose[:, 0] = twists_in_parent(*_inverse(from_mast), identity)
         by_pose[:, 1] = twists_in_parent(*_inverse(from_tilt), identity)
         by_pose[np.arange(n), 2 + eye] = identity
-        # Turning about an axis leaves that axis where it is: before or after the turn is the same.
+        # A turn does not move its own axis, so the frame before the turn and that after it serve alike.
         pan = twists_in_parent(*_inverse(from_pan), np.broadcast_to(_ABOUT_Z, (n, 6, 1)))
         tilt = twists_in_parent(*_inverse(mount), np.broadcast_to(_ABOUT_MINUS_Y, (n, 6, 1)))
         return by_pose, np.concatenate([pan, tilt], axis=2)

@@ -1,7 +1,7 @@
 """The mast of a rover as its documents give it: two axes, and the readings of the joints.
 
 Numbers of a mast are in the rover frame of the labels (ROVER_NAV_FRAME, on MER ROVER_FRAME): x forward, y
-right, z down, azimuth clockwise seen from above. Poses that come of it are z up.
+right, z down, azimuth clockwise seen from above. All poses that the mast returns are z up.
 """
 
 from dataclasses import dataclass
@@ -57,7 +57,7 @@ class MastKinematics:
         given_axis = -_unit(vector_z_up(self.elevation_axis))
         on_z = vector_z_up(self.azimuth_point_m)
         given_on_y = vector_z_up(self.elevation_point_m)
-        # Clockwise from where the elevation axis is given to home; our angles are anticlockwise.
+        # The turn from the reading at which the elevation axis is given to home: readings are clockwise, ours not.
         home = gtsam.Rot3.Expmap(z * -(self.home_azimuth_rad - self.elevation_given_at_rad)).matrix()
         y, on_y = home @ given_axis, on_z + home @ (given_on_y - on_z)
         # The two nearest points: on_z + s z and on_y + t y, apart along z x y.

@@ -42,7 +42,7 @@ class Eye:
 
 @dataclass(frozen=True, kw_only=True)
 class PointingSigma:
-    """How well telemetry knows where the mast points, one standard deviation."""
+    """Accuracy of the telemetry of pointing, one standard deviation."""
 
     pan_rad: float
     tilt_rad: float

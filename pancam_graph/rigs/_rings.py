@@ -19,7 +19,7 @@ def ladybug5() -> Rig:
 
     Nominal values within those of published calibration files: their ring radii are 60.5 to 61.6 mm, focal
     lengths of the rectified images 443 to 457 px (here 452), the top camera stands 76 mm up. Principal
-    points of units lie within 50 px of the middle, which stands in for them. 2048 x 2448 px. A unit's own
+    points of units lie within 50 px of the middle, which is used here. 2048 x 2448 px. A unit's own
     file is better than this by far: use it in a rig of your own.
     """
     return _ladybug(

@@ -25,7 +25,7 @@ _LARGEST_M = 1e9
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RigFit:
-    """A chain that fits given cameras, how well it does, and what they leave open."""
+    """A chain that fits given cameras, its misfits, and the directions that the cameras leave free."""
 
     world_T_mast: gtsam.Pose3
     """Where the mast stands in the frame of the given cameras."""
@@ -40,7 +40,7 @@ class RigFit:
     pan_tilt_rad: FloatArray
     """(n, 2) pan and tilt at which the chain meets each camera: given, moved by the offset, or fitted."""
     angle_offset_rad: FloatArray
-    """(2,) zero points found for pan and tilt, added to the given ones; 0 where they were not sought."""
+    """(2,) estimated offsets of the zero points of pan and tilt; 0 where they were not estimated."""
     residual_rad: FloatArray
     """(n, 3) rotation vector from each given camera to the chain's, in the camera's frame."""
     residual_m: FloatArray
@@ -49,7 +49,8 @@ class RigFit:
     """Sum of squared whitened residuals per degree of freedom: 1 if the given sigmas are right; NaN where
     there are no more equations than unknowns."""
     names: tuple[str, ...]
-    """Of all numbers of the chain: pose by pose, rotation before translation, then offsets of the angles."""
+    """Names of all numbers of the chain: pose by pose, rotation before translation, then offsets of the
+    angles."""
     covariance: FloatArray
     """(numbers, numbers) formal covariance by the given sigmas, in body-frame tangents of the poses. Along
     free directions it is 0: there the reference holds."""
@@ -57,22 +58,22 @@ class RigFit:
     """Descending: by how many sigmas of the cameras the misfit changes for a step of one sigma of the
     reference along each direction. Below 1, a direction counts as free."""
     free_directions: tuple[FreeDirection, ...]
-    """What the cameras cannot tell apart. Along these the chain is as near to the reference as can be."""
+    """Directions that the cameras do not determine; along these the chain is nearest to the reference."""
     reference: str
-    """What the reference was, in words."""
+    """The reference, in words."""
     converged: bool
     """Whether the fit reached its optimum."""
     iterations: int
-    """Steps that it took."""
+    """Number of steps."""
 
     @property
     def rms_m(self) -> float:
-        """Root mean square of the centres' distances."""
+        """Root mean square distance between given centres and those of the chain."""
         return float(np.sqrt(np.mean(np.sum(self.residual_m**2, axis=1))))
 
     @property
     def rms_rad(self) -> float:
-        """Root mean square of the rotations' angles."""
+        """Root mean square angle between given cameras and those of the chain."""
         return float(np.sqrt(np.mean(np.sum(self.residual_rad**2, axis=1))))
 
     @property
@@ -108,7 +109,7 @@ class RigFit:
         return rig if pointing_sigma is None else replace(rig, pointing_sigma=pointing_sigma)
 
     def report(self) -> str:
-        """What a person wants to know, in a few lines."""
+        """The misfits and the free directions, in a few lines of text."""
         worst = int(np.linalg.norm(self.residual_m, axis=1).argmax())
         turned = int(np.linalg.norm(self.residual_rad, axis=1).argmax())
         lines = [
@@ -142,16 +143,16 @@ def fit_rig(
     `cameras` are poses `world_T_camera`, or CAHV-family models with their vectors in one frame, which is then
     the world (labels: the rover frame, z down as it is). `pan_tilt_rad` (n, 2) are the angles of each, pan
     anticlockwise seen from above, tilt upwards. An encoder that counts the other way must have its sign
-    turned: cameras alone do not tell, they fit as well with mast and head upside down. `eyes` names the eye
-    of each camera (default: one eye, "camera"). `pointings` numbers the pointing of each; default: cameras
-    with equal angles are one pointing. It matters only where angles are "free".
+    turned: cameras alone do not show it, they fit as well with mast and head upside down. `eyes` names the
+    eye of each camera (default: one eye, "camera"). `pointings` numbers the pointing of each; default:
+    cameras with equal angles are one pointing. It matters only where angles are "free".
 
-    Some directions are never told by cameras: the zero point of pan against the mast's yaw, and the like;
-    with few cameras, one pan or one tilt there are more. They are found by the singular values of the
+    Some directions are never determined by cameras: the zero point of pan against the mast's yaw, and the
+    like; with few cameras, one pan or one tilt there are more. They are found by the singular values of the
     Jacobian and named in the result, and the chain is the one that is nearest to the reference in
     `options.reference_sigma`. The reference is the rig `reference` on the mast `world_T_mast`. Where a rig is
-    not given, its tilt axis is `pan_T_tilt` (default: axes that meet and are square), and mounts and mast
-    are placed where they suit the cameras best.
+    not given, its tilt axis is `pan_T_tilt` (default: axes that meet and are square), and mounts and mast are
+    placed where they fit the cameras best.
 
     Residuals are weighted with the sigmas of the options; it is the maximum-likelihood estimate for
     Gaussian errors of the cameras. Raises InputError for fewer than two cameras (one, where mast and axes are
@@ -325,7 +326,7 @@ def _result(
 
 
 def _covariance(equations: Equations, best: Optimum) -> FloatArray:
-    """Of body-frame tangents, from that of the corrections along the directions that are told."""
+    """Covariance of body-frame tangents, from that of the corrections along determined directions."""
     sought, sigma = equations.unknowns.sought, equations.unknowns.sigma
     half = np.zeros((len(sigma), best.rank))
     told = best.directions[: best.rank].T / best.singular_values[: best.rank]

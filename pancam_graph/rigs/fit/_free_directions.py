@@ -1,4 +1,4 @@
-"""What cameras cannot tell apart, in words: exact ambiguities of the chain first, then whatever is left."""
+"""Directions that cameras do not determine, in words: exact ambiguities of the chain first, then the rest."""
 
 from dataclasses import dataclass
 
@@ -11,9 +11,10 @@ from pancam_graph.rigs.fit._system import Equations
 __all__ = ["FreeDirection", "free_directions"]
 
 _INDEPENDENT = 0.01
-"""Of a length of 1; the axis, with its small sigma, has the largest part in most ambiguities."""
+"""Least new part of a direction of length 1 that makes it independent of those before; small, as the axis
+with its small sigma has the largest part in most ambiguities."""
 _SHOWN = 0.15
-"""Components smaller than this share of the largest are not worth a word."""
+"""Components smaller than this share of the largest are not named."""
 
 _BY_PAN = "undone by pan_T_tilt"
 _BY_TILT = "undone by every head_T_camera"
@@ -42,10 +43,10 @@ _OFFSETS = (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FreeDirection:
-    """A direction in which the chain may move without the cameras noticing."""
+    """A direction in which the chain can move without a change of the cameras."""
 
     text: str
-    """What moves, and what undoes it."""
+    """The number that moves, and the one that compensates for it."""
     step: FloatArray
     """(numbers,) how each number of `RigFit.names` moves along it, radians and metres; in the units of the
     reference's sigmas it has length 1."""
@@ -54,8 +55,8 @@ class FreeDirection:
 def free_directions(equations: Equations, optimum: Optimum) -> tuple[FreeDirection, ...]:
     """The free directions at the optimum, as many as there are, each independent of the others.
 
-    Directions that are free for reasons of the chain alone (or of equal pans or tilts) are named. What is
-    left over when there are few cameras has no better name than its largest components.
+    Directions that are free for reasons of the chain alone (or of equal pans or tilts) are named. Other
+    free directions, which exist with few cameras, are described by their largest components.
     """
     sought, sigma = equations.unknowns.sought, equations.unknowns.sigma
     jacobian, free = optimum.system.jacobian, optimum.directions[optimum.rank :]
@@ -73,7 +74,7 @@ def free_directions(equations: Equations, optimum: Optimum) -> tuple[FreeDirecti
             directions.append(FreeDirection(text=text, step=step))
 
     for text, step in _ambiguities(equations, optimum):
-        if np.any(step[~sought] != 0):  # what is held cannot undo anything
+        if np.any(step[~sought] != 0):  # a held number cannot compensate for another
             continue
         in_units = step[sought] / sigma[sought]
         in_units /= np.linalg.norm(in_units)
@@ -88,9 +89,9 @@ def free_directions(equations: Equations, optimum: Optimum) -> tuple[FreeDirecti
 
 
 def _ambiguities(equations: Equations, optimum: Optimum) -> list[tuple[str, FloatArray]]:
-    """Steps (numbers,) that leave the cameras alone: at all angles, at one pan, or at one tilt."""
+    """Steps (numbers,) that do not move the cameras: at all angles, at one pan, or at one tilt."""
     chain, angles = equations.chain(optimum.place), equations.pan_tilt_rad(optimum.place)
-    # In body-frame twists first; what corrections these are follows below.
+    # In body-frame twists first; they are turned to corrections below.
     twists: list[tuple[str, FloatArray, FloatArray]] = []
     n_poses, none = len(chain.rotation), np.zeros(2)
     pan, tilt = (float(np.angle(np.exp(1j * a).mean())) for a in angles.T)

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt to the optimum, then Gauss-Newton with what is free taken back to the reference."""
+"""Levenberg-Marquardt to the optimum, then Gauss-Newton with free directions taken back to the reference."""
 
 from dataclasses import dataclass
 
@@ -14,10 +14,10 @@ _NEARLY = 1e-6
 """Relative gain of a step below which the descent ends."""
 _MAX_POLISH = 30
 _SMALL_STEP = 1e-9
-"""Units of the reference: nothing below matters."""
+"""Length of a step, in units of the reference, below which the iteration ends."""
 _DAMPING = (1e-3, 1e12)
 _FREE = 1.0
-"""Singular values below it are free: the cameras tell such a direction less well than the reference does."""
+"""Singular values below it are of free directions, which the reference determines better than the cameras."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,7 +43,7 @@ def optimum(equations: Equations) -> Optimum:
     for _ in range(_MAX_POLISH):
         system = equations.system(place)
         along, values, directions = _factors(system.jacobian)
-        # The rank is settled once: a value beside the limit would otherwise flip from step to step.
+        # The rank is determined once: a value near the limit could otherwise change sides from step to step.
         rank = int(np.sum(values >= _FREE)) if rank is None else rank
         away = _in_units(equations, place)
         step = -directions[:rank].T @ (along[:, :rank].T @ system.residual / values[:rank])
@@ -83,10 +83,10 @@ def _in_units(equations: Equations, place: Place) -> FloatArray:
 
 
 def _descend(equations: Equations) -> tuple[Place, int]:
-    """The optimum, nearly, with the reference as a weak observation of one unit; and the steps it took.
+    """Nearly the optimum, with the reference as a weak observation of one unit; and the number of steps.
 
-    That leaves what is told badly near the reference on the way; how near the end is does not matter, for
-    the steps that follow converge on their own.
+    The observation keeps badly determined directions near the reference on the way. The end need not be
+    exact, as the steps that follow converge by themselves.
     """
     place, damping = equations.first_place, _DAMPING[0]
     away = _in_units(equations, place)
@@ -104,7 +104,7 @@ def _descend(equations: Equations) -> tuple[Place, int]:
                 damping = max(damping / 10, 1e-12)
                 break
             damping *= 10
-            if damping > _DAMPING[1]:  # nothing lower within rounding
+            if damping > _DAMPING[1]:  # no lower cost within rounding
                 return place, iteration
         gained, merit, place, away = merit - reached, reached, moved, moved_away
         if gained <= _NEARLY * merit:

@@ -1,4 +1,4 @@
-"""A first chain for the fit, where its reference leaves mast or mounts open: closed forms in turns."""
+"""A first chain for the fit, where no mast or no mounts are given: closed forms, applied in turns."""
 
 from itertools import permutations, product
 
@@ -11,7 +11,7 @@ __all__ = ["first_chain"]
 
 _TURNS = 30
 _NEAR = 0.05
-"""Mean squared chordal distance at which the cameras' rotations are explained well enough: 0.2 rad."""
+"""Mean squared chordal distance of rotations at which a start is good enough: 0.2 rad."""
 
 
 def first_chain(
@@ -23,11 +23,11 @@ def first_chain(
     mounts: Pose | None,
     n_eyes: int,
 ) -> Chain:
-    """The chain with a given tilt axis whose mast and mounts, where not given, suit the cameras.
+    """The chain with a given tilt axis whose mast and mounts, where not given, fit the cameras.
 
-    Rotations minimise the chordal distance, mast and mounts in turns, from cameras that look forwards or,
-    where that leads nowhere, along and across any other axis of the head. Centres follow linearly; what
-    they leave open stays where the cameras' mean is at the mast, and the mounts at the head's origin.
+    Rotations minimise the chordal distance, mast and mounts in turns, from cameras that look forwards or, if
+    that fit is bad, along and across any other axis of the head. Centres follow linearly; where they do not
+    determine a translation, the mast is at the mean of the cameras and the mounts are at the head's origin.
     """
     zero = np.zeros(len(pan_tilt_rad))
     pan_R = pan_tilt_rotation(pan_tilt_rad[:, 0], zero)

@@ -1,4 +1,4 @@
-"""The equations of the fit: which numbers are sought, in which units, and their whitened least squares."""
+"""The equations of the fit: the unknowns, their units, and their whitened least squares."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,9 +16,9 @@ __all__ = ["Equations", "Place", "ReferenceSigma", "RigFitOptions", "System", "U
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceSigma:
-    """How far a mechanism may be from the reference, one standard deviation of each component.
+    """Expected difference of a mechanism from the reference, one standard deviation of each component.
 
-    These are the units in which directions are called free and moves are made small. 0: held.
+    These are the units of the unknowns, in which a direction counts as free. 0: held.
     """
 
     mast_rad: float = 0.05
@@ -26,7 +26,7 @@ class ReferenceSigma:
     mast_m: float = 0.05
     """Translation of world_T_mast."""
     axis_rad: float = 5e-3
-    """Rotation of pan_T_tilt: how far the axes are from square, and the like."""
+    """Rotation of pan_T_tilt, as the deviation of the axes from a right angle."""
     axis_m: float = 5e-3
     """Translation of pan_T_tilt."""
     mount_rad: float = 0.05
@@ -34,7 +34,7 @@ class ReferenceSigma:
     mount_m: float = 0.05
     """Translation of each head_T_camera."""
     offset_rad: float = 0.05
-    """The zero points of pan and tilt, where they are sought."""
+    """The zero points of pan and tilt, where they are estimated."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,8 +42,8 @@ class RigFitOptions:
     """How to fit a rig. Raises InputError naming the option that makes no sense."""
 
     angles: Literal["exact", "offsets", "free"] = "exact"
-    """What the given pan and tilt are: "exact"; right but for one zero point each ("offsets"); or measured
-    with `angle_sigma_rad`, each pointing for itself ("free")."""
+    """The given pan and tilt are "exact"; or right except for one zero point each ("offsets"); or measured
+    with `angle_sigma_rad` in each pointing ("free")."""
     rotation_sigma_rad: float = 1e-5
     """Standard deviation of the given cameras' rotations, each component. Default: six printed digits."""
     centre_sigma_m: float = 1e-5
@@ -68,10 +68,10 @@ class RigFitOptions:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Unknowns:
-    """What is sought: corrections of the chain's poses, and the offsets of pan and tilt."""
+    """The unknowns: corrections of the chain's poses, and the offsets of pan and tilt."""
 
     names: tuple[str, ...]
-    """Of all numbers, held ones too: pose by pose, rotation before translation, then the offsets."""
+    """Names of all numbers, held ones too: pose by pose, rotation before translation, then the offsets."""
     sigma: FloatArray
     """(numbers,) unit of each; 0 where held."""
 
@@ -92,18 +92,18 @@ class Unknowns:
 
     @property
     def sought(self) -> BoolArray:
-        """(numbers,) whether each is sought."""
+        """(numbers,) whether each is estimated."""
         return np.asarray(self.sigma > 0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Place:
-    """Where the equations stand: corrections of the reference, and the angles of pointings."""
+    """A point of the parameter space: corrections of the reference, and the angles of pointings."""
 
     unknowns: FloatArray
     """(numbers,) radians and metres; 0 at the reference."""
     angles_rad: FloatArray
-    """(pointings, 2), where they are free; else as given."""
+    """(pointings, 2) pan and tilt: estimated where they are free, else as given."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -111,15 +111,15 @@ class System:
     """Whitened equations about one place, free angles eliminated."""
 
     jacobian: FloatArray
-    """(rows, sought), by the unknowns in their units."""
+    """(rows, sought) derivatives by the unknowns in their units."""
     residual: FloatArray
-    """(rows,)"""
+    """(rows,) whitened residuals."""
     cost: float
     """Sum of squares of all rows, before elimination."""
     angle_gain: FloatArray
     """(pointings, 2, sought) radians by which eliminated angles follow the unknowns in their units."""
     angle_step_rad: FloatArray
-    """(pointings, 2) by which they move if the unknowns stay."""
+    """(pointings, 2) change of eliminated angles if the unknowns do not change, radians."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -146,8 +146,8 @@ class Equations:
         return Place(unknowns=np.zeros(len(self.unknowns.names)), angles_rad=self.measured_rad)
 
     def spare(self, rank: int) -> int:
-        """Degrees of freedom that are left if so many directions of the unknowns are told."""
-        # A pointing's two angles cost two unknowns and bring two measurements.
+        """Degrees of freedom that are left if so many directions of the unknowns are determined."""
+        # The two angles of a pointing are two unknowns and two measurements.
         return 6 * len(self.given_rad) - rank
 
     @property
@@ -169,7 +169,7 @@ class Equations:
         return self.given_rad + place.unknowns[-2:]
 
     def misfit(self, place: Place) -> FloatArray:
-        """What the chain misses each camera by, (n, 6); see `Chain.misfit`."""
+        """Misfit (n, 6) of the chain to each camera; see `Chain.misfit`."""
         return self.chain(place).misfit(self.cameras, self.pan_tilt_rad(place))
 
     def cost(self, place: Place) -> float:
@@ -204,7 +204,7 @@ class Equations:
     def _eliminated(
         self, place: Place, residual: FloatArray, jacobian: FloatArray, by_angle: FloatArray
     ) -> System:
-        """By orthogonal rows of each pointing: those that its angles take up, and the rest."""
+        """The equations with the angles of each pointing eliminated by QR decomposition."""
         prior = (place.angles_rad - self.measured_rad) / self.options.angle_sigma_rad
         columns, pointings = jacobian.shape[2], len(prior)
         rows, values = [], []
