@@ -57,7 +57,7 @@ class MastKinematics:
         given_axis = -_unit(vector_z_up(self.elevation_axis))
         on_z = vector_z_up(self.azimuth_point_m)
         given_on_y = vector_z_up(self.elevation_point_m)
-        # From the reading at which the elevation axis is given to home; readings are clockwise, our angles not.
+        # From the reading at which the elevation axis is given to home. Readings are clockwise, angles not.
         home = gtsam.Rot3.Expmap(z * -(self.home_azimuth_rad - self.elevation_given_at_rad)).matrix()
         y, on_y = home @ given_axis, on_z + home @ (given_on_y - on_z)
         # The two nearest points: on_z + s z and on_y + t y, apart along z x y.
