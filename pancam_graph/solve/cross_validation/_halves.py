@@ -102,7 +102,8 @@ def neighbours(traverse: Traverse, problem: Problem) -> tuple[IntArray, IntArray
     i, j = shared.coords
     of_one_stop = (traverse.frame_stop[i] == traverse.frame_stop[j]) & (i < j)
     i, j, count = i[of_one_stop], j[of_one_stop], shared.data[of_one_stop]
-    tree = coo_array(minimum_spanning_tree(coo_array((-count, (i, j)), shape=(n, n)).tocsr()))
+    narrow = i.astype(np.int32), j.astype(np.int32)  # SciPy before 1.16 refuses wider indices of a graph
+    tree = coo_array(minimum_spanning_tree(coo_array((-count, narrow), shape=(n, n)).tocsr()))
     rows, columns = tree.coords
     order = np.lexsort((columns, rows))
     pairs = np.column_stack([rows, columns])[order].astype(np.int64)
