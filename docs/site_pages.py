@@ -41,7 +41,7 @@ def on_page_markdown(markdown: str, **_: object) -> str:
     """Links to the pages at the top of the repository lead to those of the site; source files have none."""
     for source, page in TOP_PAGES.items():
         markdown = markdown.replace(f"](../{source}", f"]({page}")
-    return re.sub(r"\[([^\]]+)\]\(\.\./[\w/.]+\.(?:py|json)\)", r"\1", markdown)
+    return re.sub(r"\[([^\]]+)\]\([\w/.]+\.(?:py|cff)\)", r"\1", markdown)
 
 
 def _linked_from_docs(text: str) -> str:
@@ -66,8 +66,7 @@ def _api_page(module: str, folder: Path) -> str:
     tree = ast.parse((folder / "__init__.py").read_text(encoding="utf-8"))
     exported = [
         (alias.name, _source_of(f"{node.module}.{alias.name}"))
-        for node in tree.body
-        if isinstance(node, ast.ImportFrom)
+        for node in _imports(tree)
         for alias in node.names
         if alias.asname is not None
     ]
@@ -85,10 +84,14 @@ def _source_of(name: str) -> str:
         module, _, last = name.rpartition(".")
         path = ROOT / Path(*module.split("."))
         file = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
-        imports = [
-            n for n in ast.parse(file.read_text(encoding="utf-8")).body if isinstance(n, ast.ImportFrom)
-        ]
-        origins = [f"{n.module}.{a.name}" for n in imports for a in n.names if (a.asname or a.name) == last]
+        imports = _imports(ast.parse(file.read_text(encoding="utf-8")))
+        origins = {f"{n.module}.{a.name}" for n in imports for a in n.names if (a.asname or a.name) == last}
         if not origins:
             return name
         (name,) = origins
+
+
+def _imports(tree: ast.Module) -> list[ast.ImportFrom]:
+    """Imports of a module, those for type checkers too."""
+    nodes = [node for top in tree.body for node in (top.body if isinstance(top, ast.If) else [top])]
+    return [node for node in nodes if isinstance(node, ast.ImportFrom)]
