@@ -200,3 +200,25 @@ def test_one_version_everywhere() -> None:
     assert re.search(rf"(?m)^version: {version}$", citation)
     assert f'date-released: "{date}"' in citation
     assert 'dynamic = ["version"]' in (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+
+
+def test_modules_that_the_architecture_names_exist() -> None:
+    """`room/_module.py` and `_module.py`; names in capitals stand for what somebody adds."""
+    text = (DOCS / "architecture.md").read_text(encoding="utf-8")
+    named = {name for name in re.findall(r"`([\w/]+\.py)`", text) if not re.search(r"[A-Z]", name)}
+    assert len(named) > 30
+    files = [
+        path.relative_to(ROOT)
+        for folder in ("pancam_graph", "factors")
+        for path in (ROOT / folder).rglob("*.py")
+    ]
+    known = {"/".join(path.parts[i:]) for path in files for i in range(len(path.parts))}
+    assert named - known == set()
+
+
+def test_the_architecture_has_the_rooms_of_the_contract() -> None:
+    layers = (ROOT / ".importlinter").read_text(encoding="utf-8").split("layers =")[1].split("exhaustive")[0]
+    rows = rows_of((DOCS / "architecture.md").read_text(encoding="utf-8"), "## Rooms")
+    assert [set(re.findall(r"`(\w+)`", row["room"])) for row in rows] == [
+        set(re.findall(r"\w+", line)) for line in layers.strip().splitlines()
+    ]
