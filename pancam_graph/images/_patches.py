@@ -66,6 +66,48 @@ def _standardise(patch: FloatArray, weight: FloatArray) -> float:
     return spread
 
 
+@part
+def _search(
+    image_b: Coefficients,
+    x: float,
+    y: float,
+    affine: FloatArray,
+    rx: int,
+    ry: int,
+    template: FloatArray,
+    weight: FloatArray,
+    around: FloatArray,
+    scores: FloatArray,
+) -> tuple[int, int, float]:
+    """Shift (pixels of a, along u and v) of the best correlation within the reach, and the second best peak.
+
+    `around` and `scores` are work space.
+    """
+    m00, m01, m10, m11 = affine[0, 0], affine[0, 1], affine[1, 0], affine[1, 1]
+    for j in range(_SIDE + 2 * ry):
+        for i in range(_SIDE + 2 * rx):
+            du, dv = i - HALF_WIDTH_PX - rx, j - HALF_WIDTH_PX - ry
+            around[j, i] = _at(image_b, x + m00 * du + m01 * dv, y + m10 * du + m11 * dv)
+    best, best_i, best_j = -2.0, rx, ry
+    for j in range(2 * ry + 1):
+        for i in range(2 * rx + 1):
+            total, square, product = 0.0, 0.0, 0.0
+            for k in range(_SIDE * _SIDE):
+                w, value = weight[k], around[j + k // _SIDE, i + k % _SIDE]
+                total += w * value
+                square += w * value * value
+                product += w * value * template[k]
+            scores[j, i] = product / math.sqrt(max(square - total * total, 1e-12))
+            if scores[j, i] > best:
+                best, best_i, best_j = scores[j, i], i, j
+    second = -1.0
+    for j in range(2 * ry + 1):
+        for i in range(2 * rx + 1):
+            if max(abs(i - best_i), abs(j - best_j)) > _SAME_PEAK_PX:
+                second = max(second, scores[j, i])
+    return best_i - rx, best_j - ry, second
+
+
 @entry
 def align_patches(
     first: int,
@@ -110,27 +152,7 @@ def align_patches(
         rx, ry = reach[row]
         second = -1.0
         if rx > 0 or ry > 0:
-            for j in range(_SIDE + 2 * ry):
-                for i in range(_SIDE + 2 * rx):
-                    du, dv = i - HALF_WIDTH_PX - rx, j - HALF_WIDTH_PX - ry
-                    around[j, i] = _at(image_b, x + m00 * du + m01 * dv, y + m10 * du + m11 * dv)
-            best, best_i, best_j = -2.0, rx, ry
-            for j in range(2 * ry + 1):
-                for i in range(2 * rx + 1):
-                    total, square, product = 0.0, 0.0, 0.0
-                    for k in range(n_taps):
-                        w, value = weight[k], around[j + k // _SIDE, i + k % _SIDE]
-                        total += w * value
-                        square += w * value * value
-                        product += w * value * template[k]
-                    scores[j, i] = product / math.sqrt(max(square - total * total, 1e-12))
-                    if scores[j, i] > best:
-                        best, best_i, best_j = scores[j, i], i, j
-            for j in range(2 * ry + 1):
-                for i in range(2 * rx + 1):
-                    if max(abs(i - best_i), abs(j - best_j)) > _SAME_PEAK_PX:
-                        second = max(second, scores[j, i])
-            du, dv = best_i - rx, best_j - ry
+            du, dv, second = _search(image_b, x, y, affine[row], rx, ry, template, weight, around, scores)
             x, y = x + m00 * du + m01 * dv, y + m10 * du + m11 * dv
         x_start, y_start = x, y
 
