@@ -59,5 +59,5 @@ def test_vectors_are_used_unless_they_do_not_compile_or_are_wrong(monkeypatch: p
         return numba.types.void(*types), lambda context, *_: context.get_dummy_value()
 
     for other in (raises, does_nothing):
-        monkeypatch.setattr(_tiles, "tile_subtraction", intrinsic(other))
+        monkeypatch.setattr(_tiles, "subtract_in_vectors", intrinsic(other))
         assert choose() is subtract_row

@@ -1,10 +1,11 @@
 """Linearisation of observations and elimination of landmarks."""
 
 from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from pancam_graph.base.compiled import entry, is_on_disk, part
+from pancam_graph.base.compiled import entry, inlined, is_on_disk, part
 from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.landmarks.kernel._loss import BEHIND_COST, NONE, loss_cost, loss_weight
 from pancam_graph.landmarks.kernel._observe import observe_ray, residual_by_ray
@@ -94,8 +95,249 @@ def _add_six(
     to[at + 3], to[at + 4], to[at + 5] = b3 + a3, b4 + a4, b5 + a5
 
 
+_Three: TypeAlias = tuple[float, float, float]
+_Symmetric: TypeAlias = tuple[float, float, float, float, float, float]
+"""A symmetric matrix (3, 3): its entries 00, 01, 02, 11, 12, 22."""
+_Matrix: TypeAlias = tuple[_Three, _Three, _Three]
+"""A matrix (3, 3) by rows."""
+
+
+@inlined
+def _plus_gram(total: _Symmetric, a: _Three, b: _Three) -> _Symmetric:
+    """A symmetric matrix plus J'J, J having the rows a and b."""
+    return (
+        total[0] + (a[0] * a[0] + b[0] * b[0]),
+        total[1] + (a[0] * a[1] + b[0] * b[1]),
+        total[2] + (a[0] * a[2] + b[0] * b[2]),
+        total[3] + (a[1] * a[1] + b[1] * b[1]),
+        total[4] + (a[1] * a[2] + b[1] * b[2]),
+        total[5] + (a[2] * a[2] + b[2] * b[2]),
+    )
+
+
+@inlined
+def _plus_product(total: _Three, a: _Three, b: _Three, r0: float, r1: float) -> _Three:
+    """A vector plus J'r, J having the rows a and b."""
+    return (
+        total[0] + (a[0] * r0 + b[0] * r1),
+        total[1] + (a[1] * r0 + b[1] * r1),
+        total[2] + (a[2] * r0 + b[2] * r1),
+    )
+
+
+@inlined
+def _plus_outer(row: _Three, p: float, a: _Three, q: float, b: _Three) -> _Three:
+    """A row of a matrix plus p a + q b."""
+    return (
+        row[0] + p * a[0] + q * b[0],
+        row[1] + p * a[1] + q * b[1],
+        row[2] + p * a[2] + q * b[2],
+    )
+
+
+@inlined
+def _in_base(unit_R: FloatArray, unit: int, d: _Three) -> _Three:
+    """A direction (3,) in the world, or a derivative by one, taken to the frame of a unit's base."""
+    return (
+        d[0] * unit_R[unit, 0, 0] + d[1] * unit_R[unit, 1, 0] + d[2] * unit_R[unit, 2, 0],
+        d[0] * unit_R[unit, 0, 1] + d[1] * unit_R[unit, 1, 1] + d[2] * unit_R[unit, 2, 1],
+        d[0] * unit_R[unit, 0, 2] + d[1] * unit_R[unit, 1, 2] + d[2] * unit_R[unit, 2, 2],
+    )
+
+
+@inlined
+def _cross(a: _Three, x: _Three) -> _Three:
+    """Cross product of a and x."""
+    return a[1] * x[2] - a[2] * x[1], a[2] * x[0] - a[0] * x[2], a[0] * x[1] - a[1] * x[0]
+
+
+class _Calibrations(NamedTuple):
+    """Sums over one occurrence where calibrations are free; arrays without entries where poses alone are."""
+
+    jacobian: FloatArray
+    """(2, 5) of one observation, by fx, fy, skew, cx and cy"""
+    by_landmark: FloatArray
+    """(5, 3) products with the derivative by the landmark"""
+    by_base: FloatArray
+    """(3, 5) products with the derivative by the ray in the base's frame"""
+
+
+@inlined
+def _add_calibration(
+    bearings: Bearings,
+    sights: Sights,
+    i: int,
+    u: float,
+    v: float,
+    root: float,
+    derivatives: tuple[_Three, _Three, _Three, _Three],
+    r0: float,
+    r1: float,
+    row: int,
+    sums: _Calibrations,
+    unit_H: FloatArray,
+    unit_s: FloatArray,
+) -> None:
+    """Add what observation i tells about its calibration to the sums of its occurrence and of its unit."""
+    b0, b1, e0, e1 = derivatives
+    jac, by_landmark, by_base = sums.jacobian, sums.by_landmark, sums.by_base
+    _by_calibration(bearings.calibration, sights.image[i], u, v, sights.whitening, i, root, jac)
+    for p in range(5):
+        ja, jb = jac[0, p], jac[1, p]
+        by_landmark[p, 0] += ja * b0[0] + jb * b1[0]
+        by_landmark[p, 1] += ja * b0[1] + jb * b1[1]
+        by_landmark[p, 2] += ja * b0[2] + jb * b1[2]
+        by_base[0, p] += ja * e0[0] + jb * e1[0]
+        by_base[1, p] += ja * e0[1] + jb * e1[1]
+        by_base[2, p] += ja * e0[2] + jb * e1[2]
+        unit_s[row, 6 + p] += ja * r0 + jb * r1
+        for q in range(p, 5):
+            unit_H[row, 6 + p, 6 + q] += ja * jac[0, q] + jb * jac[1, q]
+
+
+@inlined
+def _add_twist(
+    unit_H: FloatArray, unit_s: FloatArray, row: int, w: float, x: _Three, m: _Symmetric, k: _Three
+) -> None:
+    """Add an occurrence's information about its base's twist, whose ray is x, to its unit's.
+
+    m and k are the sums of e'e and e'r, e being the residual's derivative by the ray in the base's frame. A
+    twist moves the ray by [x]_x times its rotation and by -w times its translation.
+    """
+    m00, m01, m02, m11, m12, m22 = m
+    q0, q1, q2 = _cross((m00, m01, m02), x), _cross((m01, m11, m12), x), _cross((m02, m12, m22), x)
+    h0 = _cross((q0[0], q1[0], q2[0]), x)
+    h1 = _cross((q0[1], q1[1], q2[1]), x)
+    h2 = _cross((q0[2], q1[2], q2[2]), x)
+    unit_H[row, 0, 0] += h0[0]
+    unit_H[row, 0, 1] += h1[0]
+    unit_H[row, 0, 2] += h2[0]
+    unit_H[row, 1, 1] += h1[1]
+    unit_H[row, 1, 2] += h2[1]
+    unit_H[row, 2, 2] += h2[2]
+    for p in range(3):
+        unit_H[row, p, 3] -= w * q0[p]
+        unit_H[row, p, 4] -= w * q1[p]
+        unit_H[row, p, 5] -= w * q2[p]
+    unit_H[row, 3, 3] += w * w * m00
+    unit_H[row, 3, 4] += w * w * m01
+    unit_H[row, 3, 5] += w * w * m02
+    unit_H[row, 4, 4] += w * w * m11
+    unit_H[row, 4, 5] += w * w * m12
+    unit_H[row, 5, 5] += w * w * m22
+    turning = _cross(k, x)
+    for p in range(3):
+        unit_s[row, p] += turning[p]
+        unit_s[row, 3 + p] -= w * k[p]
+
+
+@inlined
+def _add_twist_by_calibration(unit_H: FloatArray, row: int, w: float, x: _Three, by_base: FloatArray) -> None:
+    """Add the products of an occurrence's twist with its calibration to its unit's information."""
+    for p in range(5):
+        f = by_base[0, p], by_base[1, p], by_base[2, p]
+        turning = _cross(f, x)
+        for q in range(3):
+            unit_H[row, q, 6 + p] += turning[q]
+            unit_H[row, 3 + q, 6 + p] -= w * f[q]
+
+
+@inlined
+def _add_to_arms(
+    sights: Sights,
+    bearings: Bearings,
+    o: int,
+    unit: int,
+    first_pair: int,
+    twist_by_landmark: tuple[_Three, _Three, _Three, _Three, _Three, _Three],
+    more: int,
+    by_landmark: FloatArray,
+    arms: FloatArray,
+) -> None:
+    """Add E' of an occurrence to the arms of its landmark, through the chains of its unit's variables.
+
+    `twist_by_landmark` (6, 3) are the products of the base's twist with the landmark, `by_landmark` (more, 3)
+    those of the calibration.
+    """
+    z0, z1, z2, z3, z4, z5 = twist_by_landmark
+    chain, place = bearings.chain, sights.place_begin[o]
+    for segment in range(bearings.segment_begin[unit], bearings.segment_begin[unit + 1]):
+        q = 6 * (first_pair + sights.place[place])
+        place += 1
+        if bearings.plain[segment]:
+            _add_six(arms, q, z0[0], z1[0], z0[1], z1[1], z0[2], z1[2])
+            _add_six(arms, q + 6, z2[0], z3[0], z2[1], z3[1], z2[2], z3[2])
+            _add_six(arms, q + 12, z4[0], z5[0], z4[1], z5[1], z4[2], z5[2])
+            continue
+        for k in range(bearings.segment_width[segment]):
+            h0, h1, h2 = chain[segment, 0, k], chain[segment, 1, k], chain[segment, 2, k]
+            h3, h4, h5 = chain[segment, 3, k], chain[segment, 4, k], chain[segment, 5, k]
+            a0 = h0 * z0[0] + h1 * z1[0] + h2 * z2[0] + h3 * z3[0] + h4 * z4[0] + h5 * z5[0]
+            a1 = h0 * z0[1] + h1 * z1[1] + h2 * z2[1] + h3 * z3[1] + h4 * z4[1] + h5 * z5[1]
+            a2 = h0 * z0[2] + h1 * z1[2] + h2 * z2[2] + h3 * z3[2] + h4 * z4[2] + h5 * z5[2]
+            if more:
+                for p in range(more):
+                    a0 += chain[segment, 6 + p, k] * by_landmark[p, 0]
+                    a1 += chain[segment, 6 + p, k] * by_landmark[p, 1]
+                    a2 += chain[segment, 6 + p, k] * by_landmark[p, 2]
+            at = q + 6 * (k >> 1) + (k & 1)
+            arms[at] += a0
+            arms[at + 2] += a1
+            arms[at + 4] += a2
+
+
+@inlined
+def _cholesky(v: _Symmetric) -> tuple[_Symmetric, bool]:
+    """Lower Cholesky factor of V (its entries 00, 10, 11, 20, 21, 22), and whether it needed the weak prior.
+
+    The weak prior goes to those pivots that need it: on all landmarks together it would hold the world.
+    """
+    v00, v10, v20, v11, v21, v22 = v
+    trace = v00 + v11 + v22
+    floor, prior = UNDETERMINED * trace, WEAK_PRIOR * trace + 1e-300
+    l00 = np.sqrt(v00 if v00 > floor else v00 + prior)
+    l10, l20 = v10 / l00, v20 / l00
+    p1 = max(v11 - l10 * l10, 0.0)
+    l11 = np.sqrt(p1 if p1 > floor else p1 + prior)
+    l21 = (v21 - l20 * l10) / l11
+    p2 = max(v22 - l20 * l20 - l21 * l21, 0.0)
+    l22 = np.sqrt(p2 if p2 > floor else p2 + prior)
+    return (l00, l10, l11, l20, l21, l22), min(v00, p1, p2) <= floor
+
+
+@inlined
+def _eliminate(
+    sights: Sights, reduced: Reduced, j: int, v: _Symmetric, g: _Three, tiles: FloatArray, s: FloatArray
+) -> None:
+    """Eliminate landmark j with V and g: divide its arms and g by its factor, subtract their products.
+
+    Below the diagonal of a tile on it, W'W leaves numbers that mean nothing.
+    """
+    (l00, l10, l11, l20, l21, l22), reduced.undetermined[j] = _cholesky(v)
+    arms, pair, n_pairs, factor = reduced.arms, sights.pair, len(s) // 2, reduced.factor
+    first_pair, last_pair = sights.pair_begin[j], sights.pair_begin[j + 1]
+    factor[j, 0], factor[j, 1], factor[j, 2] = l00, l10, l11
+    factor[j, 3], factor[j, 4], factor[j, 5] = l20, l21, l22
+    per0, per1, per2 = 1.0 / l00, 1.0 / l11, 1.0 / l22
+    g0 = g[0] * per0
+    g1 = (g[1] - l10 * g0) * per1
+    g2 = (g[2] - l20 * g0 - l21 * g1) * per2
+    reduced.gamma[j, 0], reduced.gamma[j, 1], reduced.gamma[j, 2] = g0, g1, g2
+    for p in range(first_pair, last_pair):
+        at, column = 6 * p, 2 * pair[p]
+        for q in range(at, at + 2):
+            a0 = arms[q] * per0
+            a1 = (arms[q + 2] - l10 * a0) * per1
+            a2 = (arms[q + 4] - l20 * a0 - l21 * a1) * per2
+            arms[q], arms[q + 2], arms[q + 4] = a0, a1, a2
+            s[column] -= a0 * g0 + a1 * g1 + a2 * g2
+            column += 1
+    for p in range(first_pair, last_pair):
+        subtract_row(tiles, pair[p] * n_pairs, arms, p, last_pair, pair)
+
+
 def _eliminating(rows: int) -> Callable[..., None]:
-    """The elimination kernel for chains of 6 rows (poses) or 11 (poses and calibrations)."""
+    """The elimination for chains of 6 rows (poses) or of 11 (poses and calibrations)."""
     more = rows - 6
 
     @entry
@@ -114,43 +356,34 @@ def _eliminating(rows: int) -> Callable[..., None]:
         tiles: FloatArray,
         s: FloatArray,
     ) -> None:
-        unit_H = np.zeros((n_units, rows, rows))
-        unit_s = np.zeros((n_units, rows))
+        unit_H, unit_s = np.zeros((n_units, rows, rows)), np.zeros((n_units, rows))
         unit_of = np.full(n_units, -1)
-        to_pixel, centre_m = bearings.to_pixel, bearings.centre_m
-        unit_R, unit_t, chain = bearings.unit_R, bearings.unit_t, bearings.chain
-        uv_px, whitening, arms = sights.uv_px, sights.whitening, reduced.arms
-        pair_begin, pair, n_pairs = sights.pair_begin, sights.pair, len(s) // 2
-        # Beyond the pose: an observation's Jacobian, and an occurrence's products with landmark, base.
-        jac, cross, with_base = np.empty((2, more)), np.empty((more, 3)), np.empty((3, more))
+        to_pixel, centre_m, arms = bearings.to_pixel, bearings.centre_m, reduced.arms
+        sums = _Calibrations(np.empty((2, more)), np.empty((more, 3)), np.empty((3, more)))
         for j in range(begin, end):
             X0, X1, X2, w = vector[j, 0], vector[j, 1], vector[j, 2], vector[j, 3]
             O0, O1, O2 = origin_m[j, 0], origin_m[j, 1], origin_m[j, 2]
             t = tangents(X0, X1, X2, w)
-            v00 = v10 = v11 = v20 = v21 = v22 = g0 = g1 = g2 = 0.0
-            cost = 0.0
-            first_pair, last_pair = pair_begin[j], pair_begin[j + 1]
+            v, g, cost = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0
+            first_pair, last_pair = sights.pair_begin[j], sights.pair_begin[j + 1]
             for q in range(6 * first_pair, 6 * last_pair):
                 arms[q] = 0.0
             for o in range(sights.landmark_begin[j], sights.landmark_begin[j + 1]):
                 unit, row = sights.occurrence_unit[o], sights.occurrence_row[o]
                 unit_of[row] = unit
-                R00, R01, R02 = unit_R[unit, 0, 0], unit_R[unit, 0, 1], unit_R[unit, 0, 2]
-                R10, R11, R12 = unit_R[unit, 1, 0], unit_R[unit, 1, 1], unit_R[unit, 1, 2]
-                R20, R21, R22 = unit_R[unit, 2, 0], unit_R[unit, 2, 1], unit_R[unit, 2, 2]
                 # With e the residual's derivative by the ray in the base's frame and b that by the landmark:
-                # the sums over the occurrence of e'e, e'b and e'r.
-                m00 = m01 = m02 = m11 = m12 = m22 = 0.0
-                n00 = n01 = n02 = n10 = n11 = n12 = n20 = n21 = n22 = 0.0
-                k0 = k1 = k2 = 0.0
+                # the sums over the occurrence of e'e, e'b (by rows) and e'r.
+                m, k = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+                n0, n1, n2 = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
                 if more:
-                    cross[:] = 0.0
-                    with_base[:] = 0.0
+                    sums.by_landmark[:] = 0.0
+                    sums.by_base[:] = 0.0
                 for i in range(sights.occurrence_begin[o], sights.occurrence_begin[o + 1]):
                     image = sights.image[i]
                     c0, c1, c2 = centre_m[image, 0] - O0, centre_m[image, 1] - O1, centre_m[image, 2] - O2
-                    in_front, r0, r1, u, v, per_depth = observe_ray(
-                        to_pixel, image, X0 - w * c0, X1 - w * c1, X2 - w * c2, uv_px, whitening, i
+                    y0, y1, y2 = X0 - w * c0, X1 - w * c1, X2 - w * c2
+                    in_front, r0, r1, u_px, v_px, per_depth = observe_ray(
+                        to_pixel, image, y0, y1, y2, sights.uv_px, sights.whitening, i
                     )
                     if not in_front:
                         cost += BEHIND_COST
@@ -160,172 +393,57 @@ def _eliminating(rows: int) -> Callable[..., None]:
                     root = 1.0 if kind == NONE else np.sqrt(loss_weight(kind, width, squared))
                     r0, r1 = root * r0, root * r1
                     d00, d01, d02, d10, d11, d12 = residual_by_ray(
-                        to_pixel, image, u, v, root * per_depth, whitening, i
+                        to_pixel, image, u_px, v_px, root * per_depth, sights.whitening, i
                     )
-                    b00, b01, b02 = by_tangents(t, d00, d01, d02, -(d00 * c0 + d01 * c1 + d02 * c2))
-                    b10, b11, b12 = by_tangents(t, d10, d11, d12, -(d10 * c0 + d11 * c1 + d12 * c2))
-                    e00 = d00 * R00 + d01 * R10 + d02 * R20
-                    e01 = d00 * R01 + d01 * R11 + d02 * R21
-                    e02 = d00 * R02 + d01 * R12 + d02 * R22
-                    e10 = d10 * R00 + d11 * R10 + d12 * R20
-                    e11 = d10 * R01 + d11 * R11 + d12 * R21
-                    e12 = d10 * R02 + d11 * R12 + d12 * R22
-                    v00 += b00 * b00 + b10 * b10
-                    v10 += b01 * b00 + b11 * b10
-                    v11 += b01 * b01 + b11 * b11
-                    v20 += b02 * b00 + b12 * b10
-                    v21 += b02 * b01 + b12 * b11
-                    v22 += b02 * b02 + b12 * b12
-                    g0 += b00 * r0 + b10 * r1
-                    g1 += b01 * r0 + b11 * r1
-                    g2 += b02 * r0 + b12 * r1
-                    m00 += e00 * e00 + e10 * e10
-                    m01 += e00 * e01 + e10 * e11
-                    m02 += e00 * e02 + e10 * e12
-                    m11 += e01 * e01 + e11 * e11
-                    m12 += e01 * e02 + e11 * e12
-                    m22 += e02 * e02 + e12 * e12
-                    n00, n01, n02 = (
-                        n00 + e00 * b00 + e10 * b10,
-                        n01 + e00 * b01 + e10 * b11,
-                        n02 + e00 * b02 + e10 * b12,
-                    )
-                    n10, n11, n12 = (
-                        n10 + e01 * b00 + e11 * b10,
-                        n11 + e01 * b01 + e11 * b11,
-                        n12 + e01 * b02 + e11 * b12,
-                    )
-                    n20, n21, n22 = (
-                        n20 + e02 * b00 + e12 * b10,
-                        n21 + e02 * b01 + e12 * b11,
-                        n22 + e02 * b02 + e12 * b12,
-                    )
-                    k0 += e00 * r0 + e10 * r1
-                    k1 += e01 * r0 + e11 * r1
-                    k2 += e02 * r0 + e12 * r1
+                    b0 = by_tangents(t, d00, d01, d02, -(d00 * c0 + d01 * c1 + d02 * c2))
+                    b1 = by_tangents(t, d10, d11, d12, -(d10 * c0 + d11 * c1 + d12 * c2))
+                    e0 = _in_base(bearings.unit_R, unit, (d00, d01, d02))
+                    e1 = _in_base(bearings.unit_R, unit, (d10, d11, d12))
+                    v, g = _plus_gram(v, b0, b1), _plus_product(g, b0, b1, r0, r1)
+                    m, k = _plus_gram(m, e0, e1), _plus_product(k, e0, e1, r0, r1)
+                    n0 = _plus_outer(n0, e0[0], b0, e1[0], b1)
+                    n1 = _plus_outer(n1, e0[1], b0, e1[1], b1)
+                    n2 = _plus_outer(n2, e0[2], b0, e1[2], b1)
                     if more:
-                        _by_calibration(bearings.calibration, image, u, v, whitening, i, root, jac)
-                        for p in range(more):
-                            ja, jb = jac[0, p], jac[1, p]
-                            cross[p, 0] += ja * b00 + jb * b10
-                            cross[p, 1] += ja * b01 + jb * b11
-                            cross[p, 2] += ja * b02 + jb * b12
-                            with_base[0, p] += ja * e00 + jb * e10
-                            with_base[1, p] += ja * e01 + jb * e11
-                            with_base[2, p] += ja * e02 + jb * e12
-                            unit_s[row, 6 + p] += ja * r0 + jb * r1
-                            for q in range(p, more):
-                                unit_H[row, 6 + p, 6 + q] += ja * jac[0, q] + jb * jac[1, q]
-                # A twist of the base moves the ray by [x]_x times its rotation and -w times its translation,
-                # x being the ray from the base to the landmark.
-                y0 = X0 - w * (unit_t[unit, 0] - O0)
-                y1 = X1 - w * (unit_t[unit, 1] - O1)
-                y2 = X2 - w * (unit_t[unit, 2] - O2)
-                x0 = R00 * y0 + R10 * y1 + R20 * y2
-                x1 = R01 * y0 + R11 * y1 + R21 * y2
-                x2 = R02 * y0 + R12 * y1 + R22 * y2
-                q00, q01, q02 = m01 * x2 - m02 * x1, m02 * x0 - m00 * x2, m00 * x1 - m01 * x0
-                q10, q11, q12 = m11 * x2 - m12 * x1, m12 * x0 - m01 * x2, m01 * x1 - m11 * x0
-                q20, q21, q22 = m12 * x2 - m22 * x1, m22 * x0 - m02 * x2, m02 * x1 - m12 * x0
-                unit_H[row, 0, 0] += x2 * q10 - x1 * q20
-                unit_H[row, 0, 1] += x2 * q11 - x1 * q21
-                unit_H[row, 0, 2] += x2 * q12 - x1 * q22
-                unit_H[row, 1, 1] += x0 * q21 - x2 * q01
-                unit_H[row, 1, 2] += x0 * q22 - x2 * q02
-                unit_H[row, 2, 2] += x1 * q02 - x0 * q12
-                unit_H[row, 0, 3] -= w * q00
-                unit_H[row, 0, 4] -= w * q10
-                unit_H[row, 0, 5] -= w * q20
-                unit_H[row, 1, 3] -= w * q01
-                unit_H[row, 1, 4] -= w * q11
-                unit_H[row, 1, 5] -= w * q21
-                unit_H[row, 2, 3] -= w * q02
-                unit_H[row, 2, 4] -= w * q12
-                unit_H[row, 2, 5] -= w * q22
-                unit_H[row, 3, 3] += w * w * m00
-                unit_H[row, 3, 4] += w * w * m01
-                unit_H[row, 3, 5] += w * w * m02
-                unit_H[row, 4, 4] += w * w * m11
-                unit_H[row, 4, 5] += w * w * m12
-                unit_H[row, 5, 5] += w * w * m22
-                unit_s[row, 0] += x2 * k1 - x1 * k2
-                unit_s[row, 1] += x0 * k2 - x2 * k0
-                unit_s[row, 2] += x1 * k0 - x0 * k1
-                unit_s[row, 3] -= w * k0
-                unit_s[row, 4] -= w * k1
-                unit_s[row, 5] -= w * k2
-                # The twist's part of E' (6, 3), a row each.
-                z00, z01, z02 = x2 * n10 - x1 * n20, x2 * n11 - x1 * n21, x2 * n12 - x1 * n22
-                z10, z11, z12 = x0 * n20 - x2 * n00, x0 * n21 - x2 * n01, x0 * n22 - x2 * n02
-                z20, z21, z22 = x1 * n00 - x0 * n10, x1 * n01 - x0 * n11, x1 * n02 - x0 * n12
-                z30, z31, z32 = -w * n00, -w * n01, -w * n02
-                z40, z41, z42 = -w * n10, -w * n11, -w * n12
-                z50, z51, z52 = -w * n20, -w * n21, -w * n22
+                        _add_calibration(
+                            bearings,
+                            sights,
+                            i,
+                            u_px,
+                            v_px,
+                            root,
+                            (b0, b1, e0, e1),
+                            r0,
+                            r1,
+                            row,
+                            sums,
+                            unit_H,
+                            unit_s,
+                        )
+                # The ray from the base to the landmark, in the world and in the base's frame.
+                y0 = X0 - w * (bearings.unit_t[unit, 0] - O0)
+                y1 = X1 - w * (bearings.unit_t[unit, 1] - O1)
+                y2 = X2 - w * (bearings.unit_t[unit, 2] - O2)
+                x = _in_base(bearings.unit_R, unit, (y0, y1, y2))
+                _add_twist(unit_H, unit_s, row, w, x, m, k)
                 if more:
-                    for p in range(more):
-                        f0, f1, f2 = with_base[0, p], with_base[1, p], with_base[2, p]
-                        unit_H[row, 0, 6 + p] += x2 * f1 - x1 * f2
-                        unit_H[row, 1, 6 + p] += x0 * f2 - x2 * f0
-                        unit_H[row, 2, 6 + p] += x1 * f0 - x0 * f1
-                        unit_H[row, 3, 6 + p] -= w * f0
-                        unit_H[row, 4, 6 + p] -= w * f1
-                        unit_H[row, 5, 6 + p] -= w * f2
-                place = sights.place_begin[o]
-                for segment in range(bearings.segment_begin[unit], bearings.segment_begin[unit + 1]):
-                    q = 6 * (first_pair + sights.place[place])
-                    place += 1
-                    if bearings.plain[segment]:
-                        _add_six(arms, q, z00, z10, z01, z11, z02, z12)
-                        _add_six(arms, q + 6, z20, z30, z21, z31, z22, z32)
-                        _add_six(arms, q + 12, z40, z50, z41, z51, z42, z52)
-                        continue
-                    for k in range(bearings.segment_width[segment]):
-                        h0, h1, h2 = chain[segment, 0, k], chain[segment, 1, k], chain[segment, 2, k]
-                        h3, h4, h5 = chain[segment, 3, k], chain[segment, 4, k], chain[segment, 5, k]
-                        a0 = h0 * z00 + h1 * z10 + h2 * z20 + h3 * z30 + h4 * z40 + h5 * z50
-                        a1 = h0 * z01 + h1 * z11 + h2 * z21 + h3 * z31 + h4 * z41 + h5 * z51
-                        a2 = h0 * z02 + h1 * z12 + h2 * z22 + h3 * z32 + h4 * z42 + h5 * z52
-                        if more:
-                            for p in range(more):
-                                a0 += chain[segment, 6 + p, k] * cross[p, 0]
-                                a1 += chain[segment, 6 + p, k] * cross[p, 1]
-                                a2 += chain[segment, 6 + p, k] * cross[p, 2]
-                        at = q + 6 * (k >> 1) + (k & 1)
-                        arms[at] += a0
-                        arms[at + 2] += a1
-                        arms[at + 4] += a2
-            trace = v00 + v11 + v22
-            # The weak prior goes to pivots that need it: on all landmarks together it would hold the world.
-            floor, prior = UNDETERMINED * trace, WEAK_PRIOR * trace + 1e-300
-            l00 = np.sqrt(v00 if v00 > floor else v00 + prior)
-            l10, l20 = v10 / l00, v20 / l00
-            p1 = max(v11 - l10 * l10, 0.0)
-            l11 = np.sqrt(p1 if p1 > floor else p1 + prior)
-            l21 = (v21 - l20 * l10) / l11
-            p2 = max(v22 - l20 * l20 - l21 * l21, 0.0)
-            l22 = np.sqrt(p2 if p2 > floor else p2 + prior)
-            reduced.undetermined[j] = min(v00, p1, p2) <= floor
-            factor = reduced.factor
-            factor[j, 0], factor[j, 1], factor[j, 2] = l00, l10, l11
-            factor[j, 3], factor[j, 4], factor[j, 5] = l20, l21, l22
-            per0, per1, per2 = 1.0 / l00, 1.0 / l11, 1.0 / l22
-            g0 = g0 * per0
-            g1 = (g1 - l10 * g0) * per1
-            g2 = (g2 - l20 * g0 - l21 * g1) * per2
-            reduced.gamma[j, 0], reduced.gamma[j, 1], reduced.gamma[j, 2] = g0, g1, g2
+                    _add_twist_by_calibration(unit_H, row, w, x, sums.by_base)
+                z0 = _cross((n0[0], n1[0], n2[0]), x)
+                z1 = _cross((n0[1], n1[1], n2[1]), x)
+                z2 = _cross((n0[2], n1[2], n2[2]), x)
+                twist_by_landmark = (
+                    (z0[0], z1[0], z2[0]),
+                    (z0[1], z1[1], z2[1]),
+                    (z0[2], z1[2], z2[2]),
+                    (-w * n0[0], -w * n0[1], -w * n0[2]),
+                    (-w * n1[0], -w * n1[1], -w * n1[2]),
+                    (-w * n2[0], -w * n2[1], -w * n2[2]),
+                )
+                _add_to_arms(
+                    sights, bearings, o, unit, first_pair, twist_by_landmark, more, sums.by_landmark, arms
+                )
             reduced.cost[j] = cost
-            for p in range(first_pair, last_pair):
-                at, column = 6 * p, 2 * pair[p]
-                for q in range(at, at + 2):
-                    a0 = arms[q] * per0
-                    a1 = (arms[q + 2] - l10 * a0) * per1
-                    a2 = (arms[q + 4] - l20 * a0 - l21 * a1) * per2
-                    arms[q], arms[q + 2], arms[q + 4] = a0, a1, a2
-                    s[column] -= a0 * g0 + a1 * g1 + a2 * g2
-                    column += 1
-            # W'W: below the diagonal of a tile on it, this leaves numbers that mean nothing.
-            for p in range(first_pair, last_pair):
-                subtract_row(tiles, pair[p] * n_pairs, arms, p, last_pair, pair)
+            _eliminate(sights, reduced, j, v, g, tiles, s)
         _add_units(unit_H, unit_s, unit_of, bearings, segment_column, tiles, s)
 
     return eliminate

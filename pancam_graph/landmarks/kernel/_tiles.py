@@ -12,6 +12,7 @@ from typing import Any
 import numba
 import numpy as np
 from llvmlite import ir
+from numba import types
 from numba.extending import intrinsic, overload
 
 from pancam_graph.base.compiled import entry, part
@@ -44,70 +45,52 @@ def subtract_row(
                     tiles[4 * (row + pair[q]) + 2 * h + m] -= arms[6 * first + k + h] * arms[6 * q + k + m]
 
 
-def subtract_row_in_vectors(
-    tiles: FloatArray, row: int, arms: FloatArray, first: int, last: int, pair: IntArray
-) -> None:
-    """`subtract_row` with each tile as one vector of four numbers: a third of the time of the plain form.
-
-    For compiled functions only.
-    """
-    p = 6 * first
-    p00, p01, p10, p11, p20, p21 = arms[p], arms[p + 1], arms[p + 2], arms[p + 3], arms[p + 4], arms[p + 5]
-    for q in range(first, last):
-        tile_subtraction(tiles, 4 * (row + pair[q]), arms, 6 * q, p00, p01, p10, p11, p20, p21)
-
-
-def _subtract_tile(
-    typing: Any,
-    tiles: Any,
-    tile: Any,
-    arms: Any,
-    arm: Any,
-    p00: Any,
-    p01: Any,
-    p10: Any,
-    p11: Any,
-    p20: Any,
-    p21: Any,
-) -> Any:
-    """Subtract W_p' W_q from the tile at tiles[tile], with W_q at arms[arm], in LLVM's own instructions.
+def _in_vectors(typing: Any, tiles: Any, row: Any, arms: Any, first: Any, last: Any, pair: Any) -> Any:
+    """`subtract_row` in LLVM's own instructions: each tile is one vector of four numbers.
 
     Numba leaves LLVM's search for such vectors switched off, and LLVM then takes each entry alone.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        number, word = ir.DoubleType(), ir.IntType(32)
-        two, four = ir.VectorType(number, 2), ir.VectorType(number, 4)
-        tiles, arms = (
-            context.make_array(signature.args[k])(context, builder, arguments[k]).data for k in (0, 2)
+        from numba.core import cgutils  # noqa: PLC0415  not public: where it is gone, the plain form is taken
+
+        tiles, row, arms, first, last, pair = (
+            context.make_array(kind)(context, builder, value).data if isinstance(kind, types.Array) else value
+            for kind, value in zip(signature.args, arguments, strict=True)
         )
-        tile, arm = arguments[1], arguments[3]
+        index, number = row.type, ir.DoubleType()
+        two, four = ir.VectorType(number, 2), ir.VectorType(number, 4)
 
-        def each_twice(left: Any, right: Any) -> Any:
-            """A vector (left, left, right, right)."""
-            vector = ir.Constant(four, ir.Undefined)
-            for k, value in enumerate((left, left, right, right)):
-                vector = builder.insert_element(vector, value, word(k))
-            return vector
-
-        at = builder.bitcast(builder.gep(tiles, [tile]), four.as_pointer())
-        entries = builder.load(at, align=8)
-        for k in range(3):
-            place = builder.gep(arms, [builder.add(arm, arm.type(2 * k))])
+        def row_of_arms(q: Any, k: int, order: tuple[int, ...]) -> Any:
+            """Row k of W_q as a vector of four, its two numbers in the given order."""
+            place = builder.gep(arms, [builder.add(builder.mul(q, index(6)), index(2 * k))])
             row_of_q = builder.load(builder.bitcast(place, two.as_pointer()), align=8)
-            both = builder.shuffle_vector(
-                row_of_q, row_of_q, ir.Constant(ir.VectorType(word, 4), (0, 1, 0, 1))
-            )
-            product = builder.fmul(each_twice(*arguments[4 + 2 * k : 6 + 2 * k]), both, flags=("contract",))
-            entries = builder.fsub(entries, product, flags=("contract",))
-        builder.store(entries, at, align=8)
+            lanes = ir.Constant(ir.VectorType(ir.IntType(32), 4), order)
+            return builder.shuffle_vector(row_of_q, row_of_q, lanes)
+
+        rows_of_p = [row_of_arms(first, k, (0, 0, 1, 1)) for k in range(3)]
+        with cgutils.for_range_slice(builder, first, last, index(1), index) as (q, _):
+            column = builder.load(builder.gep(pair, [q]))
+            tile = builder.gep(tiles, [builder.mul(builder.add(row, column), index(4))])
+            tile = builder.bitcast(tile, four.as_pointer())
+            entries = builder.load(tile, align=8)
+            for k in range(3):
+                product = builder.fmul(rows_of_p[k], row_of_arms(q, k, (0, 1, 0, 1)), flags=("contract",))
+                entries = builder.fsub(entries, product, flags=("contract",))
+            builder.store(entries, tile, align=8)
         return context.get_dummy_value()
 
-    index, number = numba.types.intp, numba.types.float64
-    return numba.types.void(tiles, index, arms, index, *(number,) * 6), generate
+    return types.void(tiles, types.intp, arms, types.intp, types.intp, pair), generate
 
 
-tile_subtraction: Any = intrinsic(_subtract_tile)
+subtract_in_vectors: Any = intrinsic(_in_vectors)
+
+
+def subtract_row_in_vectors(
+    tiles: FloatArray, row: int, arms: FloatArray, first: int, last: int, pair: IntArray
+) -> None:
+    """`subtract_row` in vectors, in a third of the time of the plain form. For compiled functions only."""
+    subtract_in_vectors(tiles, row, arms, first, last, pair)
 
 
 @cache
