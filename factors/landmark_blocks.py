@@ -1,17 +1,18 @@
-"""Landmark blocks: factors on cameras' variables alone, landmarks eliminated (as many rows as the rank left).
+"""Landmark blocks: factors on the variables of cameras alone, with the landmarks eliminated.
 
 Linearised, with A, B the whitened Jacobians of all observations by cameras and landmarks, V = B'B, E = A'B:
 
     S = A'A - sum E V^-1 E'        s = A'r - sum E V^-1 g        g = B'r
 
-One factor per group of variables (a stop) hands over the rows of a square root R'R = S that begin with that
-group, R'e = s; together they are S exactly, and each row is handed over once. Evaluated elsewhere, with dx
-the step of the variables, landmarks follow by dp = -V^-1 (g + E' dx), and each factor's error is the true
-cost of its block there. So GTSAM's Levenberg-Marquardt takes the exact joint step of cameras and landmarks,
-as sparse bundle adjustment does (thesis section 3.8).
+There is one factor for each group of variables (a stop). It has those rows of a square root R'R = S that
+begin with its group, as many as the rank of S has there, and R'e = s; the rows of all factors together are S
+exactly. At other values, a step dx of the variables away, landmarks follow by dp = -V^-1 (g + E' dx), and the
+error of a factor is the true cost of its block there. So GTSAM's Levenberg-Marquardt takes the exact joint
+step of cameras and landmarks, as sparse bundle adjustment does (thesis section 3.8).
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import gtsam
@@ -27,7 +28,7 @@ Reader = Callable[[gtsam.Values, int], Any]
 
 
 class LandmarkBlocks:
-    """All landmark blocks of a problem; they are linearised together and share what that found.
+    """All landmark blocks of a problem; they are linearised together and share the result.
 
     The landmarks are no variables of the graph: they are state of this object, and move when GTSAM linearises
     where a step led. So a graph with these factors is for one optimiser at a time.
@@ -54,8 +55,10 @@ class LandmarkBlocks:
         ]
         self._groups = [g for g in structure.order if self._members[g]]
         self._owner = np.array([b.groups[0] if b.groups else self._groups[0] for b in system.blocks])
-        self._here: dict[int, Any] = {}
-        self._there: dict[int, Any] = {}
+        self._linearised: _Place | None = None
+        """Where the landmarks are, and the system is linearised"""
+        self._evaluated: _Place | None = None
+        """Where the costs are; the same place, or one that a step leads to"""
         self._cost = np.zeros(0)
         self._panels: Panels | None = None
         self._root: Root | None = None
@@ -76,10 +79,10 @@ class LandmarkBlocks:
     def settle(self, values: gtsam.Values) -> bool:
         """Move the landmarks to where a step to these values leads them; whether they were elsewhere."""
         self._evaluate(values, self._touched)
-        moved = self._here is not self._there
+        moved = self._linearised is not self._evaluated
         if moved:
             self.system.adopt()
-            self._here = self._there = {}
+            self._linearised = self._evaluated = None
             self._panels, self._root = None, None
         return moved
 
@@ -88,7 +91,7 @@ class LandmarkBlocks:
         self._evaluate(values, self._touched)
         self._adopt()
         if self._panels is None:
-            self._linearise(self._posture(values))
+            self._linearise()
         assert self._panels is not None
         return self._panels.copy()
 
@@ -110,7 +113,7 @@ class LandmarkBlocks:
             self._evaluate(values, variables)
             if jacobians is None:
                 return np.array([np.sqrt(2 * self._cost[own].sum())])
-            root = self._linearised()
+            root = self._square_root()
             rows = root.rows[group]
             error = np.empty(len(rows) + first)
             error[: len(rows)] = rows[:, -1]
@@ -128,24 +131,25 @@ class LandmarkBlocks:
 
     def _evaluate(self, values: gtsam.Values, variables: Sequence[int]) -> None:
         """Bring costs to these values, unless the given variables are as they were."""
-        if self._there and all(_same(self._there[v], self._value(values, v)) for v in variables):
+        known = self._evaluated
+        if known is not None and all(_same(known.value[v], self._value(values, v)) for v in variables):
             return
-        there = {v: self._value(values, v) for v in self._touched}
-        posture = self._posture(values)
-        if not self._here:
-            self._there = there
-            self._linearise(posture)
+        place = _Place(
+            value={v: self._value(values, v) for v in self._touched}, posture=self._posture(values)
+        )
+        self._evaluated = place
+        if self._linearised is None:
+            self._linearise()
             return
         step = np.zeros(self._n_columns)
         for v in self._touched:
-            step[self._slice[v]] = _difference(self._here[v], there[v])
-        self._cost = self.system.try_step(posture, step)
-        self._there, self._pending = there, posture
+            step[self._slice[v]] = _difference(self._linearised.value[v], place.value[v])
+        self._cost = self.system.try_step(place.posture, step)
 
     def _value(self, values: gtsam.Values, variable: int) -> Any:
         return self._read(values, self.system.linkage.key[variable])
 
-    def _linearised(self) -> Root:
+    def _square_root(self) -> Root:
         """The square root at the last values evaluated."""
         self._adopt()
         if self._root is None:
@@ -154,18 +158,29 @@ class LandmarkBlocks:
         return self._root
 
     def _adopt(self) -> None:
-        if self._here is not self._there:
+        """Take the landmarks to where costs were evaluated last, and linearise there."""
+        if self._linearised is not self._evaluated:
             self.system.adopt()
-            self._linearise(self._pending)
+            self._linearise()
 
-    def _linearise(self, posture: Posture) -> None:
-        self._panels, self._root = self.system.linearise(posture), None
+    def _linearise(self) -> None:
+        assert self._evaluated is not None
+        self._panels, self._root = self.system.linearise(self._evaluated.posture), None
         self._cost = self.system.block_costs()
-        self._here = self._there
+        self._linearised = self._evaluated
 
     def _remainder(self, root: Root) -> float:
         """What the cost has beyond the squares of all e, as one more row."""
         return float(np.sqrt(max(2 * (float(self._cost.sum()) - root.gain()), 0.0)))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Place:
+    """Values of the variables, and the cameras there."""
+
+    value: dict[int, Any]
+    """By variable, of those that cameras hang on"""
+    posture: Posture
 
 
 def _same(a: Any, b: Any) -> bool:

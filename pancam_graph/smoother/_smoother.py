@@ -1,6 +1,5 @@
 """The rover drives: an estimate that follows stop by stop."""
 
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,22 +11,21 @@ from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.base.threads import blas_on_one_thread
 from pancam_graph.cameras import carry_to_pinhole
 from pancam_graph.data import Frame, Image, Observations, Sharing, Stop, Traverse
-from pancam_graph.elimination import relative_pose_covariance
 from pancam_graph.graph import GraphKeys, HardTemplate, UserFactors
 from pancam_graph.landmarks import Landmarks
 from pancam_graph.rigs import Rig
 from pancam_graph.smoother._batch import whole_template, whole_traverse
-from pancam_graph.smoother._closure import bridge, judged, loops
-from pancam_graph.smoother._engine import Engine, Rounds
+from pancam_graph.smoother._covariances import joint_covariance, relative_covariance
+from pancam_graph.smoother._engine import Engine
 from pancam_graph.smoother._ledger import Fate
 from pancam_graph.smoother._localise import localise
 from pancam_graph.smoother._map import Change, DriveMap
 from pancam_graph.smoother._nearness import by_nearness, sample
 from pancam_graph.smoother._odometry import guess, join, local_priors
-from pancam_graph.smoother._options import Closure, Estimate, SmootherOptions, Update
+from pancam_graph.smoother._options import Estimate, SmootherOptions, Update
 from pancam_graph.smoother._state import SmootherState, state_of
 from pancam_graph.smoother._station import Postures, Station, copied
-from pancam_graph.smoother._warnings import warnings_of
+from pancam_graph.smoother._update_run import UpdateRun
 
 __all__ = ["TraverseSmoother"]
 
@@ -94,30 +92,11 @@ class TraverseSmoother:
 
     def covariance(self, stop: str) -> FloatArray:
         """Covariance (6, 6) of a stop's mast pose, rotation first, body frame; 0 where it is held."""
-        return self._joint([self._station(stop)])
+        return joint_covariance(self._engine, [self._station(stop)])
 
     def relative_covariance(self, stop_a: str, stop_b: str) -> FloatArray:
         """Covariance (6, 6) of a_T_b, where b's mast is as a's sees it; rotation first, in the frame of b."""
-        a, b = self._station(stop_a), self._station(stop_b)
-        if a is b:
-            return np.zeros((6, 6))
-        values = self._engine.estimate
-        return relative_pose_covariance(a.world_T_mast(values), b.world_T_mast(values), self._joint([a, b]))
-
-    def _joint(self, stations: Sequence[Station]) -> FloatArray:
-        """Joint covariance of mast poses; 0 where held."""
-        free = [i for i, s in enumerate(stations) if s.mast is not None]
-        out = np.zeros((6 * len(stations),) * 2)
-        if free:
-            with blas_on_one_thread():
-                found = self._engine.covariance([m for i in free if (m := stations[i].mast) is not None])
-            held = np.zeros(len(out), dtype=bool)
-            for i, station in enumerate(stations):
-                held[6 * i + station.held_of_mast] = True
-            rows = np.concatenate([np.arange(6 * i, 6 * i + 6) for i in free])
-            out[np.ix_(rows, rows)] = found
-            out[held], out[:, held] = 0.0, 0.0
-        return out
+        return relative_covariance(self._engine, self._station(stop_a), self._station(stop_b))
 
     def _station(self, stop: str) -> Station:
         if stop not in self._stop:
@@ -141,7 +120,6 @@ class TraverseSmoother:
         is the stop from which odometry leads here; default: the one added last. Raises InputError, and
         changes nothing, where an id or a number makes no sense or was added before.
         """
-        begin = time.perf_counter()
         entries = Traverse(
             name="",
             rig=self.rig,
@@ -153,11 +131,16 @@ class TraverseSmoother:
         self._require_new(entries)
         previous = self._station(after) if after is not None else next(reversed(self._stop.values()), None)
         station = Station(len(self._stop), entries, self._sharing, len(self._image_row))
+        run = self._run(station)
         if previous is not None:
             self._follow(station, previous)
         with blas_on_one_thread():
-            rows = self._enter(station, observations)
-            return self._placed(station, previous, rows, begin)
+            run.rows = self._drive.ledger.with_fate(self._enter(station, observations), Fate.WAITING)
+            self._place(station, previous, run)
+        return run.finished()
+
+    def _run(self, station: Station | None = None) -> UpdateRun:
+        return UpdateRun(self._drive, self._engine, self.options, station)
 
     def _require_new(self, entries: Traverse) -> None:
         stop = entries.stops[0]
@@ -205,10 +188,9 @@ class TraverseSmoother:
         whitening = observations.noise.whiten(turn)
         return self._drive.ledger.append(image, observations, carried, whitening, valid)
 
-    def _placed(self, station: Station, previous: Station | None, rows: IntArray, begin: float) -> Update:
-        """Find where a new stop is, and let it take part."""
+    def _place(self, station: Station, previous: Station | None, run: UpdateRun) -> None:
+        """Find where a new station is, and let its observations take part."""
         drive, engine = self._drive, self._engine
-        rows = drive.ledger.with_fate(rows, Fate.WAITING)
         known, new = gtsam.Values(engine.estimate), gtsam.Values()
         start = station.start(guess(station, previous, engine.estimate))
         for key in start.keys():  # noqa: SIM118  gtsam.Values is not a dictionary
@@ -216,101 +198,17 @@ class TraverseSmoother:
                 copied(start, [key], new)
         known.insert(new)
         around = drive.near(previous.number) | {station.number} if previous is not None else {station.number}
-        near, far = by_nearness(drive, rows, {station.number: around})
+        near, far = by_nearness(drive, run.rows, {station.number: around})
         seen = sample(drive, station, near)
         if seen is not None:
-            found = localise(station, known, seen, local_priors(station, previous, known), robust=True)
-            new.update(found.values)
-            known.update(found.values)
+            located = localise(station, known, seen, local_priors(station, previous, known), robust=True)
+            new.update(located.values)
+            known.update(located.values)
         change = Change()
         drive.take_in(near, Postures(known), change, far)
         first = drive.stations[0].shared_priors() if station.number == 0 else []
-        done = self._advanced(change, [*first, *station.factors(firm=False)], station, new)
-        return self._closed(station, rows, far, change, done, begin)
-
-    def _advanced(
-        self,
-        change: Change,
-        factors: Sequence[gtsam.NonlinearFactor] = (),
-        station: Station | None = None,
-        values: gtsam.Values | None = None,
-    ) -> list[Rounds]:
-        """Bring the estimate up to date, and set aside what has come to lie behind its cameras."""
-        drive, engine = self._drive, self._engine
-        done = [engine.advance(change, factors, station, values)]
-        late = Change()
-        drive.drop_behind(Postures(engine.estimate), late)
-        if late.touched or late.slots:
-            change.rejected += late.rejected
-            done.append(engine.advance(late))
-        return done
-
-    def _closed(
-        self,
-        station: Station | None,
-        rows: IntArray,
-        far: IntArray,
-        change: Change,
-        done: list[Rounds],
-        begin: float,
-    ) -> Update:
-        """Close loops with what sees tracks far off, and say what was done."""
-        drive, engine, ledger = self._drive, self._engine, self._drive.ledger
-        rejected, closures = change.rejected, list[Closure]()
-        known = far[drive.home(ledger.track[far]) >= 0]
-        for loop in loops(drive, known):
-            values = engine.estimate
-            covariance = self.relative_covariance(loop.anchor.id, loop.station.id)
-            closure, found = judged(drive, loop, values, covariance, self.options)
-            closures.append(closure)
-            if not closure.accepted:
-                ledger.set_fate(loop.rows, Fate.CLOSURE)
-                rejected += len(loop.rows)
-                continue
-            factor = bridge(loop, values, found)
-            if factor is not None:
-                done.append(engine.bend(factor))
-            change = Change()
-            drive.take_in(loop.rows, Postures(engine.estimate), change, np.setdiff1d(far, loop.rows))
-            done += self._advanced(change)
-            rejected += change.rejected
-        late = ledger.with_fate(np.setdiff1d(far, known), Fate.WAITING)
-        # Pairs of rays across a loop say too little to be judged alone: they share the fate of the others.
-        doubted = {c.stop for c in closures if not c.accepted} - {c.stop for c in closures if c.accepted}
-        of_doubted = np.isin(drive.station_of(late), [self._stop[stop].number for stop in doubted])
-        ledger.set_fate(late[of_doubted], Fate.CLOSURE)
-        rejected += int(of_doubted.sum())
-        late = late[~of_doubted]
-        if len(late):
-            change = Change()
-            drive.take_in(late, Postures(engine.estimate), change, late[:0])
-            if change.touched or change.slots:
-                done += self._advanced(change)
-            rejected += change.rejected
-        return self._update(station, rows, rejected, done, tuple(closures), begin)
-
-    def _update(
-        self,
-        station: Station | None,
-        rows: IntArray,
-        rejected: int,
-        done: Sequence[Rounds],
-        closures: tuple[Closure, ...],
-        begin: float,
-    ) -> Update:
-        return Update(
-            stop=None if station is None else station.id,
-            observations=len(rows),
-            rejected=rejected,
-            blocks=sum(d.blocks for d in done),
-            rounds=sum(d.rounds for d in done),
-            relinearised=sum(d.relinearised for d in done),
-            cost=self.cost,
-            fell_back=any(d.fell_back for d in done),
-            closures=closures,
-            warnings=tuple(warnings_of(self._drive, station, rows, closures)),
-            seconds=time.perf_counter() - begin,
-        )
+        run.advance(change, [*first, *station.factors(firm=False)], new)
+        run.close_loops(far)
 
     def add_observations(self, observations: Observations) -> Update:
         """Add observations of images that were added before; `observations.image` are rows of `images`.
@@ -319,8 +217,7 @@ class TraverseSmoother:
         that does not contradict the drive. Raises InputError, and changes nothing, for an image that was not
         added and for an image that has seen a track already.
         """
-        begin = time.perf_counter()
-        drive, engine = self._drive, self._engine
+        run, drive, engine = self._run(), self._drive, self._engine
         image = self._rows_of_images(observations)
         known = drive.ledger.find(image, observations.track) >= 0
         if known.any():
@@ -330,11 +227,13 @@ class TraverseSmoother:
                 f"{self.images[image[row]]!r}, track {observations.track[row]} again"
             )
         with blas_on_one_thread():
-            rows = drive.ledger.with_fate(self._append(observations, image), Fate.WAITING)
-            near, far = by_nearness(drive, rows, {})
+            run.rows = drive.ledger.with_fate(self._append(observations, image), Fate.WAITING)
+            near, far = by_nearness(drive, run.rows, {})
             change = Change()
             drive.take_in(near, Postures(engine.estimate), change, far)
-            return self._closed(None, rows, far, change, self._advanced(change), begin)
+            run.advance(change)
+            run.close_loops(far)
+            return run.finished()
 
     @property
     def keys(self) -> GraphKeys:
@@ -359,20 +258,19 @@ class TraverseSmoother:
 
     def add_factors_of(self, template: HardTemplate, factors: UserFactors) -> Update:
         """The same on the keys of a template of the whole drive, whose frames may be in another order."""
-        begin = time.perf_counter()
+        run = self._run()
         with blas_on_one_thread():
             new = self._drive.take_factors(template, factors, self._engine.estimate)
-            change = Change()
-            done = self._advanced(change, new) if new else []
-        return self._update(None, np.zeros(0, dtype=np.int64), change.rejected, done, (), begin)
+            if new:
+                run.advance(Change(), new)
+            return run.finished()
 
     def remove(self, observations: Observations) -> Update:
         """Take back observations: those with the same `image` (row of `images`) and `track`.
 
         Raises InputError, and changes nothing, for one that was not added.
         """
-        begin = time.perf_counter()
-        ledger = self._drive.ledger
+        run, ledger = self._run(), self._drive.ledger
         image = self._rows_of_images(observations)
         rows = ledger.find(image, observations.track)
         missing = rows < 0
@@ -387,8 +285,9 @@ class TraverseSmoother:
             ledger.set_fate(rows, Fate.REMOVED)
             change = Change()
             self._drive.give_up(used, Postures(self._engine.estimate), change)
-            done = self._advanced(change) if change.touched or change.slots else []
-        return self._update(None, rows, change.rejected, done, (), begin)
+            run.rows = rows
+            run.advance_if_changed(change)
+            return run.finished()
 
     def _rows_of_images(self, observations: Observations) -> IntArray:
         n = len(self._image_row)

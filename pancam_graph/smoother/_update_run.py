@@ -1,0 +1,115 @@
+"""One update of a drive: iSAM2 brought up to date, loops closed, and what is said of it at the end."""
+
+import time
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+
+from pancam_graph.base.geometry import IntArray
+from pancam_graph.smoother._closure import Loop, bridge, judged, loops
+from pancam_graph.smoother._covariances import relative_covariance
+from pancam_graph.smoother._engine import Engine, Rounds
+from pancam_graph.smoother._ledger import Fate
+from pancam_graph.smoother._map import Change, DriveMap
+from pancam_graph.smoother._options import Closure, SmootherOptions, Update
+from pancam_graph.smoother._station import Postures, Station
+from pancam_graph.smoother._warnings import warnings_of
+
+__all__ = ["UpdateRun"]
+
+
+class UpdateRun:
+    """An update under way, and a record of what it did; its clock starts when it is made."""
+
+    def __init__(
+        self, drive: DriveMap, engine: Engine, options: SmootherOptions, station: Station | None = None
+    ) -> None:
+        """`station` is the new one, if the update adds one."""
+        self._begin = time.perf_counter()
+        self._drive, self._engine, self._options, self._station = drive, engine, options, station
+        self.rows: IntArray = np.zeros(0, dtype=np.int64)
+        """Rows of the ledger that the update is about"""
+        self._rejected = 0
+        self._rounds: list[Rounds] = []
+        self._closures: list[Closure] = []
+
+    def advance(
+        self,
+        change: Change,
+        factors: Sequence[gtsam.NonlinearFactor] = (),
+        values: gtsam.Values | None = None,
+    ) -> None:
+        """Bring the estimate up to date, and set aside what has come to lie behind its cameras.
+
+        `values` are those of the new station, about right; None: no station is new.
+        """
+        station = None if values is None else self._station
+        self._rounds.append(self._engine.advance(change, factors, station, values))
+        late = Change()
+        self._drive.drop_behind(Postures(self._engine.estimate), late)
+        if late.touched or late.slots:
+            self._rounds.append(self._engine.advance(late))
+            self._rejected += late.rejected
+        self._rejected += change.rejected
+
+    def advance_if_changed(self, change: Change) -> None:
+        """The same, unless no block has changed."""
+        if change.touched or change.slots:
+            self.advance(change)
+        else:
+            self._rejected += change.rejected
+
+    def close_loops(self, far: IntArray) -> None:
+        """Close loops with those of these rows that see known tracks far off; the others take part after."""
+        drive, engine, ledger = self._drive, self._engine, self._drive.ledger
+        known = far[drive.home(ledger.track[far]) >= 0]
+        for loop in loops(drive, known):
+            self._close(loop, far)
+        late = ledger.with_fate(np.setdiff1d(far, known), Fate.WAITING)
+        # Pairs of rays across a loop say too little to be judged alone: they share the fate of the others.
+        believed = {c.stop for c in self._closures if c.accepted}
+        doubted = {c.stop for c in self._closures if not c.accepted} - believed
+        numbers = [station.number for station in drive.stations if station.id in doubted]
+        of_doubted = np.isin(drive.station_of(late), numbers)
+        ledger.set_fate(late[of_doubted], Fate.CLOSURE)
+        self._rejected += int(of_doubted.sum())
+        late = late[~of_doubted]
+        if len(late):
+            change = Change()
+            drive.take_in(late, Postures(engine.estimate), change, late[:0])
+            self.advance_if_changed(change)
+
+    def _close(self, loop: Loop, far: IntArray) -> None:
+        """Judge one loop closure, and let its observations take part if it is believed."""
+        drive, engine = self._drive, self._engine
+        covariance = relative_covariance(engine, loop.anchor, loop.station)
+        closure, pose = judged(drive, loop, engine.estimate, covariance, self._options)
+        self._closures.append(closure)
+        if not closure.accepted:
+            drive.ledger.set_fate(loop.rows, Fate.CLOSURE)
+            self._rejected += len(loop.rows)
+            return
+        factor = bridge(loop, engine.estimate, pose)
+        if factor is not None:
+            self._rounds.append(engine.bend(factor))
+        change = Change()
+        drive.take_in(loop.rows, Postures(engine.estimate), change, np.setdiff1d(far, loop.rows))
+        self.advance(change)
+
+    def finished(self) -> Update:
+        """What the update did."""
+        station, rounds = self._station, self._rounds
+        return Update(
+            stop=None if station is None else station.id,
+            observations=len(self.rows),
+            rejected=self._rejected,
+            blocks=sum(r.blocks for r in rounds),
+            rounds=sum(r.rounds for r in rounds),
+            relinearised=sum(r.relinearised for r in rounds),
+            cost=self._engine.cost,
+            fell_back=any(r.fell_back for r in rounds),
+            closures=tuple(self._closures),
+            warnings=tuple(warnings_of(self._drive, station, self.rows, self._closures)),
+            seconds=time.perf_counter() - self._begin,
+        )
