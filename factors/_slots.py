@@ -65,14 +65,15 @@ def custom_factor(
 ) -> gtsam.CustomFactor:
     """A GTSAM factor from a pure residual, over those of its slots that are variables.
 
-    Each slot comes with what it holds. One factor may stand for many sites (the images of a stop), each slot
-    is then a sequence of so many: that is evaluated in one go, and its rows are those of one site after the
-    other. An exception in the residual reaches the caller of the optimiser with its own type and message.
+    Each slot comes with the kind of value that it holds. One factor may serve many sites (the images of a
+    stop): each slot is then a sequence with one entry a site, all sites are evaluated at once, and the rows
+    of the factor are those of one site after the other. An exception in the residual reaches the caller of
+    the optimiser with its own type and message.
     """
     readers = [
         _Reader([slot] if isinstance(slot, Key | Fixed | Corrected) else slot, kind) for slot, kind in slots
     ]
-    # By key, which reader's sites have it.
+    # By key: reader, distinct slot of the reader, and the sites that have this slot.
     places: dict[int, list[tuple[int, int, IntArray]]] = {}
     for i, reader in enumerate(readers):
         for j, slot in enumerate(reader.distinct):
@@ -84,9 +85,9 @@ def custom_factor(
     ) -> FloatArray:
         error, derivatives = residual(*(reader.read(values) for reader in readers))
         if jacobians is not None:
-            for k, found in enumerate(places.values()):
+            for k, uses in enumerate(places.values()):
                 block: FloatArray | None = None
-                for i, j, sites in found:
+                for i, j, sites in uses:
                     part = derivatives[i][sites]
                     if (twist := readers[i].twist(j)) is not None:
                         part = part @ twist
@@ -127,18 +128,18 @@ class _Reader:
 
     def read(self, values: gtsam.Values) -> Any:
         """Rotations and translations, or vectors, or numbers, of all sites."""
-        found: list[Any] = []
+        values_read: list[Any] = []
         for j, slot in enumerate(self.distinct):
             if isinstance(slot, Corrected):
                 pose, self._twist[j] = slot.pose(values)
-                found.append(pose)
+                values_read.append(pose)
             else:
-                found.append(self._read(values, slot.key) if isinstance(slot, Key) else slot.value)
+                values_read.append(self._read(values, slot.key) if isinstance(slot, Key) else slot.value)
         if not self._is_pose:
-            return np.array(found)[self.place]
-        rotations, translations = pose_arrays(found)
+            return np.array(values_read)[self.place]
+        rotations, translations = pose_arrays(values_read)
         return rotations[self.place], translations[self.place]
 
     def twist(self, distinct: int) -> FloatArray | None:
-        """Of a corrected pose that was read: its body-frame twist by the variable (6, n)."""
+        """Body-frame twist (6, n) of a corrected pose by its variable, at the values read last; else None."""
         return self._twist.get(distinct)

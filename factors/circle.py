@@ -2,9 +2,10 @@
 
     C = R [rho cos(phi), rho sin(phi), h]^T + Cc
 
-R and Cc are the circle's orientation and centre; h is 0 in the thesis. Here the circle's pose is the
-mast's, whose z is the pan axis, so that one pose serves every eye at every tilt: an eye's circle lies h
-above the mast's origin, and phi is the pan plus the eye's phase. The camera's rotation is free.
+R and Cc are the orientation and the centre of the circle; h is 0 in the thesis. Here the pose of the circle
+is that of the mast, whose z axis is the pan axis. So one pose serves every eye at every tilt: the circle of
+an eye lies h above the origin of the mast, and phi is the pan plus the phase of the eye. The rotation of the
+camera is free.
 """
 
 from collections.abc import Sequence

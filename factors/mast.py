@@ -2,8 +2,8 @@
 
     world_T_camera = world_T_mast . Rz(pan) . pan_T_tilt . Ry(-tilt) . head_T_camera
 
-The residual is what is left of it: the rotation vector, radians, then the shift, metres, of the
-camera as seen from where the chain puts it. Its sigma stands for the flex of the mast.
+The residual is the pose of the camera as seen from where the chain puts it: the rotation vector, radians,
+then the shift, metres. Its sigma stands for the flex of the mast.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,8 @@
 """Projective factor: a projection matrix hangs on the mast as a camera of the rig does (12 rows).
 
-The matrix is split, P = s K R [I | -C]: what is left of R and C beside the chain (`mast_residual`, 6 rows,
-radians and metres), of K beside the rig's (fx, fy, skew, cx, cy, pixels) and the logarithm of s. Images say
-nothing of s; each matrix has its own, and this row alone holds it.
+The matrix is split, P = s K R [I | -C]. The rows compare R and C with the chain (`mast_residual`, 6 rows,
+radians and metres), K with that of the rig (fx, fy, skew, cx, cy, pixels), and s with 1 (its logarithm).
+Images do not depend on s: the last row alone determines it.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from pancam_graph.factors.mast import Pose, mast_residual
 __all__ = ["projective_factor", "projective_residual"]
 
 _NO_CAMERA = 1e6
-"""What each row of a matrix without a camera says: no step of an optimiser ends there."""
+"""Residual in each row of a matrix that is no camera: no step of an optimiser ends there."""
 
 
 def projective_residual(

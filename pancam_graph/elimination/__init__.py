@@ -1,4 +1,4 @@
-"""Landmarks eliminated: structure, blocks, square root of what is left, entries of its inverse."""
+"""Elimination of landmarks: the system that is left for the cameras, its square root, and its inverse."""
 
 from pancam_graph.elimination._joint_covariance import JointCovariance as JointCovariance
 from pancam_graph.elimination._joint_covariance import PosePlace as PosePlace

@@ -17,8 +17,8 @@ __all__ = ["Block", "Layout", "blocks_of"]
 class Block:
     """Landmarks first seen from one stop, and the groups that these touch.
 
-    Its columns are those that some segment touches, group by group. Each segment has an even number: the
-    kernel takes them in pairs, and one that fills up a pair belongs to nothing.
+    Its columns are those that some segment touches, group by group. Each segment has an even number of
+    columns, since the kernel takes them in pairs: an odd segment gets one more, which belongs to no variable.
     """
 
     groups: tuple[int, ...]
@@ -28,11 +28,11 @@ class Block:
     segment_column: IntArray
     """(segments,) first column of each segment in the block; negative where it is of another"""
     row: IntArray
-    """(columns,) of each of the block's columns among those of its group; -1: of nothing"""
+    """(columns,) place of each column of the block among those of its group; -1: it belongs to no variable"""
     panel_column: tuple[IntArray, ...]
-    """For each of the groups, where in its panel each of the block's columns is; -1: of nothing"""
+    """For each of the groups, the place in its panel of each column of the block; -1: it has none"""
     source: IntArray
-    """(columns,) of each among all columns; -1: of nothing"""
+    """(columns,) place of each column of the block among all columns; -1: it belongs to no variable"""
     n_units: int
 
     @staticmethod
@@ -61,14 +61,15 @@ class Block:
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """Columns that segments touch, group by group, each segment's number filled up to an even one."""
+    """Columns that segments touch, group by group; the number of columns of each segment is made even."""
 
     group_width: IntArray
     """(groups,) columns of each"""
     segment_column: IntArray
     """(segments,) first column of each in its group"""
     row: tuple[IntArray, ...]
-    """For each group, where each of these columns is among all of the group's; -1: of nothing"""
+    """For each group, the place of each of these columns among all of the group; -1: it belongs to no
+    variable"""
 
     @staticmethod
     def of(linkage: Linkage) -> "Layout":
@@ -95,7 +96,7 @@ class Layout:
 def blocks_of(linkage: Linkage, m: Measurements) -> tuple[IntArray, dict[int, tuple[int, ...]]]:
     """Block of each landmark, named by the first group that sees it, and the groups each block touches."""
     groups = [linkage.unit_groups[u] for u in linkage.image_unit]
-    # What no variable moves is of a block of its own that touches nothing.
+    # Landmarks whose cameras no variable moves make a block of their own, which touches no group.
     nobody = linkage.n_groups
     image_first = np.array([g[0] if g else nobody for g in groups])
     first = np.minimum.reduceat(image_first[m.image], m.starts)

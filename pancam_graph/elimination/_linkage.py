@@ -1,4 +1,4 @@
-"""How camera poses hang on the variables of a graph: what a model tells the landmark blocks."""
+"""How camera poses depend on the variables of a graph: what a template tells the landmark system."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -14,12 +14,12 @@ __all__ = ["Linkage", "Posture"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Linkage:
-    """Structure of the chain rule, which no step changes.
+    """Structure of the chain rule from variables to cameras; it stays the same from step to step.
 
-    Images that all variables move alike are one *unit* (the eyes of a frame on a rigid head; else each image
-    is its own). A unit hangs on variables by *segments*: some columns of one variable, and a small matrix
-    that takes these to the unit's pose (and calibration). Variables of one *group* (a stop) are eliminated
-    together.
+    A *unit* is a set of images that every variable moves in the same way: the eyes of a frame on a rigid
+    head, or one image. A unit depends on variables by *segments*: a segment is some columns of one variable,
+    and a small matrix that takes these columns to the pose of the unit (and to its calibration). Variables of
+    one *group* (a stop) are eliminated together.
     """
 
     key: tuple[int, ...]
@@ -39,8 +39,8 @@ class Linkage:
     segment_width: IntArray
     """(segments,) number of columns"""
     segment_plain: BoolArray
-    """(segments,) whether the variable's tangent is the twist of the unit's base itself: 6 columns, the chain
-    a unit matrix at all values"""
+    """(segments,) whether the tangent of the variable is the twist of the base of the unit itself: the
+    segment has 6 columns, and its matrix is the identity at all values"""
 
     @property
     def n_groups(self) -> int:
@@ -91,7 +91,7 @@ class Linkage:
 
     @cached_property
     def touched(self) -> BoolArray:
-        """(variables,) whether any image hangs on it."""
+        """(variables,) whether any image depends on it."""
         out = np.zeros(len(self.dim), dtype=bool)
         out[self.segment_variable] = True
         return out

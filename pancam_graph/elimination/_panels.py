@@ -13,7 +13,7 @@ from pancam_graph.base.geometry import FloatArray, IntArray
 __all__ = ["Covariance", "FreeDirectionError", "Panels", "Pattern", "Root", "pattern"]
 
 _RANK_TOLERANCE = 1e-12
-"""A pivot is zero where no more than this is left of what was summed."""
+"""A pivot counts as zero where it is no more than this share of the diagonal entry that was summed up."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -60,7 +60,7 @@ def pattern(dim: IntArray, cliques: Iterable[Iterable[int]]) -> Pattern:
 
 
 class FreeDirectionError(SolveError):
-    """A direction that nothing holds; `group` and `column` have most of it."""
+    """No factor determines some direction; most of it lies in column `column` of group `group`."""
 
     def __init__(self, group: int, column: int) -> None:
         super().__init__("nothing holds a direction of the solution")
@@ -137,7 +137,7 @@ class Panels:
         return twin
 
     def hold(self, held: dict[int, IntArray]) -> None:
-        """Make some columns of groups independent of everything, of unit information."""
+        """Make some columns of groups independent of all others, with an information of 1."""
         for g, columns in held.items():
             self.panel[g][columns] = 0.0
             for panel, place in zip(self.panel, self._place, strict=True):
@@ -179,7 +179,7 @@ class Panels:
         """
         st = self.structure
         rows: list[FloatArray] = [np.zeros((0, 0))] * len(st.dim)
-        # What is left of a diagonal that was summed up tells rounding from information.
+        # A pivot is judged by the diagonal entry that was summed up: what is tiny beside it is rounding.
         summed = [np.diag(panel).copy() for panel in self.panel]
         for g in st.order:
             rows[g] = _root_of_panel(self.panel[g], summed[g])
@@ -239,8 +239,8 @@ class Root:
     def step(self, known: Mapping[int, FloatArray] | None = None) -> FloatArray:
         """The x (columns,) that solves S x = -s, by back substitution in R x = -e; group by group.
 
-        Groups whose x is `known` keep it, and those before follow. Where a group's rows leave directions
-        free, the shortest one for what the later groups do.
+        Groups whose x is `known` keep it, and groups that were eliminated before them follow. Where the rows
+        of a group leave directions free, its x is the shortest that fits those of the later groups.
         """
         st = self.structure
         begin = np.concatenate([[0], np.cumsum(st.dim)])
@@ -254,8 +254,10 @@ class Root:
             right = -rows[:, -1] - rows[:, n:-1] @ rest
             own = rows[:, :n]
             # Rows come in the order of their pivots, which is not that of the columns.
-            found = np.linalg.solve(own, right) if len(own) == n else np.linalg.lstsq(own, right)[0]
-            x[begin[g] : begin[g + 1]] = found
+            is_square = len(own) == n
+            x[begin[g] : begin[g + 1]] = (
+                np.linalg.solve(own, right) if is_square else np.linalg.lstsq(own, right)[0]
+            )
         return x
 
     def inverse_columns(self, g: int, columns: slice) -> FloatArray:
@@ -323,7 +325,7 @@ def _block(blocks: dict[tuple[int, int], FloatArray], g: int, h: int) -> FloatAr
 
 
 class Covariance:
-    """Entries of an inverse."""
+    """Blocks of the inverse of a system, of those groups that a clique joins."""
 
     def __init__(self, blocks: dict[tuple[int, int], FloatArray]) -> None:
         self._blocks = blocks

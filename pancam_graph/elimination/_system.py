@@ -1,4 +1,4 @@
-"""All landmarks of a problem, cut into blocks, and what is left of them for the cameras' variables."""
+"""All landmarks of a problem, cut into blocks, and the system that is left for the variables of cameras."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -39,9 +39,9 @@ _ROOM = 6_000_000
 _STRAY = 1.0
 """A landmark with this cost per observation, twice what noise gives or more, is refined after a step."""
 _LOST = 0.5 * 5.0**2
-"""One with this cost even then, as if all were 5 sigma off, is placed anew."""
+"""A stray that has this cost after its refinement, as if all rays were 5 sigma off, is placed anew."""
 _TOUCHED = 1e-2
-"""If the step changed its cost by more than this share."""
+"""A landmark is a stray only if the step changed its cost by more than this share."""
 _REFINED = 0.1
 """A stray is refined until that promises no more than this share of its cost."""
 _STRAY_GRAIN = 256
@@ -64,9 +64,10 @@ class _Chunk:
 
 
 class Room(local):
-    """Memory that systems linearised in turn may share: to get it anew takes as long as to fill it.
+    """Memory that systems share if they are linearised one after the other.
 
-    Each thread has its own, so that systems may also be linearised at once.
+    To get new memory takes as long as to fill it. Each thread has memory of its own, so systems may also
+    be linearised in parallel.
     """
 
     def __init__(self) -> None:
@@ -75,7 +76,7 @@ class Room(local):
     def numbers(self, n: int) -> FloatArray:
         """(n,) numbers, whatever they were before."""
         if len(self._numbers) < n:
-            # Twice as much as there was: what grows little by little is not all got anew each time.
+            # At least twice as much as before, so that growth in small steps rarely needs new memory.
             self._numbers = np.empty(max(n, 2 * len(self._numbers)))
         return self._numbers[:n]
 
@@ -88,9 +89,9 @@ _Systems = list[tuple[FloatArray, FloatArray]]
 class LandmarkSystem:
     """Landmarks as 4-vectors on S^3 that follow the cameras, eliminated from every linearisation.
 
-    `linearise` gives the square root of the system in the cameras' variables that is left; `try_step` moves
-    landmarks along with a step of these variables and tells the true cost; `adopt` makes that the
-    next point of linearisation.
+    `linearise` gives the system that is left in the variables of cameras; `try_step` moves the landmarks
+    along with a step of these variables and returns the true cost; `adopt` makes that place the next point of
+    linearisation.
     """
 
     def __init__(
@@ -375,13 +376,13 @@ class LandmarkSystem:
         return float(cost.sum())
 
     def _replace_strays(self, views: CameraViews, bearings: kernel.Bearings) -> None:
-        """Place anew what a step leaves behind a camera or off; elsewhere the linear step is good.
+        """Place those landmarks anew that a step leaves behind a camera or far off.
 
-        First it is refined from where the step led; what is far off even then is found from its rays alone.
+        A stray is refined from where the step led; if it is still far off, it is triangulated from its rays.
         """
         counts, seen = np.diff(self._seen.begin), self._seen
         before, after = self.reduced.cost, self._moved_cost
-        # What a step hardly touches is as well placed as it was: noise alone is no reason to look again.
+        # A landmark whose cost a step hardly changes is placed as well as before, however large the cost is.
         touched = np.abs(after - before) > _TOUCHED * before
         astray = (after > _LOST * counts) | touched & (after > _STRAY * counts)
         strays = np.flatnonzero(astray | self._refined)

@@ -1,4 +1,4 @@
-"""The rig as a factor template, and landmarks as variables; options that shape a graph."""
+"""The rig as variables and factors of a GTSAM graph; keys and factors of callers; landmarks as variables."""
 
 from pancam_graph.graph._factors import FactorList as FactorList
 from pancam_graph.graph._factors import Factors as Factors

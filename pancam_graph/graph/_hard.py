@@ -31,7 +31,7 @@ from pancam_graph.landmarks import CameraViews
 __all__ = ["HardTemplate"]
 
 _ANGLES, _MAST, _AXIS, _MOUNT, _CALIBRATION = range(5)
-"""Kinds of segments, in the order that a unit has them."""
+"""Kinds of segments, in their order within a unit."""
 _TILT = np.array([[0.0], [-1.0], [0.0], [0.0], [0.0], [0.0]])
 """Twist of the tilt axis's own frame: about minus its y."""
 
@@ -56,7 +56,7 @@ class HardTemplate(FactorTemplate):
 
     @cached_property
     def linkage(self) -> Linkage:
-        """Units hang on their angles, their mast, and what of the rig is free; see `_segments`."""
+        """Units depend on their angles, their mast, and free entries of the rig; see `_segments`."""
         t, free = self.traverse, self.rig_variables
         keys: list[int] = []
         dims: list[int] = []
@@ -166,8 +166,8 @@ class HardTemplate(FactorTemplate):
     def _angle_twists(self, angles: FloatArray, axes: tuple[FloatArray, FloatArray] | None) -> FloatArray:
         """Twists of the mast frame (frames, 6, 2), rotation first, that move the head as its pan and tilt do.
 
-        Pan turns about the mast's z. Tilt turns about minus the tilt axis y; where that is on the pan stage
-        tell `axes`, by stop, if they differ from the rig's.
+        Pan turns about the z axis of the mast. Tilt turns about minus the y axis of the tilt frame; `axes`
+        are the poses of that frame on the pan stage, by stop, where they differ from the pose in the rig.
         """
         axis = self._tilt_axis if axes is None else _tilt_axis(*axes)[self.traverse.frame_stop]
         pan_R = pan_tilt_rotation(angles[:, 0], 0.0)
@@ -295,10 +295,10 @@ class HardTemplate(FactorTemplate):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Segments:
-    """What each unit hangs on: a unit is a frame, or an image where eyes of a frame move differently."""
+    """What each unit depends on; a unit is a frame, or an image where eyes of a frame move differently."""
 
     present: BoolArray
-    """(units, 5) whether it hangs on its angles, mast, tilt axis, mount and calibration"""
+    """(units, 5) whether it depends on its angles, mast, tilt axis, mount and calibration"""
     frame: IntArray
     """(units,)"""
     image: IntArray

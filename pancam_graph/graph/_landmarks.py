@@ -1,7 +1,6 @@
 """Landmarks as variables of the graph, with GTSAM's own projection factors.
 
-Another way to treat landmarks stands beside it: it too adds its factors to the template's, and reads its
-landmarks back from the values that the optimiser found.
+The other way to treat landmarks is to eliminate them (`pancam_graph.elimination`).
 """
 
 from collections.abc import Sequence
@@ -24,8 +23,8 @@ class ExplicitLandmarks:
 
     GTSAM's projections know no distortion: measurements are those of the pinhole of the same camera, and
     the noise model turns residuals back to raw pixels. A landmark that moves behind a camera costs a large
-    constant there, so the optimiser rejects the step; but where calibrations are free: GTSAM's factor for
-    these says nothing of it, and the caller must look.
+    constant there, so the optimiser rejects the step. Where calibrations are free GTSAM's factor does not do
+    so, and the caller must check it.
     """
 
     def __init__(self, template: SoftTemplate, measurements: Measurements) -> None:

@@ -29,8 +29,8 @@ from pancam_graph.landmarks import CameraViews
 __all__ = ["ProjectiveTemplate"]
 
 _FACTOR_SIGMA = 0.01
-"""Of the surplus factor of P, relative. It moves nothing else: loose enough to let steps turn a camera, which
-change the factor to second order, firm enough to keep the system regular."""
+"""Sigma of the factor s of P, relative. Nothing else depends on s. The sigma is loose enough to let steps
+turn a camera, which changes s to second order, and firm enough to keep the system regular."""
 _TYPICAL_RANGE_M = 10.0
 """Unit of the conditioned scene. A mast 1.5 m high sees its ground from 2 m on; from 1 to 100 m the number of
 iterations is the same, but for starts that are far off."""

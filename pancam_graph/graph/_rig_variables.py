@@ -1,4 +1,4 @@
-"""What of a rig is estimated, as variables: one vector of free entries per owner (thesis 4.3, 5.4).
+"""The free entries of a rig as variables: one vector for each owner (thesis 4.3, 5.4).
 
 Variables: `K` calibration, `E` mount (`head_T_camera`), `T` tilt axis (`pan_T_tilt`): vectors of corrections
 to the rig's own values, of their free entries only, so that what is held is no variable; `R` radius of a
@@ -48,7 +48,7 @@ _KIND: Mapping[Quantity, Kind] = {
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RigVariable:
-    """A correction, and who shares it: all, but for what is given here."""
+    """A variable: free entries of a correction, and who shares it. An owner that is None stands for all."""
 
     quantity: Quantity
     key: int
@@ -366,7 +366,7 @@ class RigVariables:
         return tuple(out)
 
     def start_error(self) -> tuple[FloatArray, FloatArray]:
-        """How wrong each image's camera may be at the start, one sigma: pixels (images,), metres (images,).
+        """Error of the camera of each image at the start, one sigma: pixels (images,), metres (images,).
 
         By the priors of calibration, mounts and pan_T_tilt; an entry without one counts as if it had the
         default one.

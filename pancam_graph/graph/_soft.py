@@ -38,9 +38,9 @@ class SoftTemplate(FactorTemplate):
     _camera_dim = 6
     """Dimension of a camera's variable"""
     refines_landmarks = True
-    """Cameras that are free to move far along what images hardly tell take landmarks with them, and far along
-    the linear step of a landmark is off by more than noise. Three clusters of one eye took up to 81 steps
-    without, and take 7."""
+    """Cameras of their own may move far in directions that images hardly determine, and the linear step of a
+    landmark is then wrong by more than noise. Three clusters of one eye took up to 81 steps without this
+    refinement, and 7 with it."""
 
     def __init__(self, traverse: Traverse, model: Model, flex: Flex, sharing: Sharing | None = None) -> None:
         super().__init__(traverse, model, sharing)
@@ -60,7 +60,7 @@ class SoftTemplate(FactorTemplate):
 
     @cached_property
     def linkage(self) -> Linkage:
-        """One unit per image, which hangs on its own camera and calibration; ties join it to all else."""
+        """One unit per image, which depends on its own camera and calibration; ties join it to all else."""
         t, free = self.traverse, self.rig_variables
         dim: dict[int, int] = {}
         group: list[int] = []
@@ -204,8 +204,8 @@ class SoftTemplate(FactorTemplate):
     def state(self, values: gtsam.Values, landmarks_m: FloatArray, views: CameraViews | None = None) -> State:
         """The state at values of the variables; inverse of `values`.
 
-        Pan and tilt are the variables themselves where the model is `mast`, and those of the camera poses as
-        seen from their mast otherwise: there the poses hold what images say of the pointing.
+        In the model `mast` pan and tilt are the variables themselves. In the other models they are those of
+        the camera poses as seen from their mast, since there the poses have what images say of the pointing.
         """
         t, masts, views = self.traverse, self.masts(values), views or self.views(values)
         angles = np.array(
@@ -239,9 +239,10 @@ class SoftTemplate(FactorTemplate):
         return np.flatnonzero(np.array([entry.sigma_pan_rad, entry.sigma_tilt_rad]) == 0)
 
     def angle_rows(self, frame: int, state: State) -> tuple[IntArray, FloatArray]:
-        """How a frame's pan and tilt move: they are variables, or what camera poses say.
+        """How pan and tilt of a frame move with the variables.
 
-        As in `state`: where the model is not `mast`, it is the mean over a frame's eyes.
+        As in `state`: in models other than `mast` they are those of the camera poses, the mean over the eyes
+        of the frame.
         """
         t, link = self.traverse, self.linkage
         stop = int(t.frame_stop[frame])
@@ -294,8 +295,8 @@ class SoftTemplate(FactorTemplate):
             @ mounts_R[t.image_eye].transpose(0, 2, 1)
         )
         before = t.rig.mast_T_head(pan_tilt_rad[t.image_frame, 0], pan_tilt_rad[t.image_frame, 1])[0]
-        found, nominal = pan_tilt_from_rotation(head_R), pan_tilt_from_rotation(before)
-        offset = np.column_stack([found[0] - nominal[0], found[1] - nominal[1]])
+        seen, nominal = pan_tilt_from_rotation(head_R), pan_tilt_from_rotation(before)
+        offset = np.column_stack([seen[0] - nominal[0], seen[1] - nominal[1]])
         return wrap_angle(offset)
 
 

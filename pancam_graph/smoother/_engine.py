@@ -26,12 +26,13 @@ more adds as much."""
 _PIXELS = 100.0
 """Calibrations are in pixels, of which so many are about what a unit of the other entries is."""
 _LEFT = 0.3
-"""A block may be left with some stops moved and others not that are no more than so many units apart."""
+"""A block whose moved and unmoved stops are no more than this many units apart need not be linearised
+anew."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rounds:
-    """What it took."""
+    """What a number of rounds did."""
 
     rounds: int
     relinearised: int

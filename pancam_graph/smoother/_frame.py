@@ -1,8 +1,8 @@
-"""How stops move together: what they do alike changes nothing that a block of landmarks says.
+"""The common motion of stops, which changes nothing in what a block of landmarks says.
 
 A block's quadratic, in the body-frame tangents of its mast poses, is exact under a motion of the whole: with
-T_i = exp(xi) theta_i the tangent is Ad(theta_i)^-1 xi, however large xi is. So it is how stops move against
-each other that a linearisation must be near to, and landmarks are carried along by the common motion.
+T_i = exp(xi) theta_i the tangent is Ad(theta_i)^-1 xi, however large xi is. So only the motion of stops
+against each other limits where a linearisation is good; landmarks are carried along by the common motion.
 """
 
 from collections.abc import Sequence

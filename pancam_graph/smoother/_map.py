@@ -1,4 +1,4 @@
-"""What a drive consists of: stations, observations, landmarks in blocks by the stop that saw them first."""
+"""The content of a drive: stations, observations, and landmarks in blocks by the stop that saw them first."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -137,14 +137,14 @@ class DriveMap:
         return {s for name in distinct(home[home >= 0]).tolist() for s in self.blocks[name].patch.place}
 
     def take_in(self, rows: IntArray, cameras: Postures, change: Change, but: IntArray) -> None:
-        """Landmarks get observations, or are born of them; what waited for a second ray takes part too.
+        """Give observations to landmarks, known or new.
 
-        `but` are rows that shall go on waiting.
+        Observations that waited for a second ray take part too. `but` are rows that go on waiting.
         """
         ledger = self.ledger
         track = distinct(ledger.track[rows])
         rows = distinct(rows, np.setdiff1d(self.idle(track, Fate.WAITING, Fate.OUTLIER), but))
-        # What was rejected about here may be judged too early: it is looked at again.
+        # Observations near by may have been rejected too early: they are judged again.
         around = self.near_blocks(track) | set(self.station_of(rows).tolist())
         out = ledger.all_with(Fate.OUTLIER)
         rows = distinct(rows, out[np.isin(self.station_of(out), list(around))])

@@ -28,7 +28,7 @@ _FEW_VIEWS = 4
 _WIDEST = 3.0
 """Noise is not taken to be more than so many times what observations say of themselves."""
 _HIDDEN = 3.0
-"""Others hide none in residuals whose squares are so many times below the limit."""
+"""Other landmarks hide no outlier where their largest squared residual is this many times below the limit."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -174,7 +174,7 @@ def believed(seen: Seen, views: CameraViews, cutoff_sigma: float | None) -> Seen
     m, n = placed.measurements, placed.measurements.n_landmarks
     whitened, in_front = residuals(placed.landmarks, m, views)
     if cutoff_sigma is None:
-        # What lies behind a camera that sees it anew was placed by few rays: all of them may do better.
+        # A landmark behind a camera that sees it for the first time was placed by few rays: place it by all.
         astray = (np.bincount(m.landmark, ~in_front, minlength=n) > 0) & seen.touched
         if astray.any():
             all_of = seen.accepted | astray[m.landmark]

@@ -1,4 +1,4 @@
-"""Sets of numbers as ascending arrays: what is merged here is mostly in order, which a stable sort uses."""
+"""Sets of numbers as ascending arrays; a stable sort is fast here, since most arrays are nearly in order."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""What a smoother is made of, to be kept and to go on from."""
+"""The state of a smoother, for files and for going on later."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ __all__ = ["SmootherState", "state_of"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SmootherState:
-    """A drive as far as it went. What iSAM2 has of it follows from this."""
+    """A drive as far as it was followed. The tree of iSAM2 follows from this."""
 
     traverse: Traverse
     """All stops with all observations, in the order in which they were added."""

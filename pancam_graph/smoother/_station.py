@@ -102,8 +102,8 @@ class Station:
     def factors(self, *, firm: bool) -> list[gtsam.NonlinearFactor]:
         """Priors of what is its own, or of the mast the motion that led here.
 
-        `firm`: what telemetry holds within a variable is held by the prior; else the prior says of it that it
-        is about there, for who holds it otherwise.
+        `firm`: components that telemetry holds (sigma 0) are constraints of the prior. Else their sigma in
+        the prior is 1, for callers who hold these components themselves.
         """
         t, out = self.traverse, list[gtsam.NonlinearFactor]()
 
@@ -153,7 +153,7 @@ class Postures:
         return found
 
     def of_all(self, stations: Iterable[Station]) -> list[Posture]:
-        """The postures of stations. What threads are to read at once is worked out by this before."""
+        """The postures of stations. To be called before threads read any of them."""
         return [self.of(station) for station in stations]
 
     def moved(self, station: Station, own: gtsam.Values) -> "Postures":
@@ -168,7 +168,7 @@ class Postures:
 class Patch:
     """Several stations as one structure of images, units and variables, in the order in which they are given.
 
-    With one station that is free, all others only show their images, and what is shared is held.
+    With `free`, only the variables of that station move; the other stations contribute fixed images.
     """
 
     def __init__(self, stations: Iterable[Station], free: Station | None = None) -> None:

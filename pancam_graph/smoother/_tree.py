@@ -1,4 +1,4 @@
-"""GTSAM's iSAM2, told what its thresholds mean."""
+"""GTSAM's iSAM2, with the variables to relinearise chosen by the caller."""
 
 from collections.abc import Iterable, Sequence
 

@@ -1,4 +1,4 @@
-"""What an update found that a user should know."""
+"""Warnings of an update."""
 
 from collections.abc import Sequence
 
@@ -18,7 +18,7 @@ __all__ = ["warnings_of"]
 def warnings_of(
     drive: DriveMap, station: Station | None, rows: IntArray, closures: Sequence[Closure]
 ) -> list[str]:
-    """What a user should know of an update with these rows of the ledger, of a new station or none."""
+    """Warnings of an update with these rows of the ledger, of a new station or of none."""
     ledger, out = drive.ledger, list[str]()
     if station is not None and len(drive.stations) > 1 and drive.near(station.number) == {station.number}:
         out.append(

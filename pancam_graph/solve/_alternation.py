@@ -1,4 +1,4 @@
-"""Regular and shared parameters in turn, as the thesis solves it, for comparison with the joint step.
+"""Regular and shared parameters in turn, as in the thesis, for comparison with the joint step.
 
 Regular are landmarks and what belongs to a stop, a frame or an image; shared is what all stops have in
 common (the last group of a Linkage). A regular step holds what is shared and eliminates landmarks (Schur
@@ -63,7 +63,7 @@ class AlternatingSolver(EliminatedSolver):
 
 
 class _Point:
-    """Where a minimisation is."""
+    """Values of a problem on the way to its optimum, and the system there."""
 
     def __init__(self, problem: Problem, loss: Loss) -> None:
         self.template, self.factors, self.values = problem.template, problem.factors, problem.values
@@ -198,7 +198,7 @@ class _Shared(_Set):
         self._columns = slice(*link.group_column[self._group : self._group + 2].tolist())
         own = {key for key, group in zip(link.key, link.group, strict=True) if group == self._group}
         self._factors = graph_of(f for f in point.factors.all if not own.isdisjoint(f.keys()))
-        """Those factors that move with it"""
+        """Factors on any of these variables"""
         self._is_seen = bool(link.touched[link.group == self._group].any())
         """Whether cameras hang on it; else ties alone do"""
 

@@ -16,9 +16,9 @@ from pancam_graph.solve._reduced import ReducedSystem, held_columns, loosened_ro
 __all__ = ["Uncertainty", "covariance_of", "uncertainty"]
 
 _LOOSER = 10.0
-"""By how much sigmas of priors are multiplied to see what they hold."""
+"""Factor on the sigmas of priors that shows which directions depend on them."""
 _HELD = 10.0
-"""A variance that grows by more then is held by priors: images tell less than a tenth of what these do."""
+"""A direction whose variance grows by more than this then is held by priors, not by images."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

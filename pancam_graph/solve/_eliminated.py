@@ -61,9 +61,10 @@ class EliminatedSolver(Solver):
         return self._minimise(problem, rule, loss, stage)
 
     def _fit_rigid(self, problem: Problem, loss: Loss, stage: str) -> tuple[Problem, Outcome]:
-        """The problem with cameras where a rigid mast fits best.
+        """The problem with its cameras where a rigid mast fits best.
 
-        A step from afar bends a firm tie by more than its sigma: a straight step of poses leaves the circle.
+        From afar a straight step of camera poses leaves the circle on which a mast turns them, by more than
+        the sigma of a firm tie. The rigid mast has no such poses.
         """
         rule = StopRule(max_iterations=20, relative_decrease=1e-4)
         template = problem.template
@@ -83,7 +84,7 @@ class EliminatedSolver(Solver):
     def _by_groups(
         self, problem: Problem, system: LandmarkSystem, rule: StopRule, stage: str
     ) -> tuple[Outcome, Root | None]:
-        """Where each image has a variable of its own."""
+        """Least cost on the last group, all others eliminated: where each image has a variable of its own."""
         joint = JointSystem(problem, system)
 
         outcome = optimise(
@@ -99,7 +100,7 @@ class EliminatedSolver(Solver):
     def _by_blocks(
         self, problem: Problem, system: LandmarkSystem, rule: StopRule, stage: str
     ) -> tuple[Outcome, Root | None]:
-        """Where few variables move many images."""
+        """Least cost by GTSAM on landmark blocks: where few variables move many images."""
         template = problem.template
         blocks = LandmarkBlocks(system, read_variable, template.posture)
         graph = gtsam.NonlinearFactorGraph(problem.factors.graph)

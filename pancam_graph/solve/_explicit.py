@@ -1,4 +1,4 @@
-"""Landmarks as variables of the graph."""
+"""The solver with landmarks as variables of the graph."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -38,7 +38,7 @@ class _Weak:
 
 
 class ExplicitSolver(Solver):
-    """A `L` variable per landmark: simple, slow, and independent of the eliminated way."""
+    """One variable `L` for each landmark: simple, slow, and independent of the eliminated solver."""
 
     def __init__(self, on_iteration: Callable[[Iteration], None] | None) -> None:
         super().__init__(on_iteration)

@@ -1,11 +1,11 @@
-"""A problem as GTSAM's Levenberg-Marquardt optimises it fastest: all groups of variables but one eliminated.
+"""A problem for GTSAM's Levenberg-Marquardt with all groups of variables but the last one eliminated.
 
-Where each image has variables of its own, GTSAM's elimination took ten times as long as all else together.
-So groups (stops) are eliminated here, as landmarks are, with the damping that GTSAM is about to use; it
-gets the square root of what is left, in the columns of the last group, and decides: how far to damp, and
-whether to take a step. The others follow by back substitution. That is the step of the whole system, damped
-alike in all variables. After each step the problem moves and the vector begins at 0 again: so no chart is
-ever far from where it is good.
+Where each image has variables of its own, GTSAM's elimination takes ten times as long as all else together.
+So groups (stops) are eliminated here, as landmarks are, with the damping that GTSAM is about to use. GTSAM
+gets the square root of the system that is left, in the columns of the last group, and decides on the damping
+and on whether to take a step. The other groups follow by back substitution. The result is the step of the
+whole system with the same damping of all variables. After each step the problem moves there, and GTSAM's
+vector begins at 0 again.
 """
 
 from typing import Any
@@ -23,9 +23,11 @@ from pancam_graph.solve._stopping import StopRule
 __all__ = ["JointSystem", "OnLastGroup", "all_columns", "retracted"]
 
 _KEY = 0
-"""GTSAM's, of the one vector: a step of the last group's columns, and one number for all other groups."""
+"""Key of GTSAM's only variable: a step of the columns of the last group, and one number for all other
+groups."""
 _UNIT = 1e-7
-"""Step of that number which stands for the whole step of the others: so short that no damping holds it."""
+"""Value of that number which stands for the whole step of the other groups: too short for damping to
+matter."""
 
 
 def retracted(linkage: Linkage, values: gtsam.Values, step: FloatArray) -> gtsam.Values:
@@ -52,14 +54,14 @@ class JointSystem:
     def __init__(self, problem: Problem, system: LandmarkSystem) -> None:
         self.template, self.factors, self.system = problem.template, problem.factors, system
         self.values = problem.values
-        """Where it stands"""
+        """Values of the variables at which it is linearised"""
         link = self.template.linkage
         self.last = next(g for g in reversed(system.structure.order) if link.group_dim[g])
         """The group that is not eliminated"""
         self._held = all_columns(link, held_columns(self.template))
         posture = self.template.posture(self.values)
         self.cost = system.cost_at(posture) + self.factors.error(self.values)
-        """There"""
+        """Cost at these values"""
         self._forget()
 
     def _forget(self) -> None:

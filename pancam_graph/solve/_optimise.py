@@ -32,7 +32,7 @@ MOST_DAMPING = 1e10
 _INDETERMINATE = "ndeterminate"
 """Part of GTSAM's message for a system without a unique solution."""
 _FAR = 100.0
-"""Gains that shrink, and will end so many times above the limit, need no closer look at the one ahead."""
+"""While gains shrink and will end this many times above the limit, the next gain need not be worked out."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,8 +251,8 @@ class Elimination:
     """Factorisation and order of elimination for graphs of one structure.
 
     GTSAM's Cholesky refuses a variable of which one direction is known 4096 times better than another: the
-    range of a far landmark, or a camera pose that a tight tie holds once its angles are eliminated. So angles
-    and masts come last; and QR, three times slower, minds less.
+    range of a far landmark, or a camera pose that a tight tie holds once its angles are eliminated. So all
+    variables but cameras and landmarks come last. QR bears more, and is three times slower.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""What a solver of either kind is given and returns."""
+"""The problem that every solver is given and returns, and what a solver is."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
@@ -33,7 +33,7 @@ class Problem:
     """On the template's variables: priors, ties, and the caller's own."""
     measurements: Measurements
     accepted: BoolArray
-    """(n,) measurements that take part, but for those of landmarks with fewer than two of them"""
+    """(n,) measurements that are no outliers; those of landmarks with two or more of them take part"""
     values: gtsam.Values
     """The template's variables."""
     landmarks: Landmarks
@@ -55,7 +55,7 @@ class Problem:
         return np.asarray(self.accepted & self.present[self.measurements.landmark])
 
     def points_m(self) -> FloatArray:
-        """World points (landmarks, 3), none further than where parallax tells nothing."""
+        """World points (landmarks, 3), none further away than where parallax is lost in the noise."""
         length, w = self.landmarks.length, self.landmarks.vector[:, 3]
         # Most are nearer than any limit.
         beyond = length * _FURTHEST_PARALLAX_SIGMAS > w * _LEAST_BASELINE_M * _resolution(self)
@@ -79,13 +79,13 @@ class Problem:
         return replace(self, landmarks=best)
 
     def on(self, template: FactorTemplate) -> "Problem":
-        """The same with other variables, cameras as near to where they are as these allow."""
+        """The same problem on another template, with cameras as near as its variables allow."""
         values = template.values(self.template.state(self.values, np.zeros((0, 3))))
         factors = template.factors(self.factors.given, present=self.values)
         return replace(self, template=template, factors=factors, values=values)
 
     def at(self, values: gtsam.Values, landmarks: Landmarks) -> "Problem":
-        """The same elsewhere."""
+        """The same problem at other values and landmarks."""
         return replace(self, values=values, landmarks=landmarks)
 
 
@@ -112,13 +112,13 @@ def _resolution(problem: Problem) -> float:
 
 
 class Solver(ABC):
-    """A way to minimise."""
+    """A way to find the least cost of a problem."""
 
     def __init__(self, on_iteration: Callable[[Iteration], None] | None) -> None:
         self.on_iteration = on_iteration
 
     def require(self, template: FactorTemplate) -> None:  # noqa: B027  most ways have nothing to ask for
-        """Raise InputError where a template has not what this way needs."""
+        """Raise InputError where a template lacks something that this solver needs."""
 
     @abstractmethod
     def approach(self, problem: Problem, rule: StopRule, loss: Loss, stage: str) -> Problem:

@@ -1,4 +1,4 @@
-"""A problem with its landmarks eliminated: the square root of the system in the cameras' variables."""
+"""A problem with its landmarks eliminated: the square root of the system in the variables of cameras."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ __all__ = ["ReducedSystem", "add_factors", "held_columns", "joint_panels", "join
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReducedSystem:
-    """What is left of a problem at its values, linearised, priors and ties included."""
+    """The system in the variables of cameras at a problem's values, all factors included."""
 
     system: LandmarkSystem
     """Linearised there."""
@@ -37,12 +37,12 @@ class ReducedSystem:
 
 
 def joint_root(template: FactorTemplate, factors: Factors, values: gtsam.Values, panels: Panels) -> Root:
-    """Square root of what is left of the landmarks, with all other factors added. Destroys the panels."""
+    """Square root of the system left by the landmarks, with all other factors added. Destroys the panels."""
     return joint_panels(template, factors, values, panels).root()
 
 
 def joint_panels(template: FactorTemplate, factors: Factors, values: gtsam.Values, panels: Panels) -> Panels:
-    """What is left of the landmarks, with all other factors added in place."""
+    """The system left by the landmarks, with all other factors added in place."""
     add_factors(panels, template.linkage, factors.linearize(values))
     panels.hold(held_columns(template))
     return panels
