@@ -42,11 +42,11 @@ def _adjoint_of_inverse(rotation: FloatArray, translation: FloatArray) -> FloatA
 
 def mast_chain(
     world_T_mast: Pose, pan_tilt_rad: FloatArray, head_T_camera: Pose, pan_T_tilt: Pose
-) -> tuple[Pose, tuple[FloatArray, FloatArray, FloatArray]]:
-    """The camera pose on the mast, and its body-frame twist by mast, pan-tilt and tilt axis.
+) -> tuple[Pose, tuple[FloatArray, FloatArray, FloatArray, FloatArray]]:
+    """The camera pose on the mast, and its body-frame twist by mast, by pan, by tilting down, by tilt axis.
 
-    Poses are pairs of rotations (..., 3, 3) and translations (..., 3); twists (..., 6, 6), by pan-tilt
-    (..., 6, 2), rotation first. By the mount the twist is the mount's own.
+    Poses are pairs of rotations (..., 3, 3) and translations (..., 3); twists (..., 6, 6), of pan and tilt
+    (..., 6, 1), rotation first. By the mount the twist is that of the mount itself.
     """
     pan, tilt = pan_tilt_rad[..., 0], pan_tilt_rad[..., 1]
     none = np.zeros(3)
@@ -55,11 +55,10 @@ def mast_chain(
     tilt_to_camera = compose(pan_tilt_rotation(0.0 * tilt, tilt), none, *head_T_camera)
     pan_to_camera = compose(*pan_T_tilt, *tilt_to_camera)
     mast_to_camera = compose(pan_tilt_rotation(pan, 0.0 * pan), none, *pan_to_camera)
-    by_pan = _adjoint_of_inverse(*pan_to_camera)[..., 2:3]
-    by_tilt = -_adjoint_of_inverse(*head_T_camera)[..., 1:2]
     return compose(*world_T_mast, *mast_to_camera), (
         _adjoint_of_inverse(*mast_to_camera),
-        np.concatenate([by_pan, by_tilt], axis=-1),
+        _adjoint_of_inverse(*pan_to_camera)[..., 2:3],
+        _adjoint_of_inverse(*head_T_camera)[..., 1:2],
         _adjoint_of_inverse(*tilt_to_camera),
     )
 
@@ -74,7 +73,7 @@ def mast_residual(
     Defined where camera and chain differ by less than half a turn.
     """
     camera_R, camera_t = world_T_camera
-    (chain_R, chain_t), (by_mast, by_pan_tilt, by_axis) = mast_chain(
+    (chain_R, chain_t), (by_mast, by_pan, by_down, by_axis) = mast_chain(
         world_T_mast, pan_tilt_rad, head_T_camera, pan_T_tilt
     )
     back = _transposed(chain_R)
@@ -91,7 +90,8 @@ def mast_residual(
     d_chain[..., 3:, :3] = skew(shift)
     d_chain[..., 3:, 3:] = -np.eye(3)
 
-    by_variables = (d_camera, d_chain @ by_mast, d_chain @ by_pan_tilt, d_chain, d_chain @ by_axis)
+    d_pan_tilt = np.concatenate([d_chain @ by_pan, -d_chain @ by_down], axis=-1)
+    by_variables = (d_camera, d_chain @ by_mast, d_pan_tilt, d_chain, d_chain @ by_axis)
     return np.concatenate([rotation, shift], axis=-1), by_variables
 
 

@@ -38,7 +38,7 @@ def mast_projection_residual(
     body-frame tangents, rotation first. A point that is not in front of its camera has a large residual that
     moves nowhere.
     """
-    (chain_R, chain_t), (by_mast, by_pan_tilt, by_axis) = mast_chain(
+    (chain_R, chain_t), (by_mast, by_pan, by_down, by_axis) = mast_chain(
         world_T_mast, pan_tilt_rad, head_T_camera, pan_T_tilt
     )
     back = np.swapaxes(chain_R, -1, -2)
@@ -60,7 +60,7 @@ def mast_projection_residual(
     jacobians = (
         d_seen @ back,
         d_camera @ by_mast,
-        d_camera @ by_pan_tilt,
+        np.concatenate([d_camera @ by_pan, -d_camera @ by_down], axis=-1),
         d_camera,
         d_camera @ by_axis,
         d_calibration,
