@@ -41,7 +41,7 @@ def test_version_and_help(capsys: Captured) -> None:
     listed = capsys.readouterr().out
     for name, command in COMMANDS.items():
         assert re.search(rf"^ +{name}\b", listed, flags=re.MULTILINE)
-        assert command.summary in listed
+        assert command.summary in " ".join(listed.split())  # whatever the width of the terminal
         assert main([name, "--help"]) == 0
         assert capsys.readouterr().out.startswith(f"usage: pancam-graph {name} ")
 
