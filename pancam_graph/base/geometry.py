@@ -9,8 +9,8 @@ from collections.abc import Sequence
 
 import gtsam
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from pancam_graph.base.errors import GeometryError
 
@@ -190,7 +190,7 @@ def rotation_from_wxyz(wxyz: Sequence[float] | FloatArray) -> FloatArray:
 
 def wxyz_from_rotation(rotation: FloatArray) -> FloatArray:
     """Unit quaternion (w, x, y, z) with w >= 0 of a rotation matrix."""
-    xyzw = Rotation.from_matrix(rotation).as_quat(canonical=True)
+    xyzw = scipy.spatial.transform.Rotation.from_matrix(rotation).as_quat(canonical=True)
     return np.roll(xyzw, 1)
 
 

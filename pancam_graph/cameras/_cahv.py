@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from scipy.linalg import rq
+import scipy
 
 from pancam_graph.base.errors import CameraError
 from pancam_graph.base.geometry import BoolArray, FloatArray
@@ -88,7 +88,7 @@ class CAHV(Camera):
 
     def _split_axes(self) -> tuple[FloatArray, FloatArray]:
         # [H; V; A] = K R exactly; the five numbers of K take up that A, H, V are never quite orthogonal.
-        k, camera_R_frame = rq(np.array([self.H, self.V, self.A]))
+        k, camera_R_frame = scipy.linalg.rq(np.array([self.H, self.V, self.A]))
         sign = np.diag(np.sign(np.diag(k)))
         k, camera_R_frame = k @ sign, sign @ camera_R_frame
         return k / k[2, 2], camera_R_frame

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.interpolate import RectBivariateSpline
+import scipy
 
 from pancam_graph.base.errors import CameraError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
@@ -82,7 +82,9 @@ def straightening_map(camera: Camera, straight: Pinhole, range_m: float) -> Floa
     if np.isfinite(coarse).all() and len(columns) > 3 and len(rows) > 3:
         out = np.empty((h, w, 2))
         for axis in (0, 1):
-            out[..., axis] = RectBivariateSpline(rows, columns, coarse[..., axis])(np.arange(h), np.arange(w))
+            out[..., axis] = scipy.interpolate.RectBivariateSpline(rows, columns, coarse[..., axis])(
+                np.arange(h), np.arange(w)
+            )
     else:  # no spline across the edge of the model's domain
         out = _looked_up(camera, straight, np.arange(w), np.arange(h), range_m)
     same = (w, h) == (camera.width_px, camera.height_px) and bool(

@@ -5,7 +5,7 @@ from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import blas, lapack
+import scipy
 
 from pancam_graph.base.errors import SolveError
 from pancam_graph.base.geometry import FloatArray, IntArray
@@ -210,7 +210,7 @@ def _root_of_panel(panel: FloatArray, summed: FloatArray) -> FloatArray:
     if not np.all(np.isfinite(panel)):
         raise SolveError("the linearised system is not finite: a camera or a landmark has left the domain")
     own = panel[:, :n] * scale[:, None] * scale
-    upper, pivot, rank, _ = lapack.dpstrf(own, tol=_RANK_TOLERANCE)
+    upper, pivot, rank, _ = scipy.linalg.lapack.dpstrf(own, tol=_RANK_TOLERANCE)
     pivot -= 1  # LAPACK counts from 1, and takes the first pivot whatever it is
     if np.max(np.diag(own), initial=0.0) <= _RANK_TOLERANCE:
         rank = 0
@@ -220,7 +220,7 @@ def _root_of_panel(panel: FloatArray, summed: FloatArray) -> FloatArray:
         rows[:, pivot] = upper * unit[pivot]
         right = panel[pivot[:rank], n:] * scale[pivot[:rank], None]
         # U'^-1 right, transposed: so that BLAS finds its own order of entries and nothing large is copied.
-        rows[:, n:] = blas.dtrsm(1.0, upper[:, :rank], right.T, side=1, overwrite_b=1).T
+        rows[:, n:] = scipy.linalg.blas.dtrsm(1.0, upper[:, :rank], right.T, side=1, overwrite_b=1).T
     return rows
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from scipy.linalg import null_space
+import scipy
 
 from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.graph._given import Seat
@@ -62,7 +62,7 @@ class NativeCalibrations:
                     keys=tuple(keys),
                     nominal=np.concatenate(nominal),
                     along=np.linalg.pinv(stacked),
-                    across=null_space(stacked.T).T,
+                    across=scipy.linalg.null_space(stacked.T).T,
                     basis=stacked,
                 )
             )

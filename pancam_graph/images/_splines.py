@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from threading import Lock
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from pancam_graph.io import GreyImage
 
@@ -44,8 +44,10 @@ class Splines:
             if kept.coefficients is None:
                 grey = self._images[row]
                 assert grey is not None  # it has features
-                blurred = ndimage.gaussian_filter(grey.astype(np.float32), _BLUR_PX * 2 ** (half_octaves / 2))
+                blurred = scipy.ndimage.gaussian_filter(
+                    grey.astype(np.float32), _BLUR_PX * 2 ** (half_octaves / 2)
+                )
                 kept.coefficients = np.ascontiguousarray(
-                    ndimage.spline_filter(blurred, 3, output=np.float32, mode="mirror")
+                    scipy.ndimage.spline_filter(blurred, 3, output=np.float32, mode="mirror")
                 )
             return kept.coefficients

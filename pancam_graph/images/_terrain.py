@@ -6,7 +6,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, pose_arrays
 from pancam_graph.cameras import Camera
@@ -301,7 +301,7 @@ def _slopes(terrain: Terrain, rows: IntArray, world_R_camera: FloatArray) -> Flo
     prior = (_SLOPE_SHARE * np.linalg.norm(level, axis=1) + w / focal) ** -2.0
 
     count = min(_NEIGHBOURS + 1, len(rows))
-    distance, near = (np.reshape(x, (len(rows), -1)) for x in cKDTree(uv).query(uv, k=count))
+    distance, near = (np.reshape(x, (len(rows), -1)) for x in scipy.spatial.cKDTree(uv).query(uv, k=count))
     delta = uv[near] - uv[:, None]
     design = np.concatenate([np.ones((*near.shape, 1)), delta], axis=2)
     base = np.where(distance < _NEIGHBOUR_PX, 1 / np.hypot(sigma[near], sigma[:, None]) ** 2, 0.0)

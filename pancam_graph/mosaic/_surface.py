@@ -3,9 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage, sparse
-from scipy.sparse.linalg import LinearOperator, cg, splu
-from scipy.spatial import cKDTree
+import scipy
 
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.data import Solution
@@ -125,15 +123,19 @@ def surface_of_stop(solution: Solution, stop: int, origin_m: FloatArray, view: V
     robust = np.ones(len(rows))
     first = None
     for _ in range(_ROUNDS if len(rows) else 0):
-        data = sparse.diags(weight * robust)
+        data = scipy.sparse.diags(weight * robust)
         system = (at.T @ data @ at + smooth).tocsc()
         right = at.T @ (weight * robust * (inverse - base))
         if first is None:
-            first = splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+            first = scipy.sparse.linalg.splu(
+                system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
+            )
             relief = first.solve(right)
         else:  # weights change little: the first factorisation is a good preconditioner
-            solver = LinearOperator(system.shape, matvec=first.solve, dtype=np.float64)
-            relief, _ = cg(system, right, x0=relief, rtol=1e-6, maxiter=_MOST_GRADIENTS, M=solver)
+            solver = scipy.sparse.linalg.LinearOperator(system.shape, matvec=first.solve, dtype=np.float64)
+            relief, _ = scipy.sparse.linalg.cg(
+                system, right, x0=relief, rtol=1e-6, maxiter=_MOST_GRADIENTS, M=solver
+            )
         robust = _robust(weight, inverse - base - at @ relief)
     return Surface(
         origin_m=origin_m, plane=plane, relief=_without_spikes(plane, relief.reshape(_ROWS, _COLUMNS))
@@ -147,7 +149,7 @@ def _supported(ray: FloatArray, inverse: FloatArray, weight: FloatArray) -> Bool
     """
     if len(ray) <= _NEIGHBOURS:
         return np.ones(len(ray), dtype=bool)
-    near = np.asarray(cKDTree(ray).query(ray, k=_NEIGHBOURS + 1)[1])[:, 1:]
+    near = np.asarray(scipy.spatial.cKDTree(ray).query(ray, k=_NEIGHBOURS + 1)[1])[:, 1:]
     apart = np.abs(inverse[near] - inverse[:, None])
     noise = np.sqrt(1 / np.maximum(weight, 1e-12))
     noise = np.hypot(noise[:, None], noise[near])
@@ -165,7 +167,7 @@ def _without_spikes(plane: FloatArray, relief: FloatArray) -> FloatArray:
     base = _plane_inverse_range(plane, ray.reshape(-1, 3)).reshape(relief.shape)
     inverse = np.maximum(base + relief, _LEAST_INVERSE_RANGE)
     padded = np.pad(np.pad(inverse, ((0, 0), (1, 1)), "wrap"), ((1, 1), (0, 0)), "edge")
-    around = ndimage.median_filter(padded, size=3)[1:-1, 1:-1]
+    around = scipy.ndimage.median_filter(padded, size=3)[1:-1, 1:-1]
     spike = (inverse > _SPIKE * around) | (inverse * _SPIKE < around)
     return np.asarray(np.where(spike, around - base, relief))
 
@@ -247,14 +249,14 @@ def _plane_inverse_range(plane: FloatArray, direction: FloatArray) -> FloatArray
     return np.asarray(np.maximum(direction @ plane, 0.0))
 
 
-def _interpolation(direction: FloatArray) -> sparse.csr_array:
+def _interpolation(direction: FloatArray) -> "scipy.sparse.csr_array":
     """Matrix (n, rows * columns) that reads the relief along unit directions (n, 3)."""
     azimuth = np.rad2deg(np.arctan2(direction[:, 1], direction[:, 0])) / _CELL_DEG
     elevation = np.rad2deg(np.arcsin(np.clip(direction[:, 2], -1.0, 1.0))) / _CELL_DEG
     return _bilinear(azimuth, elevation + 90.0 / _CELL_DEG, columns=_COLUMNS, rows=_ROWS)
 
 
-def _bilinear(column: FloatArray, row: FloatArray, *, columns: int, rows: int) -> sparse.csr_array:
+def _bilinear(column: FloatArray, row: FloatArray, *, columns: int, rows: int) -> "scipy.sparse.csr_array":
     """Matrix that interpolates a grid whose columns go round, at (n,) columns and rows."""
     left, low = np.floor(column).astype(np.int64), np.clip(np.floor(row).astype(np.int64), 0, rows - 2)
     right, up = column - left, np.clip(row - low, 0.0, 1.0)
@@ -265,10 +267,10 @@ def _bilinear(column: FloatArray, row: FloatArray, *, columns: int, rows: int) -
             cells.append((low + i) * columns + (left + j) % columns)
             weights.append(across * along)
     at = (np.concatenate(weights), (np.tile(n, 4), np.concatenate(cells)))
-    return sparse.csr_array(at, shape=(len(column), rows * columns))
+    return scipy.sparse.csr_array(at, shape=(len(column), rows * columns))
 
 
-def _smoothness(plane: FloatArray) -> sparse.csr_array:
+def _smoothness(plane: FloatArray) -> "scipy.sparse.csr_array":
     """Matrix of the prior of the relief.
 
     It holds the relief itself near 0, and changes from cell to cell, as shares of the plane's inverse range.
@@ -288,6 +290,6 @@ def _smoothness(plane: FloatArray) -> sparse.csr_array:
         weight = stiff * 0.5 * (scale[a] + scale[b])
         edge = np.arange(len(a))
         ends = (np.concatenate([weight, -weight]), (np.tile(edge, 2), np.concatenate([a, b])))
-        parts.append(sparse.csr_array(ends, shape=(len(a), number.size)))
-    change = sparse.vstack(parts)
-    return sparse.csr_array(change.T @ change + sparse.diags((scale / _FADE_CELLS) ** 2))
+        parts.append(scipy.sparse.csr_array(ends, shape=(len(a), number.size)))
+    change = scipy.sparse.vstack(parts)
+    return scipy.sparse.csr_array(change.T @ change + scipy.sparse.diags((scale / _FADE_CELLS) ** 2))

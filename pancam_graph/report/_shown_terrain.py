@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from pancam_graph.base.geometry import FloatArray, IntArray, pose_arrays
 from pancam_graph.data import Solution
@@ -77,7 +77,7 @@ def shown_terrain(solution: Solution) -> ShownTerrain:
     ground_m = stops_m - [0.0, 0.0, solution.traverse.rig.mast_height_m]
     corners = [stops_m, ground_m]
     if len(rows):
-        distance_m, _ = cKDTree(stops_m).query(points_m)
+        distance_m, _ = scipy.spatial.cKDTree(stops_m).query(points_m)
         limit_m = min(np.quantile(distance_m, 0.95), 3 * np.median(distance_m))
         near = points_m[distance_m <= limit_m]
         corners.append(np.quantile(near, [0.01, 0.99], axis=0))

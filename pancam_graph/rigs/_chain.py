@@ -8,7 +8,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from pancam_graph.base.geometry import (
     FloatArray,
@@ -92,7 +92,9 @@ class Chain:
         turn; then the shift in the world's frame, metres.
         """
         rotation, centre = self.world_T_camera(pan_tilt_rad, cameras.eye)
-        turn = Rotation.from_matrix(np.swapaxes(cameras.rotation, -1, -2) @ rotation).as_rotvec()
+        turn = scipy.spatial.transform.Rotation.from_matrix(
+            np.swapaxes(cameras.rotation, -1, -2) @ rotation
+        ).as_rotvec()
         return np.column_stack([turn, centre - cameras.centre_m])
 
     def misfit_jacobian(

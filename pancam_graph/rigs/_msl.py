@@ -2,7 +2,7 @@
 
 import gtsam
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from pancam_graph.cameras import CAHV, CAHVOR
 from pancam_graph.rigs._eyes import label_eye, mast_rig
@@ -82,7 +82,7 @@ def msl_navcam() -> Rig:
     head_T_document = MSL_MAST.head_T_document()
     document_T_right = head_T_document.inverse() * right.head_T_camera
     left_R, right_R = (
-        Rotation.from_euler("YXZ", angles, degrees=True).as_matrix()
+        scipy.spatial.transform.Rotation.from_euler("YXZ", angles, degrees=True).as_matrix()
         for angles in (_NAVCAM_LEFT_B_DEG, _NAVCAM_RIGHT_B_DEG)
     )
     document_T_left = gtsam.Pose3(

@@ -5,8 +5,7 @@ from typing import Literal
 
 import gtsam
 import numpy as np
-from scipy.ndimage import affine_transform, shift
-from scipy.spatial.transform import Rotation
+import scipy
 
 from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.simulate import _rays
@@ -142,7 +141,7 @@ def _at_nodes(grid: FloatArray, frame: Frame, other: Frame, order: Literal[1, 3]
     """A grid interpolated at the nodes of another, which lies within it."""
     ratio = other[1] / frame[1]
     offset = (other[0] - frame[0])[::-1] / frame[1]
-    out: FloatArray = affine_transform(
+    out: FloatArray = scipy.ndimage.affine_transform(
         grid, np.array([ratio, ratio]), offset, output_shape=other[2], order=order
     )
     return out
@@ -212,10 +211,13 @@ def _shades(grids: list[FloatArray], frames: tuple[Frame, ...], sun: FloatArray)
     around: Frame | None = None
     for grid, frame in reversed(list(zip(grids, frames, strict=True))):
         reached, nodes = np.ptp(grid) / (rise * frame[1]), 1.0
-        shade = shift(grid, -towards, order=1, mode="nearest") - rise * frame[1]
+        shade = scipy.ndimage.shift(grid, -towards, order=1, mode="nearest") - rise * frame[1]
         while nodes < min(reached, max(grid.shape)):
             # The highest of the next 2n nodes: of n, and of n from there.
-            further = shift(shade, -nodes * towards, order=1, mode="nearest") - nodes * rise * frame[1]
+            further = (
+                scipy.ndimage.shift(shade, -nodes * towards, order=1, mode="nearest")
+                - nodes * rise * frame[1]
+            )
             shade, nodes = np.maximum(shade, further), 2 * nodes
         if around is not None:
             shade = np.maximum(shade, _at_nodes(shades[0], around, frame))
@@ -322,7 +324,9 @@ def _with_rocks(
     n = len(size)
     axes = 0.5 * size[:, None] * rng.uniform([0.9, 0.65, 0.45], [1.25, 1.0, 0.85], (n, 3))
     yaw, lean, towards = rng.uniform(0, 2 * np.pi, n), 0.3 * rng.standard_normal(n), rng.uniform(0, np.pi, n)
-    turn = Rotation.from_euler("ZYZ", np.column_stack([yaw + towards, lean, -towards])).as_matrix()
+    turn = scipy.spatial.transform.Rotation.from_euler(
+        "ZYZ", np.column_stack([yaw + towards, lean, -towards])
+    ).as_matrix()
     tall = np.sqrt(np.sum((turn[:, 2] * axes) ** 2, axis=1))
     z = heights(scene, xy) + tall * rng.uniform(-0.25, 0.45, n)
     rocks = np.zeros((n, 17))

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from scipy.special import chdtrc, chdtri, erfcinv
+import scipy
 
 from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.smoother._localise import localise
@@ -21,7 +21,8 @@ _LEAST_SIGMAS = np.repeat([1e-5, 1e-4], 3)
 """Radians and metres: no drive is taken to be known better."""
 _INLIERS = 0.5
 """Share of the observations that must agree on one pose."""
-_INLIER_SIGMA_SQUARED = float(chdtri(2, 1e-5))
+_OUTLIER_CHANCE = 1e-5
+"""Chance of a squared residual in sigmas that is larger than the limit of those that agree."""
 _BRIDGE_SIGMAS = np.repeat([1e-4, 2e-3], 3)
 _ENOUGH = 4000
 """Observations that judge a closure."""
@@ -98,15 +99,18 @@ def judged(
         error = here.localCoordinates(found)
         square = float(error @ np.linalg.solve(known, error))
         own = np.isin(seen.placed.measurements.row, rows)
-        inliers = float(np.mean(located.squares[own] < _INLIER_SIGMA_SQUARED))
-    chance = float(chdtrc(6, square))
+        limit = float(scipy.special.chdtri(2, _OUTLIER_CHANCE))
+        inliers = float(np.mean(located.squares[own] < limit))
+    chance = float(scipy.special.chdtrc(6, square))
     return (
         Closure(
             stop=station.id,
             other=loop.anchor.id,
             observations=len(loop.rows),
             inliers=inliers,
-            sigmas=float(np.sqrt(2) * erfcinv(chance)) if chance > 0 else float(np.sqrt(square)),
+            sigmas=float(np.sqrt(2) * scipy.special.erfcinv(chance))
+            if chance > 0
+            else float(np.sqrt(square)),
             shift_m=float(np.linalg.norm(found.translation() - here.translation())),
             accepted=inliers >= _INLIERS and chance >= options.closure_probability,
         ),

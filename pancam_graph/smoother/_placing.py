@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtri, erfc
+import scipy
 
 from pancam_graph.base.geometry import BoolArray, IntArray
 from pancam_graph.landmarks import (
@@ -189,8 +189,8 @@ def believed(seen: Seen, views: CameraViews, cutoff_sigma: float | None) -> Seen
     square = weight * np.sum(whitened**2, axis=1)
     total, count = np.bincount(m.landmark, square, minlength=n), np.bincount(m.landmark, weight, minlength=n)
     largest = np.maximum.reduceat(square, m.starts)
-    tail = erfc(cutoff_sigma / np.sqrt(2.0))
-    limit = float(chdtri(1, tail))
+    tail = scipy.special.erfc(cutoff_sigma / np.sqrt(2.0))
+    limit = float(scipy.special.chdtri(1, tail))
     suspect = (total >= limit) & ((count <= _FEW_VIEWS) | (largest * _HIDDEN >= limit))
     suspect |= np.bincount(m.landmark, ~in_front | ~seen.accepted, minlength=n) > 0
     suspect &= seen.touched

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import eigh
+import scipy
 
 from pancam_graph.base.errors import SolveError
 from pancam_graph.base.geometry import BoolArray, FloatArray
@@ -87,7 +87,7 @@ def _unseen(problem: Problem, reduced: ReducedSystem, covariance: Covariance) ->
         out += [names[i] for i in np.flatnonzero(np.isinf(prior) & (size > _LOOSER * usual))]
         firm, wide = firm / np.outer(size, size), wide / np.outer(size, size)
         # A correlation of 1 but for rounding is no reason to fail.
-        ratio, functional = eigh(wide, firm + 1e-12 * np.eye(len(size)))
+        ratio, functional = scipy.linalg.eigh(wide, firm + 1e-12 * np.eye(len(size)))
         for k in np.flatnonzero(ratio > _HELD)[::-1]:
             direction = np.abs(firm @ functional[:, k])
             most = np.argsort(-direction)

@@ -3,8 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 from pancam_graph.base.geometry import BoolArray, IntArray
 from pancam_graph.data import Traverse
@@ -22,8 +21,8 @@ def components(n_members: int, member: IntArray, landmark: IntArray) -> tuple[in
     """
     n_landmarks = int(landmark.max()) + 1 if len(landmark) else 0
     n = n_members + n_landmarks
-    links = coo_array((np.ones(len(member)), (member, n_members + landmark)), shape=(n, n))
-    _, label = connected_components(links, directed=False)
+    links = scipy.sparse.coo_array((np.ones(len(member)), (member, n_members + landmark)), shape=(n, n))
+    _, label = scipy.sparse.csgraph.connected_components(links, directed=False)
     names, group = np.unique(label[:n_members], return_inverse=True)
     return len(names), group
 

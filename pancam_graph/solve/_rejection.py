@@ -8,7 +8,7 @@ triangulated again, and so on. A rejected observation that fits again is accepte
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri, erfc
+import scipy
 
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.landmarks import (
@@ -70,8 +70,10 @@ def snoop(
     residual, b, cofactor = np.empty((n, 2)), np.empty((n, 2, 3)), np.empty((n, 2, 2))
     test, freedom, in_front = np.empty(n), np.empty(n, dtype=np.int64), np.empty(n, dtype=bool)
     lost, changed = np.empty(n_landmarks, dtype=bool), np.empty(n_landmarks, dtype=bool)
-    tail = erfc(cutoff_sigma / np.sqrt(2.0))  # share of a Gaussian beyond the cutoff, on both sides
-    limit = np.array([np.inf, chdtri(1, tail), chdtri(2, tail)])
+    tail = scipy.special.erfc(
+        cutoff_sigma / np.sqrt(2.0)
+    )  # share of a Gaussian beyond the cutoff, on both sides
+    limit = np.array([np.inf, scipy.special.chdtri(1, tail), scipy.special.chdtri(2, tail)])
     known, scale = scale, min_scale if scale is None else scale
     which = np.arange(n_landmarks)
     fresh = np.flatnonzero(np.minimum.reduceat(weight, starts) > 0)
@@ -132,6 +134,6 @@ def _revived(accepted: BoolArray, measurements: Measurements) -> BoolArray:
 
 def _robust_scale(test: FloatArray, dof: IntArray) -> float:
     """Noise scale: root of the median of the tests, each divided by its median under noise of scale 1."""
-    expected = np.array([np.nan, chdtri(1, 0.5), chdtri(2, 0.5)])
+    expected = np.array([np.nan, scipy.special.chdtri(1, 0.5), scipy.special.chdtri(2, 0.5)])
     ratio = test[dof > 0] / expected[dof[dof > 0]]
     return float(np.sqrt(np.median(ratio))) if len(ratio) else 0.0

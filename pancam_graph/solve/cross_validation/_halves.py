@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import minimum_spanning_tree
+import scipy
 
 from pancam_graph.base.geometry import BoolArray, IntArray
 from pancam_graph.data import Traverse
@@ -96,14 +95,17 @@ def neighbours(traverse: Traverse, problem: Problem) -> tuple[IntArray, IntArray
     """
     m, kept, n = problem.measurements, problem.kept, len(traverse.frames)
     frame = traverse.image_frame[m.image[kept]]
-    sights = coo_array((np.ones(len(frame)), (frame, m.landmark[kept])), shape=(n, m.n_landmarks)).tocsr()
+    sights = scipy.sparse.coo_array(
+        (np.ones(len(frame)), (frame, m.landmark[kept])), shape=(n, m.n_landmarks)
+    ).tocsr()
     sights.data[:] = 1  # a frame sees a landmark once, with however many eyes
-    shared = coo_array(sights @ sights.T)
+    shared = scipy.sparse.coo_array(sights @ sights.T)
     i, j = shared.coords
     of_one_stop = (traverse.frame_stop[i] == traverse.frame_stop[j]) & (i < j)
     i, j, count = i[of_one_stop], j[of_one_stop], shared.data[of_one_stop]
     narrow = i.astype(np.int32), j.astype(np.int32)  # SciPy before 1.16 refuses wider indices of a graph
-    tree = coo_array(minimum_spanning_tree(coo_array((-count, narrow), shape=(n, n)).tocsr()))
+    weights = scipy.sparse.coo_array((-count, narrow), shape=(n, n)).tocsr()
+    tree = scipy.sparse.coo_array(scipy.sparse.csgraph.minimum_spanning_tree(weights))
     rows, columns = tree.coords
     order = np.lexsort((columns, rows))
     pairs = np.column_stack([rows, columns])[order].astype(np.int64)
