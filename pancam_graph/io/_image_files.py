@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -91,6 +90,8 @@ def _read_with_opencv(path: Path) -> ImageContent:
         channels = image.shape[2]
         if channels >= 3:
             colour = bool(np.any(image[:, :, 1:3] != image[:, :, :1]))
+            import cv2  # noqa: PLC0415  only pictures need OpenCV
+
             image = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_BGR2GRAY)
         else:
             image = np.ascontiguousarray(image[:, :, 0])
@@ -99,6 +100,8 @@ def _read_with_opencv(path: Path) -> ImageContent:
 
 def _decode(data: bytes) -> NDArray[Any] | None:
     """The image, or None for bytes that OpenCV cannot read."""
+    import cv2  # noqa: PLC0415  only pictures need OpenCV
+
     if not data:
         return None
     # OpenCV logs lines about broken files; the sentence of the caller replaces them.

@@ -13,10 +13,6 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
-from pvl.decoder import OmniDecoder
-from pvl.exceptions import LexerError, ParseError, QuantityError
-from pvl.grammar import OmniGrammar
-from pvl.parser import PVLParser
 
 from pancam_graph.base.errors import ImageError, InputError
 from pancam_graph.base.geometry import FloatArray
@@ -319,6 +315,8 @@ def _split_groups(label_file: Path, text: str) -> tuple[str, dict[str, str]]:
 
 def _parsed(where: Path | str, text: str) -> dict[str, Any]:
     """Entries of a text without groups; the first of two entries of one name."""
+    from pvl.exceptions import LexerError, ParseError, QuantityError  # noqa: PLC0415  only labels need PVL
+
     try:
         module = _parser().parse(text + "\nEND\n")
     except (ParseError, LexerError, QuantityError, ValueError, StopIteration) as error:
@@ -334,6 +332,9 @@ def _parser() -> Any:
 
     It leaves dates as text, as trying all formats of dates takes most of the time.
     """
+    from pvl.decoder import OmniDecoder  # noqa: PLC0415  only labels need PVL
+    from pvl.grammar import OmniGrammar  # noqa: PLC0415
+    from pvl.parser import PVLParser  # noqa: PLC0415
 
     def no_date(value: str) -> NoReturn:
         raise ValueError(value)

@@ -4,8 +4,6 @@ import base64
 import gzip
 from functools import lru_cache
 
-from plotly.offline import get_plotlyjs
-
 __all__ = ["HEAD", "UNPACKED", "packed", "packed_plotly"]
 
 HEAD = """<!DOCTYPE html>
@@ -40,4 +38,6 @@ def packed(text: str) -> str:
 @lru_cache(maxsize=1)
 def packed_plotly() -> str:
     """Plotly's script."""
+    from plotly.offline import get_plotlyjs  # noqa: PLC0415  only a page that is written needs Plotly
+
     return packed(get_plotlyjs())

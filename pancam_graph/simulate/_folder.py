@@ -4,7 +4,6 @@ from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from pancam_graph.base.errors import InputError
@@ -44,6 +43,8 @@ def write_rendering(
     The folder appears when all is done, or not at all. `progress` is called with how many images are
     written, and how many there are. Raises InputError unless `folder` is new or empty.
     """
+    import cv2  # noqa: PLC0415  only pictures that are written need OpenCV
+
     folder = Path(folder)
     check_new(folder)
     images = rendering.traverse.images

@@ -140,3 +140,33 @@ def test_help_loads_no_library(words: list[str]) -> None:
     loaded = loaded_by(f"from pancam_graph.cli import main\nmain({words})")
     assert loaded & HEAVY == set()
     assert {m.split(".")[1] for m in loaded if m.startswith("pancam_graph.")} == {"base", "cli"}
+
+
+KERNEL = {"gtsam", "llvmlite", "numba", "numpy", "scipy"}
+"""What the adjustment cannot do without; of SciPy only its top, whose parts load when they are called."""
+
+
+@pytest.mark.parametrize(
+    ("name", "libraries", "rooms"),
+    [
+        (
+            "solve",
+            KERNEL,
+            {"base", "cameras", "data", "elimination", "factors", "graph", "initialise", "landmarks", "rigs"}
+            | {"solve"},
+        ),
+        (
+            "read_traverse",
+            KERNEL | {"pydantic"},
+            {"base", "cameras", "data", "elimination", "io", "landmarks", "rigs"},
+        ),
+    ],
+)
+def test_a_public_name_loads_what_it_needs_and_no_more(
+    name: str, libraries: set[str], rooms: set[str]
+) -> None:
+    loaded = loaded_by(f"from pancam_graph import {name}")
+    assert loaded & HEAVY == libraries
+    assert {m.split(".")[1] for m in loaded if m.startswith("pancam_graph.")} <= rooms
+    parts = {m.split(".")[1] for m in loaded if m.startswith("scipy.")}
+    assert not parts & {"fft", "interpolate", "linalg", "ndimage", "optimize", "sparse", "spatial", "special"}
