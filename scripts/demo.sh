@@ -8,8 +8,8 @@ prepare ""
 traverse=out/demo/traverse
 if [ ! -e "$traverse/traverse.json" ]; then
     echo "simulating two stops of a MER Navcam panorama: telemetry errors, pixel noise, 3 % outliers"
-    .venv/bin/python scripts/simulate_traverse.py "$traverse" --rig mer-navcam --stops 2 --outliers 0.03 --seed 1
+    .venv/bin/pancam-graph simulate "$traverse" --rig mer-navcam --stops 2 --outliers 0.03 --seed 1
 fi
 echo "refining it (the first run on a machine compiles the kernel, once: about 20 seconds more)"
-.venv/bin/python scripts/optimize_traverse.py "$traverse" --out out/demo/result
+.venv/bin/pancam-graph refine "$traverse" --out out/demo/result
 echo "open out/demo/result/report.html in a browser: before beside after"

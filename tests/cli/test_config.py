@@ -1,6 +1,8 @@
 """Files of options: values as of the command line, and one sentence for whatever is wrong with them."""
 
+import re
 import tempfile
+import textwrap
 from argparse import Namespace
 from pathlib import Path
 
@@ -122,6 +124,18 @@ def test_wrong_numbers_are_one_sentence(tmp_path: Path, text: str, says: str) ->
     with pytest.raises(InputError) as raised:
         parsed(tmp_path, text, "OUT", command="simulate")
     assert str(raised.value) == f"{tmp_path / 'options.toml'}: {says}"
+
+
+def test_the_example_of_the_documentation_is_a_file_of_options(tmp_path: Path) -> None:
+    page = Path(__file__).resolve().parents[2] / "docs" / "files.md"
+    if not page.exists():
+        pytest.skip("no docs/files.md: it is part of the repository, not of the installed package")
+    (example,) = re.findall(
+        r"^    progress = .*?(?=\n\n\S)", page.read_text("utf-8"), re.DOTALL | re.MULTILINE
+    )
+    arguments = parsed(tmp_path, textwrap.dedent(example), "F")
+    assert (arguments.progress, arguments.mosaic) == ("json", True)
+    assert arguments.export == ("colmap", "cahvor")
 
 
 def test_no_file_is_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
