@@ -207,8 +207,9 @@ def test_a_fault_in_a_subcommand_is_no_traceback_on_the_terminal(tmp_path: Path)
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_program_after_it_has_cleaned_up(sent: signal.Signals) -> None:
     code = """
-import sys, time
+import signal, sys, time
 from pancam_graph.cli import run
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background would ignore it
 def work():
     try:
         print("ready", flush=True)

@@ -1,0 +1,33 @@
+"""The doors of the rooms: what a room's `__init__.py` offers is its own, by its own name."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import pancam_graph
+
+PACKAGE = Path(pancam_graph.__file__).parent
+DOORS = sorted(d.relative_to(PACKAGE).as_posix() for d in PACKAGE.rglob("__init__.py") if d.parent != PACKAGE)
+
+
+def test_every_room_has_a_door() -> None:
+    rooms = {d.name for d in PACKAGE.iterdir() if d.is_dir() and d.name != "__pycache__"}
+    assert {door.partition("/")[0] for door in DOORS} >= rooms - {"factors"}
+    assert len(DOORS) > 15
+
+
+@pytest.mark.parametrize("door", DOORS)
+def test_a_door_offers_only_its_own_under_the_same_names(door: str) -> None:
+    tree = ast.parse((PACKAGE / door).read_text(encoding="utf-8"))
+    assert ast.get_docstring(tree)
+    room = ".".join(["pancam_graph", *Path(door).parent.parts])
+    offered = []
+    for line in (n for n in tree.body if isinstance(n, ast.ImportFrom)):
+        assert f"{line.module}.".startswith(f"{room}."), f"{door} imports from {line.module}"
+        assert line.level == 0
+        for alias in line.names:
+            assert alias.asname == alias.name, f"{door}: {alias.name} as {alias.asname}"
+            assert not alias.name.startswith("_")
+            offered.append(alias.name)
+    assert len(set(offered)) == len(offered)
