@@ -7,7 +7,7 @@ from argparse import Namespace
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pancam_graph.base.errors import InputError
@@ -176,6 +176,7 @@ def as_toml(value: object) -> str:
     return repr(value)
 
 
+@settings(deadline=None)  # the first that names an export or a rig loads its room
 @given(
     content=st.dictionaries(KEYS, VALUES, max_size=4)
     | st.builds(
@@ -189,6 +190,7 @@ def test_any_tables_are_options_or_one_sentence(content: dict[str, object], comm
     check_any("\n".join(f"{as_toml(k)} = {as_toml(v)}" for k, v in content.items()).encode(), command)
 
 
+@settings(deadline=None)
 @given(content=st.binary(max_size=60) | st.text(max_size=60).map(lambda t: t.encode("utf-8", "replace")))
 def test_any_bytes_are_options_or_one_sentence(content: bytes) -> None:
     check_any(content, "refine")
