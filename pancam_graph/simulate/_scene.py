@@ -329,15 +329,16 @@ def _with_rocks(
     ).as_matrix()
     tall = np.sqrt(np.sum((turn[:, 2] * axes) ** 2, axis=1))
     z = heights(scene, xy) + tall * rng.uniform(-0.25, 0.45, n)
-    rocks = np.zeros((n, 17))
-    rocks[:, :2], rocks[:, 2] = xy, z
-    rocks[:, 3:12] = (turn.transpose(0, 2, 1) / axes[:, :, None]).reshape(n, 9)
-    rocks[:, 12] = z + tall
-    rocks[:, 13] = rng.integers(len(scene.forms), size=n)
+    rocks = np.zeros((n, _rays.ROCK_COLUMNS))
+    rocks[:, [_rays.ROCK_X, _rays.ROCK_Y]], rocks[:, _rays.ROCK_Z] = xy, z
+    to_ball = turn.transpose(0, 2, 1) / axes[:, :, None]
+    rocks[:, _rays.ROCK_TO_BALL : _rays.ROCK_TO_BALL + 9] = to_ball.reshape(n, 9)
+    rocks[:, _rays.ROCK_TOP] = z + tall
+    rocks[:, _rays.ROCK_FORM] = rng.integers(len(scene.forms), size=n)
     bright = rng.random(n) < 0.2
-    rocks[:, 14] = np.where(bright, rng.uniform(0.19, 0.24, n), rng.uniform(0.12, 0.19, n))
-    rocks[:, 15] = axes[:, :2].max(axis=1)
-    rocks[:, 16] = rng.integers(2**20, size=n)
+    rocks[:, _rays.ROCK_ALBEDO] = np.where(bright, rng.uniform(0.19, 0.24, n), rng.uniform(0.12, 0.19, n))
+    rocks[:, _rays.ROCK_RADIUS] = axes[:, :2].max(axis=1)
+    rocks[:, _rays.ROCK_KEY] = rng.integers(2**20, size=n)
     return _sorted_into_cells(scene._replace(rocks=rocks), low, high)
 
 
@@ -345,15 +346,15 @@ def _sorted_into_cells(scene: Scene, low: FloatArray, high: FloatArray) -> Scene
     """Rocks by the cells that they reach into, and by those that they shade."""
     across, deep = (int(c) for c in np.ceil((high - low) / _ROCK_CELL_M))
     rocks, shape = scene.rocks, (across, deep)
-    xy, radius = rocks[:, :2], rocks[:, 15:16]
+    xy, radius = rocks[:, [_rays.ROCK_X, _rays.ROCK_Y]], rocks[:, [_rays.ROCK_RADIUS]]
     cell, rock = _cells_of(xy - radius - low, xy + radius - low, shape)
     order = np.argsort(cell, kind="stable")
     top = np.full((deep, across), -np.inf)
-    np.maximum.at(top.reshape(-1), cell, rocks[rock, 12])
+    np.maximum.at(top.reshape(-1), cell, rocks[rock, _rays.ROCK_TOP])
     padded = np.pad(top, [(0, -n % _rays.BLOCK) for n in top.shape], constant_values=-np.inf)
     blocks = padded.reshape(len(padded) // _rays.BLOCK, _rays.BLOCK, -1, _rays.BLOCK).max(axis=(1, 3))
     # The shadow ends on ground that may lie lower than the rock's own.
-    lower = rocks[:, 12] - heights(scene, xy) + 0.5 * radius[:, 0]
+    lower = rocks[:, _rays.ROCK_TOP] - heights(scene, xy) + 0.5 * radius[:, 0]
     tip = xy - lower[:, None] * scene.sun[:2] / scene.sun[2]
     margin = _rays.DIM_FOOT * radius
     shaded, shading = _cells_of(

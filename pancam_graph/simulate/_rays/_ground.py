@@ -6,7 +6,21 @@ import numpy as np
 
 from pancam_graph.base.compiled import entry, uncounted
 from pancam_graph.base.geometry import FloatArray
-from pancam_graph.simulate._rays._world import CHANNELS, Scene
+from pancam_graph.simulate._rays._world import (
+    ALBEDO,
+    ALONG_X,
+    ALONG_Y,
+    CHANNELS,
+    FIRST,
+    OUTCROP,
+    SHADE,
+    SLOPE_X,
+    SLOPE_Y,
+    STEP,
+    Scene,
+    X,
+    Y,
+)
 
 __all__ = ["NEAREST_M", "height_at", "heights", "level_at", "march", "march_start", "sample"]
 
@@ -20,9 +34,9 @@ def level_at(scene: Scene, x: float, y: float) -> int:
     """The finest grid that has ground around a place; the last one outside all."""
     out = len(scene.height_shape) - 1
     for level in range(len(scene.height_shape) - 1):
-        a = (x - scene.frame_m[level, 0, 0]) / scene.frame_m[level, 0, 2]
-        b = (y - scene.frame_m[level, 0, 1]) / scene.frame_m[level, 0, 2]
-        wide, deep = scene.height_shape[level, 1], scene.height_shape[level, 2]
+        a = (x - scene.frame_m[level, 0, X]) / scene.frame_m[level, 0, STEP]
+        b = (y - scene.frame_m[level, 0, Y]) / scene.frame_m[level, 0, STEP]
+        wide, deep = scene.height_shape[level, ALONG_X], scene.height_shape[level, ALONG_Y]
         if a >= _RIM and b >= _RIM and a < wide - 1 - _RIM and b < deep - 1 - _RIM:
             out = level
             break
@@ -32,12 +46,12 @@ def level_at(scene: Scene, x: float, y: float) -> int:
 @uncounted.inlined
 def height_at(scene: Scene, level: int, x: float, y: float) -> float:
     """Height of a grid at a place; nothing that means anything beside the grid."""
-    a = (x - scene.frame_m[level, 0, 0]) / scene.frame_m[level, 0, 2]
-    b = (y - scene.frame_m[level, 0, 1]) / scene.frame_m[level, 0, 2]
-    wide, deep = scene.height_shape[level, 1], scene.height_shape[level, 2]
+    a = (x - scene.frame_m[level, 0, X]) / scene.frame_m[level, 0, STEP]
+    b = (y - scene.frame_m[level, 0, Y]) / scene.frame_m[level, 0, STEP]
+    wide, deep = scene.height_shape[level, ALONG_X], scene.height_shape[level, ALONG_Y]
     i, j = min(max(int(a), 0), wide - 2), min(max(int(b), 0), deep - 2)
     u, v = a - i, b - j
-    at = scene.height_shape[level, 0] + j * wide + i
+    at = scene.height_shape[level, FIRST] + j * wide + i
     low = scene.height_m[at] + u * (scene.height_m[at + 1] - scene.height_m[at])
     high = scene.height_m[at + wide] + u * (scene.height_m[at + wide + 1] - scene.height_m[at + wide])
     over: float = low + v * (high - low)
@@ -60,7 +74,7 @@ def sample(
 ) -> tuple[float, float, float, float, float]:
     """What the ground carries around a place, over a round footprint: the channels in their order."""
     last = scene.surface_shape.shape[1] - 1
-    wider = foot / scene.frame_m[level, 0, 2]
+    wider = foot / scene.frame_m[level, 0, STEP]
     mip = math.log2(wider) if wider > 1 else 0.0
     first = min(int(mip), last)
     part = mip - first
@@ -71,22 +85,23 @@ def sample(
             share = 1.0
         elif share < 1e-3:
             continue
-        wide, deep = scene.surface_shape[level, m, 1], scene.surface_shape[level, m, 2]
-        a = (x - scene.frame_m[level, m, 0]) / scene.frame_m[level, m, 2]
-        b = (y - scene.frame_m[level, m, 1]) / scene.frame_m[level, m, 2]
+        wide, deep = scene.surface_shape[level, m, ALONG_X], scene.surface_shape[level, m, ALONG_Y]
+        a = (x - scene.frame_m[level, m, X]) / scene.frame_m[level, m, STEP]
+        b = (y - scene.frame_m[level, m, Y]) / scene.frame_m[level, m, STEP]
         a, b = min(max(a, 0.0), wide - 1.001), min(max(b, 0.0), deep - 1.001)
         i, j = int(a), int(b)
         u, v = a - i, b - j
-        at = CHANNELS * (scene.surface_shape[level, m, 0] + j * wide + i)
+        at = CHANNELS * (scene.surface_shape[level, m, FIRST] + j * wide + i)
         up = at + CHANNELS * wide
+        beside, up_beside = at + CHANNELS, up + CHANNELS
         s = scene.surface
         w, e = (1 - u) * (1 - v) * share, u * (1 - v) * share
         f, g = (1 - u) * v * share, u * v * share
-        c0 += w * s[at] + e * s[at + 5] + f * s[up] + g * s[up + 5]
-        c1 += w * s[at + 1] + e * s[at + 6] + f * s[up + 1] + g * s[up + 6]
-        c2 += w * s[at + 2] + e * s[at + 7] + f * s[up + 2] + g * s[up + 7]
-        c3 += w * s[at + 3] + e * s[at + 8] + f * s[up + 3] + g * s[up + 8]
-        c4 += w * s[at + 4] + e * s[at + 9] + f * s[up + 4] + g * s[up + 9]
+        c0 += w * s[at + SLOPE_X] + e * s[beside + SLOPE_X] + f * s[up + SLOPE_X] + g * s[up_beside + SLOPE_X]
+        c1 += w * s[at + SLOPE_Y] + e * s[beside + SLOPE_Y] + f * s[up + SLOPE_Y] + g * s[up_beside + SLOPE_Y]
+        c2 += w * s[at + ALBEDO] + e * s[beside + ALBEDO] + f * s[up + ALBEDO] + g * s[up_beside + ALBEDO]
+        c3 += w * s[at + OUTCROP] + e * s[beside + OUTCROP] + f * s[up + OUTCROP] + g * s[up_beside + OUTCROP]
+        c4 += w * s[at + SHADE] + e * s[beside + SHADE] + f * s[up + SHADE] + g * s[up_beside + SHADE]
         if m == last:
             break
     return c0, c1, c2, c3, c4
@@ -127,11 +142,11 @@ def march(
     for level in range(len(scene.height_shape)):
         if found < math.inf or t == math.inf:
             break
-        x0, y0, step = scene.frame_m[level, 0, 0], scene.frame_m[level, 0, 1], scene.frame_m[level, 0, 2]
+        x0, y0, step = scene.frame_m[level, 0, X], scene.frame_m[level, 0, Y], scene.frame_m[level, 0, STEP]
         start_h, wide, deep = (
-            scene.height_shape[level, 0],
-            scene.height_shape[level, 1],
-            scene.height_shape[level, 2],
+            scene.height_shape[level, FIRST],
+            scene.height_shape[level, ALONG_X],
+            scene.height_shape[level, ALONG_Y],
         )
         rim_x = x0 + step * (wide - 1 - _RIM if to_i else _RIM)
         rim_y = y0 + step * (deep - 1 - _RIM if to_j else _RIM)
@@ -142,9 +157,9 @@ def march(
                 break
             size = step * (1 << squaring)
             start_c, wide_c, deep_c = (
-                scene.ceiling_shape[level, squaring, 0],
-                scene.ceiling_shape[level, squaring, 1],
-                scene.ceiling_shape[level, squaring, 2],
+                scene.ceiling_shape[level, squaring, FIRST],
+                scene.ceiling_shape[level, squaring, ALONG_X],
+                scene.ceiling_shape[level, squaring, ALONG_Y],
             )
             # A little onward, or rounding might hold a ray on a border for ever.
             beyond = t + 1e-9 * (1 + t)

@@ -5,7 +5,19 @@ import math
 from pancam_graph.base.compiled import uncounted
 from pancam_graph.simulate._rays._ground import sample
 from pancam_graph.simulate._rays._noise import hashed, noise, noise_in_space
-from pancam_graph.simulate._rays._world import Scene
+from pancam_graph.simulate._rays._rocks import normal_of_ball, to_ball
+from pancam_graph.simulate._rays._world import (
+    ROCK_ALBEDO,
+    ROCK_FORM,
+    ROCK_KEY,
+    ROCK_RADIUS,
+    ROCK_TOP,
+    ROCK_X,
+    ROCK_Y,
+    ROCK_Z,
+    STEP,
+    Scene,
+)
 
 __all__ = ["of_ground", "of_rock", "of_sky", "of_stone", "reflected", "sunlit"]
 
@@ -68,7 +80,7 @@ def of_ground(
     `here` is a sample of the middle. Detail is averaged along the footprint, not around it: far ground, seen
     at a glance, would be smeared sideways.
     """
-    step = scene.frame_m[level, 0, 2]
+    step = scene.frame_m[level, 0, STEP]
     taps = min(max(int(0.5 * along / max(across, step) + 0.5), 1), _MAX_TAPS)
     foot = max(across, along / taps)
     gx, gy, albedo, outcrop, lit = here
@@ -155,26 +167,18 @@ def of_rock(
     sky: float,
 ) -> float:
     """Radiance of a rock's surface, met through that plane of its form (-1: its ball)."""
-    m = scene.rocks
-    px, py, pz = x - m[rock, 0], y - m[rock, 1], z - m[rock, 2]
+    rocks = scene.rocks
+    px, py, pz = x - rocks[rock, ROCK_X], y - rocks[rock, ROCK_Y], z - rocks[rock, ROCK_Z]
     if face < 0:
-        ux, uy, uz = (
-            m[rock, 3] * px + m[rock, 4] * py + m[rock, 5] * pz,
-            m[rock, 6] * px + m[rock, 7] * py + m[rock, 8] * pz,
-            m[rock, 9] * px + m[rock, 10] * py + m[rock, 11] * pz,
-        )
+        ux, uy, uz = to_ball(rocks, rock, px, py, pz)
     else:
-        form = int(m[rock, 13])
+        form = int(rocks[rock, ROCK_FORM])
         ux, uy, uz = scene.forms[form, face, 0], scene.forms[form, face, 1], scene.forms[form, face, 2]
-    nx, ny, nz = (
-        m[rock, 3] * ux + m[rock, 6] * uy + m[rock, 9] * uz,
-        m[rock, 4] * ux + m[rock, 7] * uy + m[rock, 10] * uz,
-        m[rock, 5] * ux + m[rock, 8] * uy + m[rock, 11] * uz,
-    )
+    nx, ny, nz = normal_of_ball(rocks, rock, ux, uy, uz)
     norm = 1 / math.sqrt(nx * nx + ny * ny + nz * nz)
     nx, ny, nz = nx * norm, ny * norm, nz * norm
-    albedo = m[rock, 14]
-    length, key = 0.7 * m[rock, 15], int(m[rock, 16])
+    albedo = rocks[rock, ROCK_ALBEDO]
+    length, key = 0.7 * rocks[rock, ROCK_RADIUS], int(rocks[rock, ROCK_KEY])
     while length > 2 * pixel_m and length > _FINEST_M:
         weight = min(1.0, length / pixel_m - 2)
         value, gx, gy, gz = noise_in_space(px / length, py / length, pz / length, key)
@@ -184,7 +188,8 @@ def of_rock(
     norm = 1 / math.sqrt(nx * nx + ny * ny + nz * nz)
     nz *= norm
     albedo *= 1 + 0.25 * max(0.0, nz)  # dust settles on top
-    high = (pz + 0.2 * (m[rock, 12] - m[rock, 2])) / (m[rock, 12] - m[rock, 2]) + 0.35
+    rise = rocks[rock, ROCK_TOP] - rocks[rock, ROCK_Z]
+    high = (pz + 0.2 * rise) / rise + 0.35
     return reflected(
         scene,
         nx * norm,

@@ -4,9 +4,21 @@ import math
 
 from pancam_graph.base.compiled import uncounted
 from pancam_graph.base.geometry import FloatArray
-from pancam_graph.simulate._rays._world import Scene
+from pancam_graph.simulate._rays._world import (
+    ROCK_FORM,
+    ROCK_RADIUS,
+    ROCK_TO_BALL,
+    ROCK_TOP,
+    ROCK_X,
+    ROCK_Y,
+    ROCK_Z,
+    STEP,
+    Scene,
+    X,
+    Y,
+)
 
-__all__ = ["BLOCK", "DIM_FOOT", "hit_rocks", "rock_shade", "through_form"]
+__all__ = ["BLOCK", "DIM_FOOT", "hit_rocks", "normal_of_ball", "rock_shade", "through_form", "to_ball"]
 
 BLOCK = 8
 """Cells along each side of a block."""
@@ -51,6 +63,28 @@ def through_form(
     return (enter if enter < leave else math.inf), leave, face
 
 
+@uncounted.inlined
+def to_ball(rocks: FloatArray, n: int, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """A vector from the centre of rock n, or a direction, taken from the world to the frame of the unit ball."""
+    k = ROCK_TO_BALL
+    return (
+        rocks[n, k] * x + rocks[n, k + 1] * y + rocks[n, k + 2] * z,
+        rocks[n, k + 3] * x + rocks[n, k + 4] * y + rocks[n, k + 5] * z,
+        rocks[n, k + 6] * x + rocks[n, k + 7] * y + rocks[n, k + 8] * z,
+    )
+
+
+@uncounted.inlined
+def normal_of_ball(rocks: FloatArray, n: int, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """A normal in the frame of the unit ball of rock n, taken to the world; its length means nothing."""
+    k = ROCK_TO_BALL
+    return (
+        rocks[n, k] * x + rocks[n, k + 3] * y + rocks[n, k + 6] * z,
+        rocks[n, k + 1] * x + rocks[n, k + 4] * y + rocks[n, k + 7] * z,
+        rocks[n, k + 2] * x + rocks[n, k + 5] * y + rocks[n, k + 8] * z,
+    )
+
+
 @uncounted.part
 def _cut(
     rocks: FloatArray,
@@ -64,14 +98,10 @@ def _cut(
     dz: float,
 ) -> tuple[float, int]:
     """Where a ray enters rock n (infinite: nowhere), and through which plane (-1: through the ball)."""
-    px, py, pz = ox - rocks[n, 0], oy - rocks[n, 1], oz - rocks[n, 2]
-    ax = rocks[n, 3] * px + rocks[n, 4] * py + rocks[n, 5] * pz
-    ay = rocks[n, 6] * px + rocks[n, 7] * py + rocks[n, 8] * pz
-    az = rocks[n, 9] * px + rocks[n, 10] * py + rocks[n, 11] * pz
-    bx = rocks[n, 3] * dx + rocks[n, 4] * dy + rocks[n, 5] * dz
-    by = rocks[n, 6] * dx + rocks[n, 7] * dy + rocks[n, 8] * dz
-    bz = rocks[n, 9] * dx + rocks[n, 10] * dy + rocks[n, 11] * dz
-    enter, _, face = through_form(forms, int(rocks[n, 13]), forms.shape[1], ax, ay, az, bx, by, bz)
+    px, py, pz = ox - rocks[n, ROCK_X], oy - rocks[n, ROCK_Y], oz - rocks[n, ROCK_Z]
+    ax, ay, az = to_ball(rocks, n, px, py, pz)
+    bx, by, bz = to_ball(rocks, n, dx, dy, dz)
+    enter, _, face = through_form(forms, int(rocks[n, ROCK_FORM]), forms.shape[1], ax, ay, az, bx, by, bz)
     return (enter if enter > 1e-6 else math.inf), face
 
 
@@ -85,7 +115,7 @@ def hit_rocks(
     best, rock, face = far, -1, -1
     wide, deep = scene.cell_shape
     wide_b, first_b = (wide + BLOCK - 1) // BLOCK, wide * deep
-    x0, y0, cell = scene.cell_frame_m[0], scene.cell_frame_m[1], scene.cell_frame_m[2]
+    x0, y0, cell = scene.cell_frame_m[X], scene.cell_frame_m[Y], scene.cell_frame_m[STEP]
     dx = dx if abs(dx) > 1e-12 else 1e-12
     dy = dy if abs(dy) > 1e-12 else 1e-12
     per_x, per_y = 1 / dx, 1 / dy
@@ -135,8 +165,8 @@ def hit_rocks(
 def rock_shade(scene: Scene, x: float, y: float, z: float, but: int) -> tuple[bool, float]:
     """Whether a rock but that one hides the sun, and the share of the sky's light that rocks leave."""
     wide, deep = scene.cell_shape
-    i = math.floor((x - scene.cell_frame_m[0]) / scene.cell_frame_m[2])
-    j = math.floor((y - scene.cell_frame_m[1]) / scene.cell_frame_m[2])
+    i = math.floor((x - scene.cell_frame_m[X]) / scene.cell_frame_m[STEP])
+    j = math.floor((y - scene.cell_frame_m[Y]) / scene.cell_frame_m[STEP])
     dark, sky = False, 1.0
     if i >= 0 and j >= 0 and i < wide and j < deep:
         sx, sy, sz = scene.sun
@@ -144,10 +174,10 @@ def rock_shade(scene: Scene, x: float, y: float, z: float, but: int) -> tuple[bo
             rock = scene.shaded_rocks[n]
             if rock == but:
                 continue
-            px, py = x - scene.rocks[rock, 0], y - scene.rocks[rock, 1]
-            away = math.sqrt(px * px + py * py) / scene.rocks[rock, 15]
+            px, py = x - scene.rocks[rock, ROCK_X], y - scene.rocks[rock, ROCK_Y]
+            away = math.sqrt(px * px + py * py) / scene.rocks[rock, ROCK_RADIUS]
             if away < DIM_FOOT:
                 sky *= 1 - 0.5 * min(1.0, (DIM_FOOT - away) / 0.9)
-            if not dark and z < scene.rocks[rock, 12]:
+            if not dark and z < scene.rocks[rock, ROCK_TOP]:
                 dark = _cut(scene.rocks, scene.forms, rock, x, y, z, sx, sy, sz)[0] < math.inf
     return dark, sky

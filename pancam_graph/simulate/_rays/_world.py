@@ -16,6 +16,19 @@ SLOPE_X, SLOPE_Y, ALBEDO, OUTCROP, SHADE = range(5)
 up to which other ground keeps the sun away."""
 CHANNELS = 5
 
+FIRST, ALONG_X, ALONG_Y = range(3)
+"""The shape of a grid: where it begins in its array, its nodes along x and along y."""
+X, Y, STEP = range(3)
+"""The frame of a grid: x and y of its first node, and the distance between nodes."""
+
+ROCK_X, ROCK_Y, ROCK_Z = range(3)
+"""Columns of `Scene.rocks`: centre in the world."""
+ROCK_TO_BALL = 3
+"""First of nine columns: rotation and scale, by rows, from the world about the centre to the unit ball."""
+ROCK_TOP, ROCK_FORM, ROCK_ALBEDO, ROCK_RADIUS, ROCK_KEY = range(12, 17)
+"""Height of the top, row in `Scene.forms`, reflectance, radius as seen from above, and which fine detail."""
+ROCK_COLUMNS = 17
+
 
 class Scene(NamedTuple):
     """Everything fixed to the world."""
@@ -27,19 +40,19 @@ class Scene(NamedTuple):
     surface: Grids
     """CHANNELS numbers per node of all mips of all grids."""
     height_shape: IntArray
-    """(levels, 3): where a grid starts in `height_m`, its nodes along x and along y."""
+    """(levels, 3): FIRST, ALONG_X and ALONG_Y of each grid in `height_m`."""
     ceiling_shape: IntArray
     """(levels, squarings, 3): the same for `ceiling_m`."""
     surface_shape: IntArray
     """(levels, mips, 3): the same for `surface`. A mip halves the one before."""
     frame_m: FloatArray
-    """(levels, mips, 3): x and y of a grid's first node, and its step."""
+    """(levels, mips, 3): X, Y and STEP of each grid."""
     steep: float
     """A slope that hardly any ground exceeds."""
     top_m: float
     """Height of the highest ground."""
     rocks: FloatArray
-    """(rocks, 17): centre, world to unit ball (9, by rows), top, form, albedo, radius from above, key."""
+    """(rocks, ROCK_COLUMNS)."""
     forms: FloatArray
     """(forms, planes, 4): unit normal and distance of the planes that cut a ball into a rock's form."""
     cells: IntArray
