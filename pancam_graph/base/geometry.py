@@ -1,4 +1,4 @@
-"""Rotations, poses and the pan-tilt chain, in NumPy for batches and in gtsam.Pose3 for one.
+"""Rotations, poses and the pan-tilt chain: batches as NumPy arrays, single poses as gtsam.Pose3.
 
 Conventions (docs/conventions.md): `a_T_b` takes coordinates in b to coordinates in a; tangents are
 in GTSAM's order, rotation before translation, in the body frame; pan is positive anticlockwise
@@ -50,7 +50,7 @@ HEAD_R_FORWARD_CAMERA: FloatArray = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0],
 """Rotation of a camera (x right, y down, z forward) that looks along the head's x axis."""
 
 Z_DOWN_R_Z_UP: FloatArray = np.diag([1.0, -1.0, -1.0])
-"""Turns the z-down frames of planetary data systems to our z-up ones, and back: its own inverse."""
+"""Rotation from frames with z down (planetary data systems) to ours with z up; its own inverse."""
 
 
 def rx(angle_rad: float) -> FloatArray:
@@ -82,7 +82,7 @@ def skew(v: FloatArray) -> FloatArray:
 def so3_log(rotations: FloatArray) -> FloatArray:
     """Rotation vectors (..., 3) of rotation matrices (..., 3, 3) of less than half a turn.
 
-    Towards half a turn, where the axis changes sign, digits are lost as in the sine of the angle.
+    Near half a turn, where the axis changes sign, the result loses as many digits as the sine of the angle.
     """
     r = rotations
     sine = 0.5 * np.stack(
@@ -128,7 +128,7 @@ def so3_right_jacobian(w: FloatArray) -> FloatArray:
     theta2 = np.sum(w * w, axis=-1)[..., None, None]
     theta = np.sqrt(theta2)
     half = np.sinc(theta / (2 * np.pi))
-    small = theta2 < 1e-4  # where the difference from the sine would lose its digits
+    small = theta2 < 1e-4  # near 0 the formula subtracts nearly equal numbers
     safe = np.where(small, 1.0, theta)
     c = np.where(small, 1 / 6 - theta2 / 120 + theta2**2 / 5040, (safe - np.sin(safe)) / safe**3)
     return np.asarray(np.eye(3) - 0.5 * half * half * k + c * (k @ k))
@@ -165,7 +165,7 @@ def twists_in_parent(a_R_b: FloatArray, a_t_b: FloatArray, twists: FloatArray) -
 def wrap_angle(angle_rad: ArrayLike) -> FloatArray:
     """Angles to [-pi, pi)."""
     wrapped = (np.asarray(angle_rad, dtype=float) + np.pi) % (2 * np.pi) - np.pi
-    # The remainder of an angle a rounding error below -pi is rounded up to the whole turn.
+    # For an angle just below -pi the remainder is rounded up to a whole turn.
     return np.where(wrapped >= np.pi, -np.pi, wrapped)
 
 

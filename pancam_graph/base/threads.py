@@ -1,4 +1,4 @@
-"""Work over all cores: ranges of items for compiled loops, and tasks whose libraries release the lock."""
+"""Work on all cores: ranges for compiled loops, and longer tasks that release the interpreter's lock."""
 
 import os
 from collections import deque
@@ -18,15 +18,15 @@ __all__ = ["blas_on_one_thread", "each", "in_order", "in_parallel", "n_workers"]
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 _AHEAD = 2
-"""Items for each worker that `in_order` hands over before their turn."""
+"""How many items per worker `in_order` begins ahead of the one whose result is next."""
 _VARIABLE = "PANCAM_GRAPH_THREADS"
 
 
 class _Thread(local):
-    """What each thread knows of itself."""
+    """State of its own for each thread."""
 
     is_busy = False
-    """Whether it works on one of several ranges."""
+    """Whether the thread works on one of several ranges."""
 
 
 _THREAD = _Thread()
@@ -50,21 +50,21 @@ def n_workers() -> int:
 def in_parallel(function: Callable[[int, int], None], n: int, *, grain: int) -> None:
     """Call function(begin, end) over consecutive ranges of 0 to n, of about `grain` items each.
 
-    The ranges depend on n and the grain alone, never on the number of threads; each item is in one of them.
-    Where there is one range, or one thread, everything runs in the caller's; so does what one of several
-    ranges calls this for. Raises the exception of the first range that failed, when no range runs any more.
+    Each item is in one range. The ranges depend on n and the grain alone, not on the number of threads. All
+    runs in the caller's thread if there is one range or one thread, or if the caller itself works on one of
+    several ranges. Raises the exception of the first range that failed, after all ranges have ended.
     """
     n_ranges = max(min(n, 1), round(n / grain))
     ranges = [(n * i // n_ranges, n * (i + 1) // n_ranges) for i in range(n_ranges)]
     waiting, failed = iter(enumerate(ranges)), dict[int, Exception]()
 
-    # Threads that wait for threads of the same pool would wait for ever.
+    # If threads of the pool waited for other threads of it, all could wait for ever.
     workers = 1 if n_ranges == 1 or _THREAD.is_busy else n_workers()
 
     def drain() -> None:
         was_busy, _THREAD.is_busy = _THREAD.is_busy, workers > 1 or _THREAD.is_busy
         try:
-            for i, (begin, end) in waiting:  # drawn under the interpreter's lock: each range once
+            for i, (begin, end) in waiting:  # the interpreter's lock gives each range to one thread
                 try:
                     function(begin, end)
                 except Exception as error:
@@ -72,17 +72,17 @@ def in_parallel(function: Callable[[int, int], None], n: int, *, grain: int) -> 
         finally:  # an interrupt passes through
             _THREAD.is_busy = was_busy
 
-    # The caller works too: to wake one thread less is a good part of a small range's time.
+    # The caller works too: waking a thread takes a good part of the time of a small range.
     others = [_pool(workers).submit(drain) for _ in range(min(workers, len(ranges)) - 1)]
     drain()
     for other in others:
-        other.result()  # cheaper than waiting for all at once
+        other.result()  # one by one is cheaper than a wait for all
     if failed:
         raise failed[min(failed)]
 
 
 def each(function: Callable[[_Item], _Result], items: Sequence[_Item]) -> list[_Result]:
-    """function(item) of all items, in their order; each is a range of its own of `in_parallel`."""
+    """The results function(item) in the order of the items, each item as one range of `in_parallel`."""
     made = dict[int, _Result]()
 
     def make(first: int, last: int) -> None:
@@ -97,12 +97,12 @@ def in_order(
     items: Iterable[_Item],
     done: Callable[[int, _Result], None] | None = None,
 ) -> list[_Result]:
-    """function(item) of each item, on as many threads as there are workers; for tasks of a tenth of a second.
+    """The results function(item) in the order of the items; for tasks of a tenth of a second or more.
 
-    `done` is called in the caller's thread with each item's number and result, in their order. BLAS is held
-    to one thread, so that sums have the same order however many there are. The function may call
-    `in_parallel`, and must not call this one. Raises the exception of the first item that failed; on an
-    exception or interrupt, what has not begun is not begun, and what has is waited for.
+    `done` is called in the caller's thread with each item's number and result, in their order. BLAS uses one
+    thread, so that sums have the same order for any number of workers. The function may call `in_parallel`,
+    but not `in_order`. Raises the exception of the first item that failed. After an exception or interrupt no
+    further item begins, and those that have begun are waited for.
     """
     results, workers = list[_Result](), n_workers()
 
@@ -116,8 +116,8 @@ def in_order(
             for item in items:
                 take(function(item))
             return results
-        # Threads of its own: were they those of `in_parallel`, all could wait for ranges that none is left
-        # to do. Few items begin before their turn: an interrupt then loses and waits for little.
+        # These threads are not those of `in_parallel`, for which they may wait. Few items begin ahead of
+        # their turn, so that an interrupt loses little work and waits for little.
         pool, waiting = (
             ThreadPoolExecutor(workers, thread_name_prefix="pancam-graph-task"),
             deque[Future[_Result]](),
@@ -135,10 +135,10 @@ def in_order(
 
 
 def blas_on_one_thread() -> AbstractContextManager[object]:
-    """While it lasts, BLAS leaves the cores to the compiled loops.
+    """A context in which BLAS uses one thread, and leaves the other cores to the compiled loops.
 
-    Matrices here have a few hundred rows. On these, BLAS threads cost more by waiting for each other than
-    they gain, and with both cores in use they took twice the time of one.
+    Matrices here have a few hundred rows. On these, threads of BLAS wait for each other longer than they
+    save: with two cores in use, two took twice the time of one.
     """
     limited: AbstractContextManager[object] = _blas().limit(limits=1, user_api="blas")
     return limited
@@ -151,10 +151,10 @@ def _blas() -> ThreadpoolController:
 
 @cache
 def _pool(workers: int) -> ThreadPoolExecutor:
-    """One for the life of the process: starting threads would cost as much as a small range."""
+    """The pool of `in_parallel`, kept for the life of the process: new threads cost as much as a small range."""
     return ThreadPoolExecutor(workers, thread_name_prefix="pancam-graph")
 
 
 if hasattr(os, "register_at_fork"):
-    # A forked child inherits the pool without its threads, and would wait for them for ever.
+    # A forked child inherits the pool without the threads, and would wait for them for ever.
     os.register_at_fork(after_in_child=_pool.cache_clear)

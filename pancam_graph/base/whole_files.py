@@ -10,7 +10,7 @@ __all__ = ["whole_file", "whole_folder"]
 
 
 def whole_file(path: Path, content: bytes) -> None:
-    """Write a file beside its place and rename it there: a reader sees the old content or the new."""
+    """Write a file under another name and rename it: a reader sees the old content or the new, whole."""
     partial = _sibling(path, "partial")
     try:
         partial.write_bytes(content)
@@ -23,11 +23,11 @@ def whole_file(path: Path, content: bytes) -> None:
 def whole_folder(path: Path, *, keep: str | None = None) -> Iterator[Path]:
     """A new folder beside `path` to write into, renamed to `path` when the block ends.
 
-    What was at `path` is moved aside just before and deleted just after, but for what it has by the name
-    `keep`, which moves into the new folder. If the block raises, or the renaming fails, the new folder is
-    deleted and what was at `path` is there as before. Missing parents are made.
+    What was at `path` is moved aside just before the renaming and deleted just after it, except for its entry
+    of the name `keep`, which moves into the new folder. If the block raises or the renaming fails, the new
+    folder is deleted and `path` is as before. Missing parents are made.
     """
-    path = path.resolve()  # through links: what they lead to is replaced, not the link
+    path = path.resolve()  # a link stays, and what it leads to is replaced
     path.parent.mkdir(parents=True, exist_ok=True)
     partial, older = _sibling(path, "partial"), _sibling(path, "older")
     partial.mkdir()

@@ -1,9 +1,9 @@
 """Landmarks as unit 4-vectors: linear triangulation, refinement with cameras held, redundancy.
 
 A landmark is (X, w) on the sphere S^3 (thesis eq. 4.1, without its surplus scale), relative to an origin
-of its own near the cameras that see it: the point is origin + X / w. Projection is linear in (X, w) but
-for its division, so a ridge on the horizon (w near 0) is an ordinary landmark, and one that starts beyond
-infinity (w below 0) can come back.
+of its own near the cameras that see it: the point is origin + X / w. A pixel is a ratio of linear
+functions of (X, w), so a ridge on the horizon (w near 0) is an ordinary landmark, and a landmark that starts
+beyond infinity (w below 0) can come back.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from pancam_graph.landmarks._losses import SQUARED, Loss
 _GRAIN = 1024
 _RAY_GRAIN = 16384
 SETTLED = 1e-9
-"""A landmark is refined until that promises no more than this share of its cost."""
+"""Refinement of a landmark ends when a step promises to lower its cost by no more than this share."""
 
 __all__ = [
     "SETTLED",
@@ -120,14 +120,15 @@ class Landmarks:
 
     @cached_property
     def length(self) -> FloatArray:
-        """(landmarks,) of X; the distance from the origin is that over w."""
+        """(landmarks,) length of X; the distance from the origin is this divided by w."""
         x = self.vector[:, :3]
         return np.asarray(np.sqrt(np.einsum("ij,ij->i", x, x)))
 
     def points_m(self, furthest_m: FloatArray) -> FloatArray:
-        """World points (landmarks, 3); those further than `furthest_m` (landmarks,) are brought to it.
+        """World points (landmarks, 3), no further from their origins than `furthest_m` (landmarks,).
 
-        A landmark beyond infinity is placed at that distance too; one without a direction at its origin.
+        A landmark at infinity or beyond is placed at that distance. One at its origin, which has no
+        direction, stays there.
         """
         x, w = self.vector[:, :3], self.vector[:, 3]
         depth = np.maximum(w, self.length / furthest_m).clip(1e-300)
@@ -230,35 +231,34 @@ def refine(
     beyond_infinity: bool = False,
     only: IntArray | None = None,
 ) -> Landmarks:
-    """Best landmarks with all cameras held: Levenberg-Marquardt for each on its own.
+    """Landmarks of least cost with all cameras held, each by Levenberg-Marquardt.
 
-    `only` are the rows of those to refine; default: all.
-
-    `weight` (n,) multiplies each observation's cost; 0 leaves it out. A step that would raise a landmark's
-    cost or move it behind a camera is not taken; directions that its rays leave free are not moved along.
-    Landmarks whose rays diverge end at infinity, or beyond it where that is allowed.
+    `only` are the rows of the landmarks to refine; default: all. `weight` (n,) multiplies each observation's
+    cost; 0 leaves it out. A step that would raise a landmark's cost or move it behind a camera is not taken.
+    A landmark does not move along directions that its rays leave free. Landmarks whose rays diverge end at
+    infinity, or beyond it with `beyond_infinity`.
     """
     seen = seen_by(measurements, views)
     start, origin = _arrays(landmarks, measurements)
-    own, vector = as_floats(weight, (len(measurements.image),)), start.copy()
+    weights, vector = as_floats(weight, (len(measurements.image),)), start.copy()
     which = np.arange(len(vector)) if only is None else only
     over_landmarks(
-        kernel.refine, which, seen, origin, own, loss.kind, loss.width, beyond_infinity, SETTLED, vector
+        kernel.refine, which, seen, origin, weights, loss.kind, loss.width, beyond_infinity, SETTLED, vector
     )
     return replace(landmarks, vector=vector)
 
 
 def residual_cofactor(b: FloatArray, measurements: Measurements, weight: FloatArray) -> FloatArray:
-    """Covariance (n, 2, 2) of whitened residuals, cameras taken as known: what noise alone makes of them.
+    """Covariance (n, 2, 2) that noise alone gives to whitened residuals, cameras taken as known.
 
-    For observations that take part (weight above 0) it is I - B V^-1 B', since the landmark follows them;
-    for the others I + B V^-1 B'. `b` (n, 2, 3) are `evaluate`'s derivatives. Source: Baarda, A testing
-    procedure for use in geodetic networks, 1968.
+    For an observation that takes part (weight above 0) it is I - B V^-1 B', since the landmark follows it;
+    for one that does not it is I + B V^-1 B'. `b` (n, 2, 3) are `evaluate`'s derivatives. Source: Baarda, A
+    testing procedure for use in geodetic networks, 1968.
     """
     n = len(measurements.image)
-    derivatives, own, out = as_floats(b, (n, 2, 3)), as_floats(weight, (n,)), np.empty((n, 2, 2))
+    derivatives, weights, out = as_floats(b, (n, 2, 3)), as_floats(weight, (n,)), np.empty((n, 2, 2))
     which = np.arange(measurements.n_landmarks)
-    over_landmarks(kernel.cofactors, which, measurements.begin, derivatives, own, out)
+    over_landmarks(kernel.cofactors, which, measurements.begin, derivatives, weights, out)
     return out
 
 
@@ -267,8 +267,8 @@ def point_sigma_m(
 ) -> FloatArray:
     """Standard deviation (landmarks,) of world points (landmarks, 3) in their worst direction, cameras held.
 
-    That direction is the line of sight but for points between their cameras. Infinite for landmarks that
-    fewer than two accepted observations see.
+    Except for points between their cameras, that direction is the line of sight. Infinite for landmarks with
+    fewer than two accepted observations.
     """
     seen, n = seen_by(measurements, views), measurements.n_landmarks
     points, weight = as_floats(points_m, (n, 3)), as_floats(accepted, (len(measurements.image),))
@@ -291,7 +291,7 @@ def over_landmarks(
 def as_floats(array: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
     """The array as contiguous float64; raises ValueError where its shape is another.
 
-    Writable, so that every caller's arrays are of one type and a loop is compiled once.
+    The array is writable, for Numba would compile a loop again for arrays that are not.
     """
     floats: FloatArray = np.require(array, np.float64, ["C", "W"])
     if floats.shape != shape:
@@ -316,7 +316,7 @@ def seen_by(measurements: Measurements, views: CameraViews) -> kernel.Seen:
 
 
 def _arrays(landmarks: Landmarks, measurements: Measurements) -> tuple[FloatArray, FloatArray]:
-    """Vectors (landmarks, 4) and origins (landmarks, 3), as many as measurements tell of."""
+    """Vectors (landmarks, 4) and origins (landmarks, 3), one for each landmark of the measurements."""
     n = measurements.n_landmarks
     return as_floats(landmarks.vector, (n, 4)), as_floats(landmarks.origin_m, (n, 3))
 

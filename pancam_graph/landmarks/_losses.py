@@ -20,7 +20,7 @@ __all__ = ["SQUARED", "Loss", "LossName", "loss_of"]
 LossName = Literal["none", "huber", "cauchy"]
 
 _WIDTH: dict[LossName, float] = {
-    # 95 % efficient for Gaussian noise: Huber 1981; Holland and Welsch 1977.
+    # The estimate keeps 95 % efficiency for Gaussian noise: Huber 1981; Holland and Welsch 1977.
     "none": np.inf,
     "huber": 1.345,
     "cauchy": 2.3849,
@@ -36,7 +36,7 @@ class Loss:
 
     name: LossName
     width: float
-    """Where it bends away from the square, in sigmas."""
+    """Length of a residual, in sigmas, from which on the loss grows more slowly than the square."""
 
     @property
     def kind(self) -> int:
@@ -48,7 +48,7 @@ class Loss:
         return self._each(kernel.loss_costs, residual)
 
     def weight(self, residual: FloatArray) -> FloatArray:
-        """Weights (n,) that make the square's gradient that of the loss."""
+        """Weights (n,) of whitened residuals (n, m), which give least squares the gradient of the loss."""
         return self._each(kernel.loss_weights, residual)
 
     def _each(self, loop: Callable[..., None], residual: FloatArray) -> FloatArray:

@@ -1,4 +1,11 @@
-"""Linearisation of observations and elimination of landmarks."""
+"""Linearisation of observations, and elimination of landmarks from the normal equations.
+
+Small vectors are tuples of numbers, never views of arrays: to make and drop a view costs as much as the
+arithmetic on it. Functions on tuples are copied into the loop that calls them.
+
+Letters are those of the formulas at `eliminate_poses`: b is the derivative of an observation's whitened
+residual r by the tangents of its landmark, e that by the ray from the base of its unit, in the base's frame.
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
@@ -17,7 +24,7 @@ from pancam_graph.landmarks.kernel._tiles import subtract_row, tile_entry
 __all__ = ["WEAK_PRIOR", "eliminate_calibrations", "eliminate_poses", "must_compile"]
 
 WEAK_PRIOR = 1e-12
-"""Weak prior of a landmark: its information, over the trace of what the landmark's observations know."""
+"""Information of a landmark's weak prior, as a share of the trace of its information V."""
 
 
 @part
@@ -30,7 +37,11 @@ def _add_units(
     tiles: FloatArray,
     s: FloatArray,
 ) -> None:
-    """Add the units' own information, taken through their chains, to the upper triangle of S and to s."""
+    """Add the information about each unit's base, through its chain, to the upper triangle of S and to s.
+
+    `unit_H` and `unit_s` are the information and the gradient by the base's twist and calibration, row by row
+    of `unit_of`, which gives the unit of each row; -1: none.
+    """
     n_pairs = len(s) // 2
     rows, widest = bearings.chain.shape[1], bearings.chain.shape[2]
     half = np.empty((rows, widest))
@@ -77,7 +88,10 @@ def _by_calibration(
     root: float,
     jac: FloatArray,
 ) -> None:
-    """An observation's Jacobian (2, 5) by fx, fy, skew, cx and cy (thesis eq. 4.2), at the pixel u, v."""
+    """Derivative (2, 5) of a whitened residual by fx, fy, skew, cx and cy (thesis eq. 4.2), at pixel (u, v).
+
+    `root` is the square root of the robust weight.
+    """
     y = (v - calibration[image, 1, 2]) / calibration[image, 1, 1]
     x = (u - calibration[image, 0, 2] - calibration[image, 0, 1] * y) / calibration[image, 0, 0]
     for m in range(2):
@@ -89,7 +103,7 @@ def _by_calibration(
 def _add_six(
     to: FloatArray, at: int, a0: float, a1: float, a2: float, a3: float, a4: float, a5: float
 ) -> None:
-    """Add six numbers to neighbours of an array."""
+    """Add six numbers to six entries of an array, from `at` on."""
     b0, b1, b2, b3, b4, b5 = to[at], to[at + 1], to[at + 2], to[at + 3], to[at + 4], to[at + 5]
     to[at], to[at + 1], to[at + 2] = b0 + a0, b1 + a1, b2 + a2
     to[at + 3], to[at + 4], to[at + 5] = b3 + a3, b4 + a4, b5 + a5
@@ -127,7 +141,7 @@ def _plus_product(total: _Three, a: _Three, b: _Three, r0: float, r1: float) -> 
 
 @inlined
 def _plus_outer(row: _Three, p: float, a: _Three, q: float, b: _Three) -> _Three:
-    """A row of a matrix plus p a + q b."""
+    """A vector plus p a + q b."""
     return (
         row[0] + p * a[0] + q * b[0],
         row[1] + p * a[1] + q * b[1],
@@ -178,7 +192,10 @@ def _add_calibration(
     unit_H: FloatArray,
     unit_s: FloatArray,
 ) -> None:
-    """Add what observation i tells about its calibration to the sums of its occurrence and of its unit."""
+    """Add what observation i tells about its calibration to the sums of its occurrence and of its unit.
+
+    `derivatives` are b and e, two rows each.
+    """
     b0, b1, e0, e1 = derivatives
     jac, by_landmark, by_base = sums.jacobian, sums.by_landmark, sums.by_base
     _by_calibration(bearings.calibration, sights.image[i], u, v, sights.whitening, i, root, jac)
@@ -199,10 +216,10 @@ def _add_calibration(
 def _add_twist(
     unit_H: FloatArray, unit_s: FloatArray, row: int, w: float, x: _Three, m: _Symmetric, k: _Three
 ) -> None:
-    """Add an occurrence's information about its base's twist, whose ray is x, to its unit's.
+    """Add what one occurrence tells about the twist of its base to the information about that base.
 
-    m and k are the sums of e'e and e'r, e being the residual's derivative by the ray in the base's frame. A
-    twist moves the ray by [x]_x times its rotation and by -w times its translation.
+    x is the ray from the base to the landmark, in the base's frame; m and k are the occurrence's sums of e'e
+    and e'r. A twist moves the ray by [x]_x times its rotation and by -w times its translation.
     """
     m00, m01, m02, m11, m12, m22 = m
     q0, q1, q2 = _cross((m00, m01, m02), x), _cross((m01, m11, m12), x), _cross((m02, m12, m22), x)
@@ -233,7 +250,7 @@ def _add_twist(
 
 @inlined
 def _add_twist_by_calibration(unit_H: FloatArray, row: int, w: float, x: _Three, by_base: FloatArray) -> None:
-    """Add the products of an occurrence's twist with its calibration to its unit's information."""
+    """Add the products of twist and calibration of one occurrence to the information about its base."""
     for p in range(5):
         f = by_base[0, p], by_base[1, p], by_base[2, p]
         turning = _cross(f, x)
@@ -288,9 +305,10 @@ def _add_to_arms(
 
 @inlined
 def _cholesky(v: _Symmetric) -> tuple[_Symmetric, bool]:
-    """Lower Cholesky factor of V (its entries 00, 10, 11, 20, 21, 22), and whether it needed the weak prior.
+    """Lower Cholesky factor of V (its entries 00, 10, 11, 20, 21, 22), and whether V needed the weak prior.
 
-    The weak prior goes to those pivots that need it: on all landmarks together it would hold the world.
+    Only pivots that are next to zero get the weak prior: on all pivots of all landmarks it would add up to a
+    prior that holds the world in place.
     """
     v00, v10, v20, v11, v21, v22 = v
     trace = v00 + v11 + v22
@@ -309,9 +327,10 @@ def _cholesky(v: _Symmetric) -> tuple[_Symmetric, bool]:
 def _eliminate(
     sights: Sights, reduced: Reduced, j: int, v: _Symmetric, g: _Three, tiles: FloatArray, s: FloatArray
 ) -> None:
-    """Eliminate landmark j with V and g: divide its arms and g by its factor, subtract their products.
+    """Eliminate landmark j, whose information is V and whose gradient is g.
 
-    Below the diagonal of a tile on it, W'W leaves numbers that mean nothing.
+    With V = L L', its arms E' become W = L^-1 E' and g becomes L^-1 g; W'W and W' L^-1 g are subtracted from
+    S and s. Entries of S below the diagonal have no meaning.
     """
     (l00, l10, l11, l20, l21, l22), reduced.undetermined[j] = _cholesky(v)
     arms, pair, n_pairs, factor = reduced.arms, sights.pair, len(s) // 2, reduced.factor
@@ -450,13 +469,15 @@ def _eliminating(rows: int) -> Callable[..., None]:
 
 
 eliminate_poses = _eliminating(6)
-"""Linearise and eliminate landmarks begin to end; adds to S (upper triangle, in tiles) and s of their block.
+"""Linearise the observations of landmarks begin to end, eliminate these, and add what is left to S and s.
+
+S (upper triangle, in tiles) and s are those of the block of the landmarks.
 
 Exact Schur complement of the whitened, robustly weighted system: S = A'A - sum E V^-1 E' and
 s = A'r - sum E V^-1 g with E = A'B, V = B'B, g = B'r for the cameras' Jacobian A and each landmark's B.
 V gets the weak prior where it needs one, and no damping."""
 eliminate_calibrations = _eliminating(11)
-"""The same for chains with calibrations."""
+"""`eliminate_poses` for chains with calibrations."""
 
 
 def must_compile() -> bool:

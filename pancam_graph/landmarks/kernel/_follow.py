@@ -12,7 +12,7 @@ from pancam_graph.landmarks.kernel._sphere import retracted, tangents
 __all__ = ["SURPRISE", "SURPRISE_COST", "follow", "landmark_costs", "point_covariances"]
 
 SURPRISE, SURPRISE_COST = 2.0, 10.0
-"""A step is shortened for a landmark whose cost more than doubles by more than this."""
+"""A landmark takes a shorter step if its cost would rise above SURPRISE times the old + SURPRISE_COST."""
 
 
 @entry
@@ -30,11 +30,12 @@ def follow(
     moved: FloatArray,
     cost: FloatArray,
 ) -> None:
-    """Landmarks begin to end follow the step dx (columns of their block,) of the cameras; their true costs.
+    """Move landmarks begin to end along with a step dx (columns of their block,) of the cameras.
 
-    `bearings` are the cameras after the step. The step dp = -V^-1 (g + E' dx) is the landmark's part of the
-    joint step. Where it ends behind a camera or costs far more than before, a shorter one that costs least is
-    taken, or none: a landmark that its linear prediction leads astray does not hold back all others.
+    Writes the landmarks to `moved` (landmarks, 4) and their true costs to `cost` (landmarks,). `bearings` are
+    the cameras after the step. A landmark's part of the joint step is dp = -V^-1 (g + E' dx). Where that ends
+    behind a camera or costs far more than before, the cheapest of a few shorter steps is taken, or none: a
+    landmark whose linear prediction fails does not hold back all others.
     """
     arms, factor, gamma = reduced.arms, reduced.factor, reduced.gamma
     for j in range(begin, end):
@@ -54,11 +55,11 @@ def follow(
         moved[j, 0], moved[j, 1], moved[j, 2], moved[j, 3] = a0, a1, a2, a3
         for share in (1.0, 0.5, 0.25, 0.0625, 0.0):
             x0, x1, x2, w = retracted(t, a0, a1, a2, a3, share * s0, share * s1, share * s2)
-            found = _cost_at(sights, bearings, x0, x1, x2, w, origin_m, kind, width, j)
-            if found < cost[j]:
-                cost[j] = found
+            trial_cost = _cost_at(sights, bearings, x0, x1, x2, w, origin_m, kind, width, j)
+            if trial_cost < cost[j]:
+                cost[j] = trial_cost
                 moved[j, 0], moved[j, 1], moved[j, 2], moved[j, 3] = x0, x1, x2, w
-            if found <= limit:
+            if trial_cost <= limit:
                 break
 
 
@@ -120,9 +121,10 @@ def point_covariances(
     end: int,
     covariance_m2: FloatArray,
 ) -> None:
-    """Covariances (landmarks, 3, 3) of points X / w, begin to end, given that of their block's variables.
+    """Covariances (landmarks, 3, 3) of the points X / w of landmarks begin to end.
 
-    L^-T (I + W C W') L^-1 in the tangent space, with W the `arms`, taken through the derivative of X / w.
+    `joint` is the covariance C of the variables of their block. In the tangent space a landmark's covariance
+    is L^-T (I + W C W') L^-1, W being its `arms`; the derivative of X / w takes it to the point.
     """
     arms, pair = reduced.arms, sights.pair
     tangent, half, point = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
@@ -145,7 +147,7 @@ def point_covariances(
             for a in range(3):
                 point[k, a] = t[3 * k + a] / w - far * t[9 + a]
         f = reduced.factor[j]
-        for k in range(3):  # rows of point L^-T
+        for k in range(3):  # rows of the point's derivative times L^-T
             half[k, 0] = point[k, 0] / f[0]
             half[k, 1] = (point[k, 1] - f[1] * half[k, 0]) / f[2]
             half[k, 2] = (point[k, 2] - f[3] * half[k, 0] - f[4] * half[k, 1]) / f[5]

@@ -1,4 +1,4 @@
-"""Robust losses of whitened residuals, by number."""
+"""Robust losses of whitened residuals, which compiled code tells by numbers."""
 
 import math
 
@@ -8,16 +8,18 @@ from pancam_graph.base.geometry import FloatArray
 __all__ = ["BEHIND_COST", "CAUCHY", "HUBER", "NONE", "loss_cost", "loss_costs", "loss_weight", "loss_weights"]
 
 NONE, HUBER, CAUCHY = 0, 1, 2
-"""Kinds of losses."""
+"""The numbers of the losses."""
 
 BEHIND_COST = 0.5 * 1000.0**2
-"""What an observation of a landmark behind its camera costs: as much as one that is 1000 sigma off. It pulls
-nowhere, so that one bad match holds back nobody; the solver sets aside and counts what ends there."""
+"""Cost of an observation whose landmark is behind its camera: that of a residual of 1000 sigma.
+
+Its gradient is taken as zero, so that one bad match does not hold back all cameras. The solver sets aside and
+counts observations that end like this."""
 
 
 @part
 def loss_cost(kind: int, width: float, squared: float) -> float:
-    """Loss rho of a whitened residual's squared length; rho is half of it near zero."""
+    """Loss of a whitened residual by its squared length; about half of that near zero."""
     if kind == HUBER and squared > width * width:
         return width * (math.sqrt(squared) - 0.5 * width)
     if kind == CAUCHY:
@@ -27,7 +29,7 @@ def loss_cost(kind: int, width: float, squared: float) -> float:
 
 @part
 def loss_weight(kind: int, width: float, squared: float) -> float:
-    """The weight that makes the square's gradient that of the loss."""
+    """Weight of a residual by its squared length; it gives least squares the gradient of the loss."""
     if kind == HUBER and squared > width * width:
         return width / math.sqrt(squared)
     if kind == CAUCHY:
@@ -37,7 +39,7 @@ def loss_weight(kind: int, width: float, squared: float) -> float:
 
 @entry
 def loss_costs(kind: int, width: float, squared: FloatArray, first: int, last: int, out: FloatArray) -> None:
-    """Costs (n,) of squared lengths (n,)."""
+    """Losses of squared lengths (n,), rows first to last, to `out` (n,)."""
     for i in range(first, last):
         out[i] = loss_cost(kind, width, squared[i])
 
@@ -46,6 +48,6 @@ def loss_costs(kind: int, width: float, squared: FloatArray, first: int, last: i
 def loss_weights(
     kind: int, width: float, squared: FloatArray, first: int, last: int, out: FloatArray
 ) -> None:
-    """Weights (n,) of squared lengths (n,)."""
+    """Weights of squared lengths (n,), rows first to last, to `out` (n,)."""
     for i in range(first, last):
         out[i] = loss_weight(kind, width, squared[i])

@@ -48,10 +48,11 @@ def observe_ray(
     whitening: FloatArray,
     i: int,
 ) -> tuple[bool, float, float, float, float, float]:
-    """Observation i of an image along a world ray y: in front, whitened residual, u, v and 1 / depth.
+    """Project a ray y of the world into an image, and compare the pixel with observation i.
 
-    The ray is X - w offset, the camera's centre being at `offset` from the landmark's origin. What is behind
-    the camera gives the residual of the mirrored point, which means nothing.
+    Returns whether the ray points to the front of the camera, the whitened residual (two numbers), the pixel
+    u, v and 1 / depth. For a landmark (X, w) the ray is X - w c, c being the camera's centre relative to the
+    landmark's origin. The residual of a ray to the back is that of the mirrored point and means nothing.
     """
     p2 = to_pixel[image, 2, 0] * y0 + to_pixel[image, 2, 1] * y1 + to_pixel[image, 2, 2] * y2
     per_depth = 1.0 / (p2 if abs(p2) > 1e-12 else 1e-12)
@@ -67,7 +68,10 @@ def observe_ray(
 def residual_by_ray(
     to_pixel: FloatArray, image: int, u: float, v: float, scale: float, whitening: FloatArray, i: int
 ) -> tuple[float, float, float, float, float, float]:
-    """Derivative (2, 3), by rows, of a whitened residual by the world ray, times scale over 1 / depth."""
+    """Derivative (2, 3), by rows, of a whitened residual by the ray that `observe_ray` projects to u, v.
+
+    `scale` is 1 / depth, times a factor for the whole derivative.
+    """
     a00, a01 = scale * whitening[i, 0, 0], scale * whitening[i, 0, 1]
     a10, a11 = scale * whitening[i, 1, 0], scale * whitening[i, 1, 1]
     gu0 = to_pixel[image, 0, 0] - u * to_pixel[image, 2, 0]
@@ -95,7 +99,11 @@ def observe(
     O1: float,
     O2: float,
 ) -> tuple[bool, float, float, float, float, float, float, float, float]:
-    """Observation i of a landmark (x, w) about O: in front, residual, derivative (2, 3) by the tangents."""
+    """Compare the landmark (x, w) of origin O with observation i of it; t are its tangents.
+
+    Returns whether it is in front of the camera, the whitened residual, and its derivative (2, 3) by the
+    tangents.
+    """
     image = seen.image[i]
     c0, c1, c2 = seen.centre_m[image, 0] - O0, seen.centre_m[image, 1] - O1, seen.centre_m[image, 2] - O2
     in_front, r0, r1, u, v, per_depth = observe_ray(
@@ -117,7 +125,10 @@ def ray_directions(
     last: int,
     direction: FloatArray,
 ) -> None:
-    """Unit directions (n, 3) in the world of pixels (n, 2); calibrations (images, 3, 3) upper-triangular."""
+    """Unit directions in the world of pixels (n, 2), rows first to last, to `direction` (n, 3).
+
+    Calibrations (images, 3, 3) are upper-triangular.
+    """
     for i in range(first, last):
         K, R = calibration[image[i]], world_R_camera[image[i]]
         z = 1.0 / K[2, 2]
@@ -138,7 +149,11 @@ def evaluate(
     b: FloatArray,
     in_front: BoolArray,
 ) -> None:
-    """Whitened residuals (n, 2), their derivatives (n, 2, 3) by the tangents, and what is in front (n,)."""
+    """Compare the landmarks `which` with their observations.
+
+    Writes whitened residuals (n, 2), their derivatives `b` (n, 2, 3) by the tangents, and which landmarks are
+    in front of the camera (n,).
+    """
     for j in which:
         x0, x1, x2, w = vector[j, 0], vector[j, 1], vector[j, 2], vector[j, 3]
         t, O0, O1, O2 = tangents(x0, x1, x2, w), origin_m[j, 0], origin_m[j, 1], origin_m[j, 2]
@@ -159,7 +174,7 @@ def residuals(
     residual: FloatArray,
     in_front: BoolArray,
 ) -> None:
-    """`evaluate` without derivatives."""
+    """Do as `evaluate` does, without derivatives."""
     for j in which:
         x0, x1, x2, w = vector[j, 0], vector[j, 1], vector[j, 2], vector[j, 3]
         for i in range(seen.begin[j], seen.begin[j + 1]):
@@ -174,7 +189,7 @@ def residuals(
 
 @entry
 def free_derivatives(which: IntArray, begin: IntArray, vector: FloatArray, b: FloatArray) -> None:
-    """Take from derivatives (n, 2, 3) their part along w where a landmark is held at infinity."""
+    """Remove the part along w from the derivatives (n, 2, 3) of landmarks that are held at infinity."""
     for j in which:
         if vector[j, 3] == 0:
             t = tangents(vector[j, 0], vector[j, 1], vector[j, 2], vector[j, 3])

@@ -1,4 +1,4 @@
-"""Observations in the order of elimination, cameras at a point of linearisation, landmarks eliminated."""
+"""The arrays of the elimination: observations in its order, cameras, and what it leaves of landmarks."""
 
 from typing import NamedTuple
 
@@ -11,28 +11,31 @@ __all__ = ["Bearings", "Reduced", "Sights", "arrange"]
 
 
 class Sights(NamedTuple):
-    """Observations of landmarks in the order of elimination; structure that no step changes.
+    """Observations of landmarks in the order of elimination. A step changes nothing of it.
 
-    An *occurrence* is one unit (images moved alike by all variables) that sees a landmark. Columns of a block
-    come in *pairs*, each segment beginning with one. A landmark touches some pairs, ascending; `place` says
-    which of them each segment of an occurrence's chain begins with.
+    A *unit* is a set of images that all variables move alike. An *occurrence* is one unit that sees one
+    landmark. A unit's *chain* consists of *segments*, one for each variable that moves it. Landmarks are
+    eliminated in *blocks*; the columns of a block's variables are numbered in *pairs*, and each segment
+    begins with a new pair. For each landmark, `pair` lists the pairs of all variables that move its units,
+    ascending, and `place` says where in that list each segment of an occurrence begins.
     """
 
     image: IntArray
-    """(n,)"""
+    """(n,) image of each observation"""
     uv_px: FloatArray
-    """(n, 2)"""
+    """(n, 2) pixels of the pinhole"""
     whitening: FloatArray
-    """(n, 2, 2)"""
+    """(n, 2, 2) takes residuals in pixels to unit covariance"""
     occurrence_begin: IntArray
-    """(occurrences + 1,) first observation of each"""
+    """(occurrences + 1,) first observation of each, and n"""
     occurrence_unit: IntArray
-    """(occurrences,)"""
+    """(occurrences,) the unit of each"""
     occurrence_row: IntArray
-    """(occurrences,) the unit's row among those of its block"""
+    """(occurrences,) row of that unit among the units that see a landmark of the block"""
     place_begin: IntArray
     """(occurrences + 1,) first entry in `place` of each"""
     place: IntArray
+    """(places,) by occurrence and segment: where in its landmark's list of pairs the segment begins"""
     landmark_begin: IntArray
     """(landmarks + 1,) first occurrence of each"""
     pair_begin: IntArray
@@ -42,42 +45,45 @@ class Sights(NamedTuple):
 
 
 class Bearings(NamedTuple):
-    """Cameras at one linearisation point, and how they move with the variables."""
+    """Cameras at a point of linearisation, and how the variables move them."""
 
     to_pixel: FloatArray
     """(images, 3, 3) world directions to homogeneous pixels"""
     centre_m: FloatArray
-    """(images, 3)"""
+    """(images, 3) in the world"""
     calibration: FloatArray
     """(images, 3, 3) K"""
     unit_R: FloatArray
-    """(units, 3, 3) world_R_base: the body whose twist moves the unit's images"""
+    """(units, 3, 3) world_R_base; a unit's base is the body whose twist moves its images"""
     unit_t: FloatArray
-    """(units, 3)"""
+    """(units, 3) origin of the base in the world, metres"""
     segment_begin: IntArray
-    """(units + 1,)"""
+    """(units + 1,) first segment of each unit's chain"""
     segment_width: IntArray
-    """(segments,) columns of each"""
+    """(segments,) number of columns of each"""
     plain: BoolArray
-    """(segments,) whether the chain is the unit matrix: the variable's tangent is the base's twist"""
+    """(segments,) whether the variable's tangent is the base's twist: the segment is the unit matrix"""
     chain: FloatArray
-    """(segments, rows, widest): takes a variable's tangent to the base's twist (6 rows, rotation first), and
-    where calibrations are free to changes of fx, fy, skew, cx, cy (5 more)"""
+    """(segments, rows, widest) takes a variable's tangent to the base's twist (6 rows, rotation first), and to
+    changes of fx, fy, skew, cx and cy (5 more rows, where calibrations are free)"""
 
 
 class Reduced(NamedTuple):
-    """What is left of landmarks after elimination, by landmark."""
+    """What elimination keeps of each landmark, to find its step and its covariance later.
+
+    V = L L' is a landmark's information, g its gradient, E its products with the cameras' variables.
+    """
 
     factor: FloatArray
-    """(landmarks, 6) lower Cholesky factor of V by rows"""
+    """(landmarks, 6) L by rows: entries 00, 10, 11, 20, 21, 22"""
     gamma: FloatArray
     """(landmarks, 3) L^-1 g"""
     arms: FloatArray
-    """(6 pairs,) L^-1 E' of each landmark: three rows of two columns for each pair"""
+    """(6 pairs,) W = L^-1 E' of each landmark: three rows of two columns for each of its pairs"""
     cost: FloatArray
-    """(landmarks,) true robust cost"""
+    """(landmarks,) robust cost of the landmark's observations"""
     undetermined: BoolArray
-    """(landmarks,) whether the weak prior alone holds a direction"""
+    """(landmarks,) whether nothing but the weak prior holds one of its directions"""
 
 
 @entry
@@ -95,11 +101,12 @@ def arrange(
     sights: Sights,
     cursor: IntArray,
 ) -> int:
-    """Put a block's landmarks into the order of elimination; returns how many units see them.
+    """Put the landmarks of a block into the order of elimination. Returns how many units see them.
 
-    `landmarks` (m,) are rows in measurements whose observations of landmark j are begin[j] to begin[j + 1].
-    Fills `rows` (n,), the measurement of each observation, and the structure of `sights` from where `cursor`
-    (observations, occurrences, places, pairs) stands, and moves the cursor on.
+    `landmarks` (m,) are rows of the measurements, in which begin[j] to begin[j + 1] are the observations of
+    landmark j. Writes `rows` (n,), the measurement of each observation, and all but pixels and whitenings of
+    `sights`. Writing begins where `cursor` (observations, occurrences, places, pairs) stands, and moves it
+    on.
     """
     unit_row = np.full(len(segment_begin) - 1, -1)
     place_of = np.full(n_pairs, -1)
@@ -109,7 +116,9 @@ def arrange(
     for m in range(len(landmarks)):
         j, first_occurrence = landmarks[m], n_occurrences
         first_obs, last_obs = n_obs, n_obs + begin[j + 1] - begin[j]
-        for i in range(begin[j], begin[j + 1]):  # sorted by unit as they come
+        for i in range(
+            begin[j], begin[j + 1]
+        ):  # insertion into the observations so far, which are sorted by unit
             unit, k = image_unit[image[i]], n_obs
             while k > first_obs and image_unit[sights.image[k - 1]] > unit:
                 sights.image[k], rows[k] = sights.image[k - 1], rows[k - 1]

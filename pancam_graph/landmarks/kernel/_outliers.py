@@ -1,4 +1,4 @@
-"""Covariances of residuals, their tests, and which observations are set aside."""
+"""Covariances of residuals, test statistics made with them, and which observations are rejected."""
 
 import numpy as np
 
@@ -10,12 +10,16 @@ from pancam_graph.landmarks.kernel._symmetric import add_row, diagonalise
 __all__ = ["cofactors", "reject", "residual_tests", "smallest_information"]
 
 _MIN_REDUNDANCY = 0.02
-"""Directions of a residual that keep less than this of the noise's variance cannot show an error."""
+"""A direction of a residual is not tested if its variance is below this share of the noise's: its landmark
+follows the observation there, and an error does not show."""
 
 
 @entry
 def cofactors(which: IntArray, begin: IntArray, b: FloatArray, weight: FloatArray, out: FloatArray) -> None:
-    """Covariances (n, 2, 2) of whitened residuals with derivatives (n, 2, 3) and weights (n,)."""
+    """Covariances of whitened residuals, cameras held, to `out` (n, 2, 2); see `landmarks.residual_cofactor`.
+
+    `b` (n, 2, 3) are the derivatives of the residuals, `weight` (n,) is 0 for observations that take no part.
+    """
     v, turn = np.empty((3, 3)), np.empty((3, 3))
     for j in which:
         v[:] = 0.0
@@ -23,7 +27,7 @@ def cofactors(which: IntArray, begin: IntArray, b: FloatArray, weight: FloatArra
             for m in range(2):
                 add_row(v, weight[i], b[i, m, 0], b[i, m, 1], b[i, m, 2])
         diagonalise(v, turn)
-        # Directions that the accepted rays leave free: their observations determine them, whatever they say.
+        # A direction that the rays leave free has no finite variance: this floor stands for its information.
         least = 1e-14 * max(v[0, 0], v[1, 1], v[2, 2]) + 1e-100
         for i in range(begin[j], begin[j + 1]):
             sign = -weight[i] if weight[i] > 0 else 1.0
@@ -42,7 +46,7 @@ def cofactors(which: IntArray, begin: IntArray, b: FloatArray, weight: FloatArra
 def smallest_information(
     which: IntArray, seen: Seen, points_m: FloatArray, weight: FloatArray, out: FloatArray
 ) -> None:
-    """Smallest eigenvalue (landmarks,) of the information about world points, in 1 / m^2."""
+    """Smallest eigenvalue of the information about world points (landmarks, 3), in 1 / m^2, to `out`."""
     v, turn = np.empty((3, 3)), np.empty((3, 3))
     for j in which:
         v[:] = 0.0
@@ -73,7 +77,10 @@ def residual_tests(
     test: FloatArray,
     freedom: IntArray,
 ) -> None:
-    """Squared residuals (n,) in units of their own covariance, and over how many directions (0, 1 or 2)."""
+    """Squared residuals (n,) in units of their own covariance `cofactor` (n, 2, 2), to `test` (n,).
+
+    `freedom` (n,) gets the number of directions (0, 1 or 2) that a test is made of.
+    """
     values, turn = np.empty((2, 2)), np.empty((2, 2))
     for j in which:
         for i in range(begin[j], begin[j + 1]):
@@ -104,11 +111,12 @@ def reject(
     lost: BoolArray,
     changed: BoolArray,
 ) -> None:
-    """Set the weight (n,) of each landmark's worst observation to 0 if it exceeds its limit.
+    """Set the weight (n,) of each landmark's worst observation to 0 if its test exceeds its limit.
 
-    `limit` (3,) of the tests by their directions, in units of the squared `scale`; `test` is overwritten. Of
-    two accepted observations both may go. Where wished, rejected ones that fit come back. Says which
-    landmarks (landmarks,) lost one, and which changed at all.
+    `limit` (3,) is by number of directions, in units of the squared `scale`. `test` is overwritten. If a
+    landmark has only two accepted observations, both may be rejected, for nothing tells which is wrong. With
+    `readmit`, rejected observations that fit get weight 1. `lost` (landmarks,) says which landmarks lost an
+    observation, `changed` (landmarks,) which lost or regained one.
     """
     excess = test
     for j in which:
@@ -116,8 +124,7 @@ def reject(
         for i in range(begin[j], begin[j + 1]):
             excess[i] = test[i] / scale**2 - limit[freedom[i]]
             if weight[i] > 0:
-                # What takes part may not exceed the noise itself, even where its cofactor shows no direction
-                # of it.
+                # Also a residual that its own covariance cannot test must not exceed the noise.
                 squared = residual[i, 0] * residual[i, 0] + residual[i, 1] * residual[i, 1]
                 excess[i] = max(excess[i], squared / scale**2 - limit[2])
                 n_accepted += 1
@@ -133,7 +140,7 @@ def reject(
         n_back = 0
         if readmit and n_left >= 2:
             for i in range(begin[j], begin[j + 1]):
-                # What has just gone exceeds its limit, so it does not come back.
+                # An observation that was just rejected exceeds its limit, and is not readmitted.
                 if weight[i] == 0 and excess[i] < 0 and freedom[i] > 0:
                     weight[i] = 1.0
                     n_back += 1

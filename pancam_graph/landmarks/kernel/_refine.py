@@ -12,7 +12,8 @@ from pancam_graph.landmarks.kernel._symmetric import UNDETERMINED, add_row, diag
 __all__ = ["refine"]
 
 _REFINE_BEHIND_COST = 1e12
-"""Of an observation behind its camera: more than any residual, and differences of residuals still show."""
+"""Cost of an observation whose landmark is behind its camera: above that of any residual, and small enough
+that differences of other costs are not lost in rounding."""
 _REFINE_STEPS = 15
 
 
@@ -33,7 +34,10 @@ def _normal(
     v: FloatArray,
     g: FloatArray,
 ) -> float:
-    """Cost of landmark j at (x, w) with its tangents, its normal matrix (3, 3) and its gradient (3,)."""
+    """Cost of landmark j at (x, w), whose tangents are t; normal matrix (3, 3) to v, gradient (3,) to g.
+
+    `held`: the landmark is held at infinity, w at 0.
+    """
     O0, O1, O2 = origin_m[j, 0], origin_m[j, 1], origin_m[j, 2]
     v[:] = 0.0
     g[:] = 0.0
@@ -47,18 +51,21 @@ def _normal(
             b10, b11, b12 = without_w(t, b10, b11, b12)
         squared = r0 * r0 + r1 * r1
         cost += weight[i] * (loss_cost(kind, width, squared) + (0.0 if in_front else _REFINE_BEHIND_COST))
-        own = weight[i] * loss_weight(kind, width, squared)
-        add_row(v, own, b00, b01, b02)
-        add_row(v, own, b10, b11, b12)
-        g[0] += own * (b00 * r0 + b10 * r1)
-        g[1] += own * (b01 * r0 + b11 * r1)
-        g[2] += own * (b02 * r0 + b12 * r1)
+        robust = weight[i] * loss_weight(kind, width, squared)
+        add_row(v, robust, b00, b01, b02)
+        add_row(v, robust, b10, b11, b12)
+        g[0] += robust * (b00 * r0 + b10 * r1)
+        g[1] += robust * (b01 * r0 + b11 * r1)
+        g[2] += robust * (b02 * r0 + b12 * r1)
     return cost
 
 
 @part
 def _newton(v: FloatArray, g: FloatArray, turn: FloatArray, step: FloatArray) -> float:
-    """Step (3,) -V^-1 g along those directions that the rays determine; its product with g. Destroys V."""
+    """Step -V^-1 g along the directions that the rays determine, to `step` (3,). Returns its product with g.
+
+    Overwrites V.
+    """
     floor = UNDETERMINED * (v[0, 0] + v[1, 1] + v[2, 2])
     if v[0, 0] > floor:
         l10, l20 = v[1, 0] / v[0, 0], v[2, 0] / v[0, 0]
@@ -98,7 +105,7 @@ def refine(
     tolerance: float,
     vector: FloatArray,
 ) -> None:
-    """Best landmarks, from `vector` (landmarks, 4) and back to it; see `landmarks.refine`."""
+    """Refine the landmarks `which` of `vector` (landmarks, 4) in place; see `landmarks.refine`."""
     v, g, turn, step = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)
     for j in which:
         a0, a1, a2, a3 = vector[j, 0], vector[j, 1], vector[j, 2], vector[j, 3]
@@ -114,7 +121,7 @@ def refine(
                 x0, x1, x2, x3 = retracted(
                     t, a0, a1, a2, a3, share * step[0], share * step[1], share * step[2]
                 )
-                if held:  # a step along the horizon leaves w at 0, but for rounding
+                if held:  # rounding moves w off 0
                     x3 = 0.0
                 tried = tangents(x0, x1, x2, x3)
                 trial_cost = _normal(
@@ -122,7 +129,7 @@ def refine(
                 )
                 better = trial_cost < cost
                 damping = min(max(damping * (0.1 if better else 100.0), 1e-12), 1e9)
-                # A landmark stays where a step promises next to nothing, or where no damping makes one gain.
+                # The end: a step promises next to no gain, or with any damping it gains nothing.
                 settled = -0.5 * share * slope <= tolerance * cost + 1e-12 or (not better and damping > 1e6)
                 if better:
                     a0, a1, a2, a3, t, cost = x0, x1, x2, x3, tried, trial_cost
@@ -131,10 +138,10 @@ def refine(
                 if better:
                     slope = _newton(v, g, turn, step)
             norm = np.sqrt(a0 * a0 + a1 * a1 + a2 * a2)
-            # One whose vector is its origin alone has no direction in which infinity could be.
+            # A landmark at its own origin has no direction in which it could be brought to infinity.
             if held or beyond_infinity or not (a3 < 0 and norm > 1e-9):
                 break
-            # Beyond infinity: brought to it, and refined there.
+            # A landmark beyond infinity is brought to infinity, and refined there.
             a0, a1, a2, a3 = a0 / norm, a1 / norm, a2 / norm, 0.0
             held = True
         vector[j, 0], vector[j, 1], vector[j, 2], vector[j, 3] = a0, a1, a2, a3

@@ -32,7 +32,7 @@ def tangents(a0: float, a1: float, a2: float, a3: float) -> Tangents:
 
 @part
 def by_tangents(t: Tangents, d0: float, d1: float, d2: float, d3: float) -> tuple[float, float, float]:
-    """A derivative by (X, w), taken to one by the tangents."""
+    """A derivative by the tangents t, from one by (X, w)."""
     return (
         d0 * t[0] + d1 * t[3] + d2 * t[6] + d3 * t[9],
         d0 * t[1] + d1 * t[4] + d2 * t[7] + d3 * t[10],
@@ -44,7 +44,7 @@ def by_tangents(t: Tangents, d0: float, d1: float, d2: float, d3: float) -> tupl
 def retracted(
     t: Tangents, a0: float, a1: float, a2: float, a3: float, s0: float, s1: float, s2: float
 ) -> tuple[float, float, float, float]:
-    """A unit vector moved by a step along its tangents, and brought back to the sphere."""
+    """A unit vector a moved by a step s along its tangents t, and scaled to unit length again."""
     x0 = a0 + t[0] * s0 + t[1] * s1 + t[2] * s2
     x1 = a1 + t[3] * s0 + t[4] * s1 + t[5] * s2
     x2 = a2 + t[6] * s0 + t[7] * s1 + t[8] * s2
@@ -55,6 +55,6 @@ def retracted(
 
 @part
 def without_w(t: Tangents, b0: float, b1: float, b2: float) -> tuple[float, float, float]:
-    """A derivative by the tangents at w = 0, less its part along w, which is one of them."""
+    """A derivative by the tangents t of a landmark at infinity, without its part along w."""
     part = b0 * t[9] + b1 * t[10] + b2 * t[11]
     return b0 - part * t[9], b1 - part * t[10], b2 - part * t[11]

@@ -1,4 +1,4 @@
-"""Small symmetric matrices: eigenvalues, and sums of squares of rows."""
+"""Small symmetric matrices: their eigenvalues, and normal matrices summed row by row."""
 
 import numpy as np
 
@@ -8,16 +8,16 @@ from pancam_graph.base.geometry import FloatArray
 __all__ = ["UNDETERMINED", "add_row", "diagonalise"]
 
 UNDETERMINED = 1e-9
-"""A direction with a pivot below this share of the trace is called undetermined, and gets the weak prior."""
+"""A direction of a landmark is undetermined if its pivot is below this share of the trace of V."""
 
 
 @part
 def diagonalise(a: FloatArray, turn: FloatArray) -> None:
-    """Eigenvalues of a symmetric matrix (m, m) to its diagonal, eigenvectors to the columns of `turn`.
+    """Replace a symmetric matrix (m, m) by the diagonal matrix of its eigenvalues, in no order of size.
 
-    Cyclic Jacobi rotations, in no order of size. Of a positive semidefinite matrix small eigenvalues come out
-    at least as accurate as LAPACK's (Demmel and Veselić, Jacobi's method is more accurate than QR, 1992).
-    Destroys `a`; ends whatever its entries are.
+    The columns of `turn` (m, m) become the eigenvectors. By cyclic Jacobi rotations: small eigenvalues of a
+    positive semidefinite matrix come out at least as accurate as LAPACK's (Demmel and Veselić, Jacobi's
+    method is more accurate than QR, 1992). Ends also for entries that are not finite.
     """
     m = len(a)
     for p in range(m):
@@ -53,7 +53,7 @@ def diagonalise(a: FloatArray, turn: FloatArray) -> None:
 
 @part
 def add_row(v: FloatArray, weight: float, b0: float, b1: float, b2: float) -> None:
-    """Add one row of a Jacobian to a normal matrix (3, 3)."""
+    """Add weight b'b, b being a row (3,) of a Jacobian, to a normal matrix (3, 3)."""
     v[0, 0] += weight * b0 * b0
     v[1, 1] += weight * b1 * b1
     v[2, 2] += weight * b2 * b2

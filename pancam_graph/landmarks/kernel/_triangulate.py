@@ -1,4 +1,4 @@
-"""Linear triangulation."""
+"""Linear triangulation of landmarks from their rays."""
 
 import numpy as np
 
@@ -22,7 +22,10 @@ def _triangulate(
     vector: FloatArray,
     origin_m: FloatArray,
 ) -> None:
-    """One landmark (4,) and its origin (3,) from its rays (m, 3); see `landmarks.triangulate`."""
+    """Triangulate one landmark from its m rays, to `vector` (4,) and `origin_m` (3,).
+
+    See `landmarks.triangulate`. `form` (4, 4), `turn` (4, 4) and `arm` (3,) are overwritten.
+    """
     n = len(weight)
     total = 0.0
     for i in range(n):
@@ -47,20 +50,20 @@ def _triangulate(
         for i in range(n):
             square = _arm(centre_m[i], direction[i], origin_m, arm)
             d = direction[i]
-            own = 1.0 if alike else weight[i]
+            share = 1.0 if alike else weight[i]
             if again:
                 range_squared = 0.0
                 for k in range(3):
                     towards = vector[k] - vector[3] * (centre_m[i, k] - origin_m[k])
                     range_squared += towards * towards
-                own /= max(range_squared, 1e-12)
+                share /= max(range_squared, 1e-12)
             for p in range(3):
-                form[p, p] += own
+                form[p, p] += share
                 for q in range(p + 1):
-                    form[p, q] -= own * d[p] * d[q]
+                    form[p, q] -= share * d[p] * d[q]
                 if parallax:
-                    form[3, p] -= own * arm[p] / baseline
-            form[3, 3] += own * (square / (baseline * baseline) if parallax else 1.0)
+                    form[3, p] -= share * arm[p] / baseline
+            form[3, 3] += share * (square / (baseline * baseline) if parallax else 1.0)
         for p in range(3):
             for q in range(p + 1, 4):
                 form[p, q] = form[q, p]
@@ -88,7 +91,10 @@ def _triangulate(
 
 @part
 def _arm(centre_m: FloatArray, direction: FloatArray, origin_m: FloatArray, arm: FloatArray) -> float:
-    """What of the way from the origin to a ray's centre is across the ray, to `arm` (3,); its square."""
+    """Vector from the origin to a ray's centre, without its part along the ray, to `arm` (3,).
+
+    Returns its squared length.
+    """
     along, square = 0.0, 0.0
     for k in range(3):
         arm[k] = centre_m[k] - origin_m[k]
@@ -109,8 +115,11 @@ def triangulate(
     vector: FloatArray,
     origin_m: FloatArray,
 ) -> None:
-    """Landmarks (landmarks, 4) and their origins (landmarks, 3) from rays (n, 3)."""
+    """Triangulate the landmarks `which` from rays (n, 3) sorted by landmark.
+
+    Writes `vector` (landmarks, 4) and `origin_m` (landmarks, 3).
+    """
     form, turn, arm = np.empty((4, 4)), np.empty((4, 4)), np.empty(3)
     for j in which:
-        own = slice(begin[j], begin[j + 1])
-        _triangulate(centre_m[own], direction[own], weight[own], form, turn, arm, vector[j], origin_m[j])
+        rows = slice(begin[j], begin[j + 1])
+        _triangulate(centre_m[rows], direction[rows], weight[rows], form, turn, arm, vector[j], origin_m[j])

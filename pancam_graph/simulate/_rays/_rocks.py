@@ -65,7 +65,7 @@ def through_form(
 
 @uncounted.inlined
 def to_ball(rocks: FloatArray, n: int, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """A vector from the centre of rock n, or a direction, taken from the world to the frame of the unit ball."""
+    """A vector from the centre of rock n, or a direction, taken to the frame of the unit ball."""
     k = ROCK_TO_BALL
     return (
         rocks[n, k] * x + rocks[n, k + 1] * y + rocks[n, k + 2] * z,
