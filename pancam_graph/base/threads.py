@@ -151,7 +151,7 @@ def _blas() -> ThreadpoolController:
 
 @cache
 def _pool(workers: int) -> ThreadPoolExecutor:
-    """The pool of `in_parallel`, kept for the life of the process: new threads cost as much as a small range."""
+    """The pool of `in_parallel`, kept as long as the process: new threads cost as much as a small range."""
     return ThreadPoolExecutor(workers, thread_name_prefix="pancam-graph")
 
 

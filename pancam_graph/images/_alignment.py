@@ -34,16 +34,16 @@ class Alignment:
 
     @property
     def covariance(self) -> FloatArray:
-        """Of the pose, (6, 6)."""
+        """(6, 6) covariance of the pose in its tangent."""
         return np.asarray(self.root @ self.root.T)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Ties:
-    """Points of a terrain, and where images of another stop saw the same."""
+    """Points of one stop's terrain, and pixels in images of another stop that show them."""
 
     row: IntArray
-    """(n,) of the terrain."""
+    """(n,) row of the terrain."""
     image: IntArray
     """(n,)"""
     uv_px: FloatArray
@@ -53,7 +53,7 @@ class Ties:
 
     @staticmethod
     def concatenate(parts: "list[Ties]") -> "Ties":
-        """All ties in one."""
+        """The ties of all parts, one after the other."""
         empty = np.empty(0, dtype=np.int64)
         return Ties(
             row=np.concatenate([empty, *(p.row for p in parts)]),
@@ -77,7 +77,7 @@ class Ties:
 
 
 def telemetry_alignment(terrain: Terrain, a: int, b: int) -> Alignment:
-    """Stop b relative to stop a, as telemetry has it; what the images of each say of its pointing counts."""
+    """Stop b relative to stop a by telemetry, with the pointing that the images of each stop give."""
     first, second = terrain.traverse.stops[a], terrain.traverse.stops[b]
     apart_m = float(np.linalg.norm(first.world_T_mast.translation() - second.world_T_mast.translation()))
     rotation = np.hypot(first.sigma_rotation_rad, second.sigma_rotation_rad)
@@ -97,26 +97,26 @@ def align_stops(
     b: int,
     options: FrontEndOptions,
 ) -> Alignment | Refusal:
-    """Stop b relative to stop a, from features whose descriptors agree; why not, where that could be chance.
+    """Stop b relative to stop a from features whose descriptors agree, or why these may agree by chance.
 
     Each point of a's terrain is looked for among the first sightings of b's, around where telemetry has it;
     what most of these matches say corrects the pose, and the search is repeated in the smaller windows.
     `feature_of` is the feature of each of the terrain's observations.
     """
     prior = telemetry_alignment(terrain, a, b)
-    found = prior
+    correction = prior
     for _ in range(_ROUNDS):
-        ties, half_width = _matched(terrain, features, feature_of, (a, b), found, options)
+        ties, half_width = _matched(terrain, features, feature_of, (a, b), correction, options)
         if len(ties) < options.min_pair_matches:
             return Refusal.FEW_ALIKE
         start_px = float(np.median(half_width))
-        found = fit_pose(terrain, ties, prior, found, start_px)
-        distance = whitened_distance(terrain, ties, found.world_T_mast)
-        # Wrong matches lie anywhere in their windows: so many would agree by chance.
+        correction = fit_pose(terrain, ties, prior, correction, start_px)
+        distance = whitened_distance(terrain, ties, correction.world_T_mast)
+        # Wrong matches are spread evenly over their windows: this share of them agrees by chance.
         chance = np.minimum(1.0, (_AGREE_SIGMAS / half_width) ** 2)
         if not beyond_chance(distance < _AGREE_SIGMAS, chance, options):
             return Refusal.CHANCE
-    return found
+    return correction
 
 
 def _matched(
@@ -133,7 +133,7 @@ def _matched(
     parts, widths = [], []
     for i in ours:
         rows = rows_of[i]
-        own = features[i].select(feature_of[terrain.row[rows]])
+        of_terrain = features[i].select(feature_of[terrain.row[rows]])
         for j in theirs:
             seen = terrain.sighting(rows, j, at.world_T_mast)
             radius = _radius_px(terrain, rows, seen, at, options)
@@ -149,7 +149,7 @@ def _matched(
                 valid=usable,
             )
             other = features[j].select(feature_of[terrain.row[rows_of[j]]])
-            matches = match_in_windows(own, other, segments, options)
+            matches = match_in_windows(of_terrain, other, segments, options)
             parts.append(
                 Ties(
                     row=rows[matches.a],
@@ -171,7 +171,7 @@ def _radius_px(
 
 
 def _comparable(terrain: Terrain, image: int, seen: Sighting, margin_px: FloatArray) -> BoolArray:
-    """Which points the image can show, and from a similar side and distance."""
+    """Which points the image can show from a side and distance similar to the first sighting's."""
     camera = terrain.camera(image)
     size = np.array([camera.width_px, camera.height_px])
     on = np.all((seen.uv_px > -margin_px[:, None]) & (seen.uv_px < size + margin_px[:, None]), axis=1)
@@ -180,7 +180,7 @@ def _comparable(terrain: Terrain, image: int, seen: Sighting, margin_px: FloatAr
 
 
 def whitened_distance(terrain: Terrain, ties: Ties, world_T_mast: gtsam.Pose3) -> FloatArray:
-    """How far ties (n,) are from where they should be, in units of what noise and depths leave open."""
+    """Distances (n,) of ties from their points' pixels, in units of what noise and depths leave open."""
     residual, root, _ = _whitened(terrain, ties, world_T_mast)
     return np.asarray(np.linalg.norm(np.einsum("nij,nj->ni", root, residual), axis=1))
 
@@ -188,7 +188,7 @@ def whitened_distance(terrain: Terrain, ties: Ties, world_T_mast: gtsam.Pose3) -
 def _whitened(
     terrain: Terrain, ties: Ties, world_T_mast: gtsam.Pose3
 ) -> tuple[FloatArray, FloatArray, Sighting]:
-    """Residuals (n, 2), and what takes them to unit covariance (n, 2, 2)."""
+    """Residuals (n, 2) in pixels, and the matrices (n, 2, 2) that take them to unit covariance."""
     seen = terrain.sighting(ties.row, ties.image, world_T_mast)
     noise = np.square(ties.sigma_px)[:, None, None] * np.eye(2)
     covariance = noise + seen.covariance_px2(np.zeros((6, 6)), terrain.sigma_inverse_m[ties.row])
@@ -216,7 +216,7 @@ def fit_pose(
         r = np.einsum("nij,nj->ni", root, residual)
         J = root @ seen.d_pose @ prior.root
         weight = (scale**2 / (scale**2 + np.sum(r * r, axis=1))) ** 2 * seen.valid
-        # The tangent at the pose stands for that at the prior: they differ by little.
+        # The tangent at the pose is taken for that at the prior, from which it differs little.
         gone = gtsam.Pose3.Logmap(prior.world_T_mast.between(pose))
         q = np.linalg.lstsq(prior.root, gone, rcond=None)[0]
         information = np.eye(columns) + np.einsum("n,nik,nil->kl", weight, J, J)

@@ -48,12 +48,12 @@ _COUNTS = ("a", "b", "sought", "unlike", "ambiguous", "unstable", "masked", "off
 
 
 def stereo_stops(traverse: Traverse, pairs: Sequence[tuple[int, int]]) -> BoolArray:
-    """Which stops (stops,) have eyes that see the same at once, by pairs of images that overlap."""
-    found = np.zeros(len(traverse.stops), dtype=bool)
+    """Which stops (stops,) have two eyes of one pointing whose images overlap."""
+    in_stereo = np.zeros(len(traverse.stops), dtype=bool)
     for a, b in pairs:
         if traverse.image_frame[a] == traverse.image_frame[b]:
-            found[traverse.image_stop[a]] = True
-    return found
+            in_stereo[traverse.image_stop[a]] = True
+    return in_stereo
 
 
 def near_stops(traverse: Traverse, options: FrontEndOptions) -> BoolArray:
@@ -65,13 +65,13 @@ def near_stops(traverse: Traverse, options: FrontEndOptions) -> BoolArray:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StopTies:
-    """What the images of one stop see of another's terrain, and what became of the other patches."""
+    """Ties of one stop's terrain with the images of another, and counts of the patches without a tie."""
 
     ties: Ties
     report: StopMatching
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """All of it, to be kept."""
+        """Everything as arrays, for the cache."""
         counts = [int(getattr(self.report, name)) for name in _COUNTS]
         noise_px = np.array(self.report.noise_px)
         return {
@@ -82,7 +82,7 @@ class StopTies:
 
     @staticmethod
     def of_arrays(arrays: Mapping[str, NDArray[Any]]) -> "StopTies":
-        """From what `arrays` gave."""
+        """The inverse of `arrays`."""
         counts = dict(zip(_COUNTS, arrays["counts"].tolist(), strict=True))
         refusal, noise_px = Refusal(counts.pop("refusal")), float(arrays["noise_px"])
         return StopTies(
@@ -93,16 +93,16 @@ class StopTies:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StopMatcher:
-    """Finds the terrain of one stop in the images of another; for any number of threads."""
+    """Finds the terrain of one stop in the images of another. Several threads may use it at once."""
 
     terrain: Terrain
-    """Its points are those that show in no mask."""
+    """Points of all stops, without those that a mask covers."""
     spline: Splines
     usable: Sequence[BoolArray | None]
-    """Where each image (height, width) shows terrain."""
+    """By image: which pixels (height, width) show terrain; None without a mask."""
     features: list[Features]
     feature_of: IntArray
-    """Of which feature each of the terrain's observations is."""
+    """(observations,) row of each of the terrain's observations in its image's features."""
     options: FrontEndOptions
 
     def ties(self, one: int, other: int) -> StopTies:
@@ -118,7 +118,7 @@ class StopMatcher:
         t = self.terrain.traverse
         ours, theirs = (np.flatnonzero(t.image_stop == s).tolist() for s in (one, other))
         rows_of = {i: np.flatnonzero(self._chosen & (self.terrain.image == i)) for i in ours}
-        # Images of the second stop in the outer loop: theirs are blurred to several levels, each made once.
+        # Images of the second stop in the outer loop: each is blurred to several levels, and each level once.
         parts = [
             _found(self.terrain, self.spline, rows, j, alignment, self.options)
             for j in theirs
@@ -131,17 +131,17 @@ class StopMatcher:
         ties = ties.select(shown)
         if len(ties) < self.options.min_pair_matches:
             return _nothing(one, other, sought, Refusal.FEW_GUIDED)
-        found = len(ties)
+        n_ties = len(ties)
         ties = _measured(self.terrain, ties, (one, other), alignment, self.options)
         report = StopMatching(
             a=one,
             b=other,
             **vars(sought),
-            off_pose=found - len(ties),
+            off_pose=n_ties - len(ties),
             kept=len(ties),
             noise_px=float(np.sqrt(np.mean(ties.sigma_px**2))) if len(ties) else 0.0,
         )
-        # What other images of a stop say of a point errs alike, by its own patch: it counts but once.
+        # Ties of one point in several images err alike, by the point's own patch: they count as one.
         _, of, times = np.unique(ties.row, return_inverse=True, return_counts=True)
         return StopTies(ties=replace(ties, sigma_px=ties.sigma_px * np.sqrt(times[of])), report=report)
 
@@ -157,7 +157,7 @@ def _nothing(one: int, other: int, sought: "_Sought", refusal: Refusal) -> StopT
 
 @dataclass(frozen=True, kw_only=True)
 class _Sought:
-    """Counts of patches; see `StopMatching`."""
+    """The report of two stops from counts of patches."""
 
     sought: int = 0
     unlike: int = 0
@@ -171,16 +171,16 @@ class _Sought:
 
 def on_terrain(usable: Sequence[BoolArray | None], image: IntArray, uv_px: FloatArray) -> BoolArray:
     """Which pixels (n, 2) of images (n,) show terrain."""
-    found = np.zeros(len(image), dtype=bool)
+    shows = np.zeros(len(image), dtype=bool)
     for i in np.unique(image).tolist():
         mask, rows = usable[i], image == i
         assert mask is not None  # it has observations
-        found[rows] = pixels_at(mask, uv_px[rows])
-    return found
+        shows[rows] = pixels_at(mask, uv_px[rows])
+    return shows
 
 
 def _spread(terrain: Terrain) -> BoolArray:
-    """Which points stand for their surroundings: in each cell of an image those that are placed best."""
+    """Rows of the points to match: in each cell of an image those whose place is known best."""
     cell = np.floor(terrain.uv_px / _CELL_PX).astype(np.int64)
     order = np.lexsort((terrain.sigma_inverse_m, cell[:, 0], cell[:, 1], terrain.image))
     key = np.column_stack([terrain.image, cell])[order]
@@ -194,11 +194,11 @@ def _spread(terrain: Terrain) -> BoolArray:
 def _measured(
     terrain: Terrain, ties: Ties, stops: tuple[int, int], alignment: Alignment, options: FrontEndOptions
 ) -> Ties:
-    """Those ties that lie where most others want the pose, with standard deviations from their scatter.
+    """The ties that agree with the pose of most ties, with standard deviations from their scatter.
 
-    `ties.sigma_px` need only say which are better placed than which. Ties of far terrain, which looks the
-    same from both stops, are several times as good as those of near terrain, and those are what places the
-    stop: so the scatter is measured in groups of about equals.
+    Of `ties.sigma_px` only the order matters. Far terrain looks the same from both stops and gives ties
+    several times better than near terrain, but near terrain is what places the stop: the scatter is therefore
+    measured in groups of ties of about the same quality.
     """
     prior, n = telemetry_alignment(terrain, *stops), len(ties)
     groups = np.array_split(np.argsort(ties.sigma_px, kind="stable"), np.clip(n // _GROUP, 1, _MOST_GROUPS))
@@ -208,7 +208,7 @@ def _measured(
         alignment = fit_pose(terrain, ties, prior, alignment, _FIT_SCALE)
         distance, sigma_px = whitened_distance(terrain, ties, alignment.world_T_mast), ties.sigma_px.copy()
         for group in groups:
-            # The median of a length in two directions is 1.177 sigma. Wrong ties must not widen it.
+            # The median length of a Gaussian residual (2,) is 1.177 sigma; wrong ties do not widen it.
             sigma_px[group] *= min(1.0, float(np.median(distance[group])) / 1.177)
         ties = replace(ties, sigma_px=np.maximum(sigma_px, _LEAST_NOISE_PX))
     distance = whitened_distance(terrain, ties, alignment.world_T_mast)
@@ -229,9 +229,9 @@ def _found(
     size = np.array([camera.width_px, camera.height_px])
     margin = HALF_WIDTH_PX + 1.0
     inside = np.all((seen.uv_px > margin) & (seen.uv_px < size - 1 - margin), axis=1)
-    own = terrain.camera(int(terrain.image[rows[0]]))
-    own_size = np.array([own.width_px, own.height_px])
-    inside &= np.all((terrain.uv_px[rows] > margin) & (terrain.uv_px[rows] < own_size - 1 - margin), axis=1)
+    camera_a = terrain.camera(int(terrain.image[rows[0]]))
+    size_a = np.array([camera_a.width_px, camera_a.height_px])
+    inside &= np.all((terrain.uv_px[rows] > margin) & (terrain.uv_px[rows] < size_a - 1 - margin), axis=1)
     inside &= seen.valid & (seen.cosine > _MAX_TURN_COSINE)
     rows, seen = rows[inside], seen.select(inside)
     if not len(rows):
@@ -240,7 +240,7 @@ def _found(
     finite: BoolArray = np.asarray(np.isfinite(affine).all(axis=(1, 2)))
     stretch = np.linalg.svd(np.where(finite[:, None, None], affine, 0.0), compute_uv=False)
     usable = finite & (stretch[:, 0] < _LARGEST_STRETCH)
-    # From the coarser to the finer image: what the finer one shows the coarser one may not.
+    # The patch of the coarser image is sought in the finer one, which shows all its detail.
     usable &= stretch[:, 1] > _SMALLEST_STRETCH
     usable &= np.linalg.det(np.where(finite[:, None, None], affine, 0.0)) > 0
     reach = _reach(terrain, rows, seen, affine, usable, alignment, options)
@@ -260,7 +260,7 @@ def _found(
     only = alike & (correlation - second > _MIN_LEAD)
     good = only & (moved < _MAX_MOVE_PX * stretch[k, 0])
     good &= np.all((uv > margin) & (uv < size - 1 - margin), axis=1)
-    # And back: the surface around an edge that hides other terrain from there has another patch.
+    # The way back must end at the start: it does not where an edge hides terrain from one of the images.
     for blur in np.unique(level[good]).tolist():
         part = np.flatnonzero(good & (level == blur))
         inverse: FloatArray = np.asarray(np.linalg.inv(affine[k[part]]))
@@ -289,11 +289,11 @@ def _reach(
     alignment: Alignment,
     options: FrontEndOptions,
 ) -> IntArray:
-    """How far (n, 2) to search along u and v of the first image, in whole pixels."""
+    """Reach (n, 2) of the search along u and v of the first image, in whole pixels."""
     inverse = np.linalg.inv(np.where(usable[:, None, None], affine, np.eye(2)))
     spread = seen.covariance_px2(alignment.covariance, terrain.sigma_inverse_m[rows])
-    own = inverse @ spread @ np.swapaxes(inverse, 1, 2)
-    sigma = np.sqrt(np.maximum(np.diagonal(own, axis1=1, axis2=2), 0.0))
+    in_a = inverse @ spread @ np.swapaxes(inverse, 1, 2)
+    sigma = np.sqrt(np.maximum(np.diagonal(in_a, axis1=1, axis2=2), 0.0))
     reach = np.ceil(options.search_sigmas * sigma + _SLACK_PX)
     return np.asarray(np.minimum(reach, MAX_REACH_PX + 1), dtype=np.int64)
 
@@ -303,7 +303,7 @@ def _aligned(
     image_b: Coefficients,
     patches: tuple[FloatArray, FloatArray, IntArray, FloatArray],
 ) -> tuple[FloatArray, FloatArray]:
-    """Pixels in b (n, 2) and what `align_patches` says of them, for its `uv_a`, `affine`, `reach`, `uv_b`."""
+    """Pixels in b (n, 2) and their quality (n, 5); see `align_patches` for these and the arguments."""
     uv_a, affine, reach, start = patches
     uv_b, fit = start.copy(), np.empty((len(uv_a), 5))
     in_parallel(

@@ -1,4 +1,4 @@
-"""What the front end has found, kept in files and found again by all that it depends on."""
+"""Results of the front end's steps, kept in files under digests of everything that they depend on."""
 
 import hashlib
 import json
@@ -40,14 +40,14 @@ class Cache:
     """
 
     def __init__(self, folder: Path | None) -> None:
-        """Keep files in `folder`, which is made with the first; None: keep nothing."""
+        """Keep files in `folder`, which is made when the first is written; None: keep nothing."""
         self._folder = folder
         self._used: set[Path] = set()
         self._begun = False
         self._beginning = Lock()
 
     def recall(self, kind: str, key: str, make: Callable[[], Mapping[str, NDArray[Any]]]) -> Arrays:
-        """The arrays that were kept, or those that `make` returns, which are kept from then on."""
+        """The arrays kept under a key, or else those that `make` returns, which then are kept."""
         if self._folder is None:
             return dict(make())
         path = self._folder / f"{kind}-{key[:40]}{_SUFFIX}"
@@ -59,14 +59,14 @@ class Cache:
         return arrays
 
     def forget_others(self) -> None:
-        """Delete files of ours that nobody asked for since this object was made."""
+        """Delete the cache's files whose keys were not asked for since this object was made."""
         if self._folder is not None and self._folder.is_dir():
             for path in self._folder.glob(f"*-*{_SUFFIX}"):
                 if path not in self._used:
                     path.unlink(missing_ok=True)
 
     def _write(self, path: Path, key: str, arrays: Arrays) -> None:
-        assert self._folder is not None  # the caller has looked
+        assert self._folder is not None  # `recall` returns before
         content = BytesIO()
         np.savez(content, **{_KEY: np.array(key)}, **arrays)  # type: ignore[arg-type]  # names of ours, none of its options
         try:
@@ -75,7 +75,7 @@ class Cache:
                     begin_cache(self._folder)
                     self._begun = True
             whole_file(path, content.getvalue())
-        except OSError as error:  # a full disk must not end what would work without
+        except OSError as error:  # without a cache the step works too
             _LOG.warning("%s: not kept: %s", path, error)
 
 

@@ -1,4 +1,4 @@
-"""The folder of what was found in images, within the folder of results."""
+"""The cache's folder, which lies within the folder of results."""
 
 import json
 from pathlib import Path
@@ -10,7 +10,7 @@ from pancam_graph.io import read_json
 __all__ = ["CACHE", "begin_cache", "cache_folder", "is_cache"]
 
 CACHE = "cache"
-"""Its name in the folder of results."""
+"""Name of the cache's folder."""
 
 _FORMAT, _VERSION = "pancam-graph/cache", 1
 _MARK = "cache.json"
@@ -22,14 +22,14 @@ def cache_folder(out: Path | str) -> Path:
 
 
 def begin_cache(folder: Path) -> None:
-    """Make the folder, and the file that says what it is. Raises OSError where that fails."""
+    """Make the folder, and the file that marks it as a cache. Raises OSError if that fails."""
     folder.mkdir(parents=True, exist_ok=True)
     mark = json.dumps({"format": _FORMAT, "version": _VERSION})
     whole_file(folder / _MARK, f"{mark}\n".encode())
 
 
 def is_cache(folder: Path) -> bool:
-    """Whether a folder is such a cache, of this version."""
+    """Whether a folder is a cache of this version."""
     if folder.is_symlink() or not folder.is_dir():
         return False
     try:

@@ -63,10 +63,10 @@ def find_features(
     """Features of an image (height, width) that `camera` took, in the pieces of it that are `wanted`.
 
     `wanted` is a grid over the image, by row and column; `usable` (height, width) leaves out pixels, by
-    default those without data.
-    `camera_up` is the world's vertical as a unit vector (3,) in the camera frame. Descriptors are turned
-    to its image instead of the local gradient's direction: a mast never rolls, so this compares like with
-    like and saves one unknown. Returns no features, never an error, for an image without texture.
+    default those without data. `camera_up` is the world's vertical as a unit vector (3,) in the camera frame.
+    Descriptors are turned to the image of the vertical instead of the local gradient's direction: since a
+    mast does not roll, descriptors of the same point then agree, and one unknown less can go wrong. Returns
+    no features, never an error, for an image without texture.
     """
     grey = normalise(image, options.tile_px, options.max_contrast_gain)
     # Without precise upscaling OpenCV's positions are 0.25 px off to the lower right, measured on spots.
@@ -75,14 +75,14 @@ def find_features(
     )
     wanted_mask = cv2.resize(wanted.astype(np.uint8), grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
     usable = (usable_mask(image) if usable is None else usable) & (wanted_mask > 0)
-    found = sift.detect(grey, None)
-    table = np.array([(k.pt[1], k.pt[0], k.size, k.response) for k in found]).reshape(-1, 4)
-    # A narrow overlap carries alone what else the whole image carries, and what telemetry leaves open makes
-    # it look wider than it is: hence the square.
+    keypoints = sift.detect(grey, None)
+    table = np.array([(k.pt[1], k.pt[0], k.size, k.response) for k in keypoints]).reshape(-1, 4)
+    # Where only a share of the image overlaps others, that share gets more features per area. The share is
+    # squared because the uncertainty of telemetry makes an overlap look wider than it is.
     share = max(float(np.mean(wanted)), _LEAST_SHARE)
     limit = min(options.max_features / share**2, max(_MOST_FEATURES, options.max_features))
     rows = _choose(table, usable, round(limit))
-    chosen = [found[i] for i in rows]
+    chosen = [keypoints[i] for i in rows]
     angles = _vertical_angle_deg(camera, camera_up, table[rows][:, [1, 0]])
     for keypoint, angle in zip(chosen, angles, strict=True):
         keypoint.angle = float(angle)
@@ -95,7 +95,7 @@ def _choose(table: FloatArray, usable: NDArray[np.bool_], max_features: int) -> 
     """Rows of distinct, usable features (v, u, size, response), the strongest of each cell, sorted."""
     if not len(table):
         return np.empty(0, dtype=np.int64)
-    # A feature with several gradient directions is listed once for each; the vertical replaces them all.
+    # SIFT lists a feature once for each of its gradient directions, which the vertical replaces.
     _, first = np.unique(table[:, :3], axis=0, return_index=True)
     height, width = usable.shape
     v = np.clip(np.rint(table[first, 0]).astype(np.int64), 0, height - 1)
@@ -107,7 +107,7 @@ def _choose(table: FloatArray, usable: NDArray[np.bool_], max_features: int) -> 
     order = np.lexsort((np.arange(len(first)), -table[first, 3], cell))
     starts = np.searchsorted(cell[order], np.arange(_CELLS**2))
     rank = np.arange(len(first)) - starts[cell[order]]
-    # The strongest of every cell before the second strongest of any.
+    # The strongest feature of every cell comes before the second strongest of any.
     chosen = order[np.lexsort((np.arange(len(first)), rank))][:max_features]
     return np.asarray(first[np.sort(chosen)], dtype=np.int64)
 

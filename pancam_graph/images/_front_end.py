@@ -39,13 +39,13 @@ def find_observations(
     terrain that each of them places (see `StopMatcher`). The same files give the same observations to the
     last bit.
 
-    Left out are what the user's masks cover, missing and saturated pixels, and sky (see `find_masks`).
-    Between stops, so is the rover itself, and matches that stand still relative to the mast are dropped; at
-    one stop, where the deck stands still, both are kept.
+    Left out are pixels that the user's masks cover, missing and saturated pixels, and sky (see `find_masks`).
+    Between stops the rover itself is left out too, and so are matches that stand still relative to the mast;
+    within a stop, where the deck stands still, both are kept.
 
     `progress` is called with a stage, how many of its parts are done, and how many there are. `cache` is a
-    folder to keep each part in: what has not changed since an earlier run, also one that was interrupted, is
-    taken from there, and the result is the same to the last bit.
+    folder in which each part is kept: a part whose inputs have not changed since an earlier run, even an
+    interrupted one, is taken from there. The result is the same to the last bit.
 
     Returns the traverse with observations of origin "images", in place of any that it had, and with
     warnings for images without observations, or whose file cannot be used (missing, truncated, of another
@@ -59,9 +59,9 @@ def find_observations(
     warnings = [*work.pictures.warnings, *work.over_exposed()]
     parts: list[Links] = []
     far = replace(options, min_depth_m=max(options.min_depth_m, _SURE_DEPTH_M))
-    for pair, found in zip(work.pairs, work.matches, strict=True):
-        if len(found.matches):
-            parts.append(_links(pair, found.matches))
+    for pair, matched in zip(work.pairs, work.matches, strict=True):
+        if len(matched.matches):
+            parts.append(_links(pair, matched.matches))
         elif np.mean(pair.overlap(far, widened=False)) > _SURE_OVERLAP:
             names = traverse.images[pair.a].id, traverse.images[pair.b].id
             warnings.append(
@@ -111,7 +111,7 @@ def find_observations(
             for a, b in sorted(untied)
         ]
     work.cache.forget_others()
-    pairs = tuple(_report(*found) for found in zip(work.pairs, work.matches, strict=True))
+    pairs = tuple(_report(*each) for each in zip(work.pairs, work.matches, strict=True))
     matching = Matching(pairs=pairs, stops=tuple(stops))
     return traverse.with_observations(observations, warnings, matching=matching)
 
@@ -123,7 +123,7 @@ def find_masks(
     progress: Progress | None = None,
     cache: Path | None = None,
 ) -> tuple[ImageMask | None, ...]:
-    """What of each image is left out, and why; None for an image without a file, or that is there twice.
+    """Which pixels of each image are left out, and why; None for an image without a file or a repeated one.
 
     Sky, saturated pixels and the rover are found in the images, unless `options.masks` is "user". The rover
     is what stands still relative to the mast between stops, in images in which an eye looks the same way at
@@ -132,15 +132,15 @@ def find_masks(
     return tuple(Steps(traverse, options, progress, Cache(cache)).masks)
 
 
-def _report(pair: PairGeometry, found: PairMatches) -> PairMatching:
+def _report(pair: PairGeometry, matched: PairMatches) -> PairMatching:
     return PairMatching(
         a=pair.a,
         b=pair.b,
-        candidates=found.candidates,
-        rover=found.rover,
-        off_line=found.off_line,
-        kept=len(found.matches),
-        refusal=found.refusal,
+        candidates=matched.candidates,
+        rover=matched.rover,
+        off_line=matched.off_line,
+        kept=len(matched.matches),
+        refusal=matched.refusal,
     )
 
 

@@ -32,33 +32,33 @@ class Reason(IntFlag):
     MISSING = 2
     """No data, or within 8 pixels of where there is none."""
     SATURATED = 4
-    """Brighter than the sensor can tell."""
+    """As bright as the sensor or the file can say, or brighter."""
     SKY = 8
     """Nothing but sky."""
     ROVER = 16
-    """Moves along with the rover; left out between stops only, for within a stop it stands still."""
+    """The rover itself. Left out between stops only, for within a stop it stands still."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ImageMask:
-    """What of an image is left out, and why."""
+    """Which pixels of an image are left out, and why."""
 
     reasons: NDArray[np.uint8]
     """(height, width) sums of `Reason`; 0: to be used."""
 
     def usable(self, *, between_stops: bool, margin_px: int = _MARGIN_PX) -> BoolArray:
-        """Pixels (height, width) farther than a margin from what is left out; skylines have no margin."""
+        """Which pixels (height, width) are farther than a margin from those left out; sky has no margin."""
         hard = Reason.USER | Reason.SATURATED | (Reason.ROVER if between_stops else 0)
         left_out = (self.reasons & np.uint8(hard) > 0).astype(np.uint8)
         near_it = cv2.dilate(left_out, np.ones((2 * margin_px + 1,) * 2, np.uint8))
         return np.asarray((near_it == 0) & (self.reasons & np.uint8(Reason.MISSING | Reason.SKY) == 0))
 
     def share(self, reason: Reason) -> float:
-        """Of the image that is left out for a reason."""
+        """Share of the image's pixels that are left out for a reason."""
         return float(np.mean(self.reasons & np.uint8(reason) > 0))
 
     def with_rover(self, rover: BoolArray) -> "ImageMask":
-        """The same mask, and the rover."""
+        """This mask with the rover's pixels added."""
         return ImageMask(reasons=self.reasons | np.uint8(Reason.ROVER) * rover.astype(np.uint8))
 
 
@@ -81,10 +81,10 @@ def mask_image(
 
 
 def saturated(image: NDArray[Any]) -> BoolArray:
-    """Which pixels lie in blocks as bright as samples of 8, 10, 12, 14 or 16 bits get, or as this image gets.
+    """Which pixels lie in blocks of the highest value: that of 8, 10, 12, 14 or 16 bits, or of this image.
 
-    That an image's own brightest value is a limit shows in its histogram: many more pixels have it than the
-    values just below. Images of rovers are often stretched or summed, so that full scale is anything.
+    An image's own highest value is taken for a limit if many more pixels have it than have the values just
+    below. Images of rovers are often stretched or summed, so that their limit may be any number.
     """
     top = int(image.max())
     full = next((f for f in _FULL_SCALES if f >= top), top)
@@ -96,7 +96,7 @@ def saturated(image: NDArray[Any]) -> BoolArray:
     ):
         return np.zeros(image.shape, dtype=bool)
     if int(image.min()) >= level and top < _NEAR_FULL * full:
-        return np.zeros(image.shape, dtype=bool)  # one value everywhere, far from full scale: no plateau
+        return np.zeros(image.shape, dtype=bool)  # all pixels have one value, which is not a limit
     block = np.ones((_CLIPPED_PX, _CLIPPED_PX), np.uint8)
     return np.asarray(cv2.morphologyEx((image >= level).astype(np.uint8), cv2.MORPH_OPEN, block) > 0)
 
@@ -119,7 +119,7 @@ def elevation_rad(traverse: Traverse, row: int) -> FloatArray:
 
 
 def pixels_at(usable: BoolArray, uv_px: FloatArray) -> BoolArray:
-    """Whether the pixels (n, 2) are usable; those outside the image are as the nearest inside."""
+    """Whether pixels (n, 2) are usable; one outside the image counts as the nearest inside."""
     height, width = usable.shape
     u, v = np.rint(uv_px).astype(np.int64).T
     return np.asarray(usable[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)])

@@ -83,13 +83,13 @@ def match_in_windows(
         best_d2,
         for_b,
     )
-    found = np.flatnonzero(best >= 0)
-    mutual = found[for_b[best[found]] == found]
+    matched = np.flatnonzero(best >= 0)
+    mutual = matched[for_b[best[matched]] == matched]
     return Matches(a=mutual, b=best[mutual], distance=np.sqrt(best_d2[mutual]) / DESCRIPTOR_NORM)
 
 
 def beyond_chance(agrees: BoolArray, chance: FloatArray, options: FrontEndOptions) -> bool:
-    """Whether more matches (n,) agree than would if all were wrong: each then does so by its chance (n,)."""
+    """Whether more matches (n,) agree than by chance; `chance` (n,) is that of each wrong match to agree."""
     expected, spread = float(chance.sum()), float(np.sqrt(np.sum(chance * (1 - chance))))
     least = max(options.min_pair_matches, expected + _CHANCE_SIGMAS * spread)
     return bool(np.count_nonzero(agrees) >= least)
@@ -124,10 +124,10 @@ def _search(
     best_d2: IntArray,
     for_b: IntArray,
 ) -> None:
-    """Best of b for `rows` of a, where it is good, and best of a for each of b, good or not.
+    """The best feature of b for each of the `rows` of a, if it is good, and the best of a for each of b.
 
-    `windows` are those of `Segments`, `size_a` is as b should show it. Those of b are in the order of their
-    cells (see `_gridded`), and `name_b` says which is which.
+    `windows` are those of `Segments`, `size_a` the sizes of a's features as b should show them. Features of b
+    are sorted by cell (see `_gridded`), and `name_b` gives their rows before that.
     """
     far, near, far_radius, near_radius = windows
     inside, d2_inside = np.empty(len(uv_b), dtype=np.int64), np.empty(len(uv_b), dtype=np.int64)
@@ -156,7 +156,7 @@ def _search(
                 size_ratio = size_a[a] / size_b[b]
                 if not 1 / _SIZE_RATIO < size_ratio < _SIZE_RATIO:
                     continue
-                # Of 32 bits throughout, or the compiler makes no vectors of it.
+                # 32 bits throughout: the compiler then computes with vectors.
                 total = np.int32(0)
                 for k in range(descriptor_a.shape[1]):
                     change = np.int32(np.int32(descriptor_a[a, k]) - np.int32(descriptor_b[b, k]))

@@ -1,4 +1,4 @@
-"""All that happens to one pair of images: match, correct the geometry, match again, verify."""
+"""Matching of one pair of images: match, correct the geometry, match again, verify."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -24,7 +24,7 @@ _DECK_PX = 3.0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PairMatches:
-    """Verified matches of two images, and what became of the other candidates; see `PairMatching`."""
+    """Verified matches of two images, and counts of the rejected candidates; see `PairMatching`."""
 
     matches: Matches
     candidates: int
@@ -33,13 +33,13 @@ class PairMatches:
     refusal: Refusal = Refusal.NONE
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """All of it, to be kept."""
+        """Everything as arrays, for the cache."""
         counts = [self.candidates, self.rover, self.off_line, int(self.refusal)]
         return {**vars(self.matches), "counts": np.array(counts)}
 
     @staticmethod
     def of_arrays(arrays: Mapping[str, NDArray[Any]]) -> "PairMatches":
-        """From what `arrays` gave."""
+        """The inverse of `arrays`."""
         candidates, rover, off_line, refusal = arrays["counts"].tolist()
         return PairMatches(
             matches=Matches(**{name: arrays[name] for name in ("a", "b", "distance")}),
@@ -61,40 +61,40 @@ def match_pair(
     """
     start = PairFit(p=pair.no_correction, root=np.diag(pair.sigma))
     segments = pair.segments(features_a.uv_px, start.p, start.root, options.search_slack_px, options)
-    found = _search(pair, features_a, features_b, segments, options)
-    matches = found.matches
+    matched = _search(pair, features_a, features_b, segments, options)
+    matches = matched.matches
     if len(matches) < options.min_pair_matches:
-        return _refused(found, Refusal.FEW_ALIKE)
+        return _refused(matched, Refusal.FEW_ALIKE)
     half_width = segments.far_radius_px[matches.a]
     uv_a, uv_b = features_a.uv_px[matches.a], features_b.uv_px[matches.b]
     fit = fit_pair(pair, uv_a, uv_b, start, float(half_width.max()), options)
     distance, _ = epipolar_px(pair, fit.p, uv_a, uv_b, options)
-    # Wrong matches lie anywhere in their windows: so many would agree by chance.
+    # Wrong matches are spread evenly over their windows: this share of them agrees by chance.
     chance = np.minimum(1.0, _TRUE_PX * np.hypot(1.0, segments.magnification[matches.a]) / half_width)
     if not beyond_chance(distance < _TRUE_PX, chance, options):
-        return _refused(found, Refusal.CHANCE)
+        return _refused(matched, Refusal.CHANCE)
 
     segments = pair.segments(features_a.uv_px, fit.p, fit.root, options.guided_slack_px, options)
-    found = _search(pair, features_a, features_b, segments, options)
-    matches = found.matches
+    matched = _search(pair, features_a, features_b, segments, options)
+    matches = matched.matches
     if len(matches) < options.min_pair_matches:
-        return _refused(found, Refusal.FEW_GUIDED)
+        return _refused(matched, Refusal.FEW_GUIDED)
     uv_a, uv_b = features_a.uv_px[matches.a], features_b.uv_px[matches.b]
     fit = fit_pair(pair, uv_a, uv_b, fit, options.guided_slack_px, options)
     distance, _ = epipolar_px(pair, fit.p, uv_a, uv_b, options)
     on_line = distance < _threshold_px(distance, options)
-    found = replace(found, matches=matches.select(on_line), off_line=int(np.count_nonzero(~on_line)))
-    if len(found.matches) < options.min_pair_matches:
-        return _refused(found, Refusal.FEW_ON_LINES)
-    return found
+    matched = replace(matched, matches=matches.select(on_line), off_line=int(np.count_nonzero(~on_line)))
+    if len(matched.matches) < options.min_pair_matches:
+        return _refused(matched, Refusal.FEW_ON_LINES)
+    return matched
 
 
-def _refused(found: PairMatches, refusal: Refusal) -> PairMatches:
-    return replace(found, matches=Matches.none(), refusal=refusal)
+def _refused(matched: PairMatches, refusal: Refusal) -> PairMatches:
+    return replace(matched, matches=Matches.none(), refusal=refusal)
 
 
 def _threshold_px(distance_px: FloatArray, options: FrontEndOptions) -> float:
-    # The median of |x| over a Gaussian is 0.6745 sigma. Matches that are all exact keep what rounding moves.
+    # The median of |x| is 0.6745 sigma for a Gaussian. The floor keeps exact matches despite rounding.
     scale = float(np.median(distance_px)) / 0.6745
     return min(max(options.epipolar_scales * scale, options.sigma_px), options.max_epipolar_px)
 
@@ -120,8 +120,7 @@ def _on_rover(pair: PairGeometry, uv_a: FloatArray, uv_b: FloatArray, options: F
 
     A match stands still if, within the pointing's uncertainty, it lies where a point fixed to the mast
     would, at any depth. Distant terrain does so too where the rover has not turned between the stops, so
-    what is seen near or above the horizon is taken for terrain; an antenna that rises so high is not
-    recognised.
+    a match near or above the horizon is taken for terrain, also one on an antenna that rises so high.
     """
     fixed = replace(pair, rover_fixed=True)
     still = fixed.segments(uv_a, fixed.no_correction, np.diag(fixed.sigma), _DECK_PX, options)

@@ -32,6 +32,6 @@ def usable_mask(image: NDArray[Any]) -> NDArray[np.bool_]:
     empty = (image == 0).astype(np.uint8)
     block = np.ones((_EMPTY_BLOCK_PX, _EMPTY_BLOCK_PX), np.uint8)
     reach = np.ones((2 * _EMPTY_MARGIN_PX + _EMPTY_BLOCK_PX,) * 2, np.uint8)
-    # Beyond the image's edge nothing counts as missing.
+    # Beyond the image's edge no pixel counts as missing.
     blocks = cv2.erode(empty, block, borderType=cv2.BORDER_CONSTANT, borderValue=0)
     return np.asarray(cv2.dilate(blocks, reach) == 0)

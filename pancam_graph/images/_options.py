@@ -18,16 +18,16 @@ class FrontEndOptions:
     tile_px: float = 64.0
     """Size of the tiles over which brightness and contrast are evened out."""
     max_contrast_gain: float = 4.0
-    """How much contrast is raised at most; more finds more features in haze, and more noise."""
+    """Limit of the factor that raises contrast; a higher one finds more features in haze, and more noise."""
     contrast_threshold: float = 0.01
-    """SIFT's; lower finds fainter features."""
+    """Threshold of SIFT; a lower one finds fainter features."""
     max_features: int = 6_000
     """The strongest features kept per image, evenly over a grid of cells, where all of it overlaps others.
 
-    Where half of it does, four times as many, up to 20 000: a narrow overlap has to carry more."""
+    Where half of the image does, four times as many are kept, up to 20 000: a narrow overlap needs more."""
     max_ties: int = 2_500
-    """Where an image shares more points than these with others, those that most images see are kept, evenly
-    over a grid of cells; a point that any of its images keeps counts in all."""
+    """If an image shares more points with others, the points that most images see are kept, evenly over a
+    grid of cells. A point is kept in all its images if one of them keeps it."""
     min_depth_m: float = 0.5
     """Nothing nearer than this is matched."""
     min_overlap: float = 0.05
@@ -39,7 +39,7 @@ class FrontEndOptions:
     search_sigmas: float = 4.0
     """How many standard deviations of the telemetry the search window reaches."""
     search_slack_px: float = 3.0
-    """Added to the search window: what telemetry's sigma does not stand for."""
+    """Added to the search window, for errors that the standard deviations of telemetry leave out."""
     mount_sigma_rad: float = 1.05e-3
     """How well an eye's orientation on the head is known, twist and flex of the mast included."""
     ratio: float = 0.85
@@ -55,7 +55,7 @@ class FrontEndOptions:
     min_pair_matches: int = 12
     """A pair of images with fewer verified matches gives none."""
     sigma_px: float = 0.2
-    """Standard deviation of each coordinate of a feature of size 0: a guess, which a solve rescales."""
+    """Standard deviation of each coordinate of a feature of size 0. A solve rescales this guess."""
     sigma_per_size: float = 0.03
     """What a feature's diameter adds to its standard deviation, in quadrature, as a share of the diameter."""
     refined_sigma_px: float = 0.12

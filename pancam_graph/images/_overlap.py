@@ -1,4 +1,4 @@
-"""Which images overlap, and on which parts of them, by all that telemetry knows."""
+"""Which images overlap, and on which of their parts, within the uncertainty of telemetry."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -24,16 +24,16 @@ def overlapping_pairs(
     *,
     stops: BoolArray,
 ) -> list[PairGeometry]:
-    """Pairs of images (a before b) that can see the same terrain by all that telemetry knows.
+    """Pairs of images (a before b) that may see the same terrain, within the uncertainty of telemetry.
 
-    Only of those pairs of stops (stops, stops) that are asked for; symmetric.
+    `stops` (stops, stops), symmetric, says which pairs of stops are asked for.
     """
     wanted = stops[np.ix_(traverse.image_stop, traverse.image_stop)]
     candidates = np.argwhere(np.triu(_cones_meet(traverse, options) & wanted, 1))
     pairs = []
     for k, (a, b) in enumerate(candidates.tolist()):
         pair = PairGeometry(traverse, a, b, options.mount_sigma_rad)
-        # Both ways: a narrow eye's whole field can lie between the corners of a wide one's pieces.
+        # Both ways: the whole field of a narrow eye can lie between the corners of a wide eye's pieces.
         if any(_share(p, options) > 0 for p in (pair, replace(pair, a=b, b=a))):
             pairs.append(pair)
         if progress is not None:
@@ -45,7 +45,7 @@ def _share(pair: PairGeometry, options: FrontEndOptions) -> float:
     """Share of image a that can lie on b; 0 where it is too small to be worth a comparison.
 
     Within a stop the search window counts, so that a small overlap is found wherever the pointing errs.
-    Between stops it would let nearly all pairs through: there the pointing is taken as telemetry has it.
+    Between stops the window would keep nearly all pairs: there the pointing is taken as exact.
     """
     share = float(np.mean(pair.overlap(options, widened=pair.same_stop)))
     least = options.min_overlap if pair.same_stop else options.min_overlap_between_stops
@@ -53,7 +53,7 @@ def _share(pair: PairGeometry, options: FrontEndOptions) -> float:
 
 
 def _cones_meet(traverse: Traverse, options: FrontEndOptions) -> BoolArray:
-    """Which images (images, images) may see a common point, by the cones around their fields: a sieve."""
+    """Which images (images, images) may see a common point: a quick test with cones around their fields."""
     R, centre = traverse.camera_poses()
     axis_of, half_of = zip(*(_cone(e.camera) for e in traverse.rig.eyes), strict=True)
     axis = np.einsum("nij,nj->ni", R, np.array(axis_of)[traverse.image_eye])

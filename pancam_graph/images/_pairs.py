@@ -1,4 +1,4 @@
-"""What the pointing says about two images: whether they overlap, and where to look for a feature."""
+"""The geometry of two images by their pointing: whether they overlap, and where to look for a feature."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,16 +24,16 @@ __all__ = [
 ]
 
 FAR_M = 1e7
-"""Stands for infinity: a baseline of 100 m is 1e-5 rad there."""
+"""Depth that stands for infinity: a baseline of 100 m is seen there under 1e-5 rad."""
 
 _DEPTHS = 16
-_AT_ONCE = 16_384  # points: few calls for few features, and what fits in the caches of a core for many
+_AT_ONCE = 16_384  # points at once: few calls for few features, and little enough for the caches of a core
 _COARSE_FARTHEST_M = 200.0
 _DIFFERENCE = 1e-2
 MAX_TURN_RAD = float(np.deg2rad(30.0))
-"""Terrain seen from further around looks too different for its descriptors."""
+"""Between lines of sight with a larger angle, descriptors of the same terrain do not agree."""
 MAX_ZOOM = 2.5
-"""And so from so many times the distance."""
+"""Nor do they at distances whose ratio is larger."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -92,7 +92,7 @@ class Relative(NamedTuple):
     """Pose of camera a in the frame of camera b."""
 
     R: FloatArray
-    """(3, 3)"""
+    """(3, 3) b_R_a"""
     t: FloatArray
     """(3,) metres."""
 
@@ -210,8 +210,8 @@ class PairGeometry:
             rays.origin_m + FAR_M * rays.direction, b_T_a, d_b_T_a
         )
 
-        # The depths that both see alike, and whose pixels fall on b or near it, form one run: its ends are
-        # those of the segment.
+        # The depths at which both see the point from similar sides, on b or near it, are consecutive: the
+        # first and the last of them are the ends of the segment.
         depths = inspected_depths_m(options.min_depth_m)
         pixels, inside = np.empty((len(depths), n, 2)), np.empty((len(depths), n), dtype=bool)
         size = np.array([self.camera_b.width_px, self.camera_b.height_px])
@@ -226,7 +226,7 @@ class PairGeometry:
         row = np.arange(n)
         far_px, near_px = pixels[first, row], pixels[last, row]
 
-        # Distortion bends the line of sight's image: the half width covers what a straight piece misses.
+        # Distortion bends the image of a line of sight: the half width covers its distance from the straight.
         along = near_px - far_px
         across = (
             np.stack([-along[:, 1], along[:, 0]], 1)
@@ -285,10 +285,10 @@ class PairGeometry:
 
 
 def move_pixels(points_m: FloatArray, d_uv: FloatArray, d_b_T_a: tuple[FloatArray, FloatArray]) -> FloatArray:
-    """How pixels in b move (n, 2, k) with k changes of the pose, see `PairGeometry.d_b_T_a`.
+    """Derivatives (n, 2, k) of pixels in b by k changes of the pose, see `PairGeometry.d_b_T_a`.
 
-    Of points (n, 3) in the frame of camera a; `d_uv` (n, 2, 3) is how a pixel moves with the point in that
-    of b.
+    `d_uv` (n, 2, 3) are the derivatives of the pixels by the points in the frame of b. The points (n, 3) are
+    in that of a.
     """
     d_R, d_t = d_b_T_a
     moved = points_m @ np.swapaxes(d_R, 1, 2) + d_t[:, None]

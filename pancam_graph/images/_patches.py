@@ -1,4 +1,4 @@
-"""Least-squares matching of patches (Gruen 1985), after a search by correlation: what runs per patch.
+"""Least-squares matching of patches (Gruen 1985), after a search by correlation: the compiled loop.
 
 A patch of image a is compared with image b under an affine map from a to b, and any gain and offset. Images
 are given by their cubic spline coefficients.
@@ -10,18 +10,18 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from pancam_graph.base.compiled import entry, part
+from pancam_graph.base.compiled import entry, inlined, part
 from pancam_graph.base.geometry import FloatArray, IntArray
 
 __all__ = ["HALF_WIDTH_PX", "MAX_REACH_PX", "Coefficients", "align_patches"]
 
 Coefficients: TypeAlias = NDArray[np.float32]
-"""Of cubic splines, (height, width)."""
+"""Coefficients (height, width) of cubic splines."""
 
 HALF_WIDTH_PX = 6
-"""Of a patch, in image a."""
+"""Half width of a patch in image a: it has 2 HALF_WIDTH_PX + 1 pixels to a side."""
 MAX_REACH_PX = 12
-"""Furthest a search goes along u or v of image a."""
+"""The furthest that a search goes along u or v of image a."""
 
 _WEIGHT_PX = 4.0
 _SIDE = 2 * HALF_WIDTH_PX + 1
@@ -33,7 +33,7 @@ _SAME_PEAK_PX = 2
 
 @part
 def _at(coefficients: Coefficients, u: float, v: float) -> float:
-    """Brightness at a pixel, of the nearest one on the image."""
+    """Brightness at a pixel; outside the image, that of the nearest pixel inside."""
     height, width = coefficients.shape
     u = min(max(u, 0.0), width - 1.0)
     v = min(max(v, 0.0), height - 1.0)
@@ -43,7 +43,7 @@ def _at(coefficients: Coefficients, u: float, v: float) -> float:
     a1, a2 = 2 / 3 - x * x + x**3 / 2, 2 / 3 - (1 - x) ** 2 + (1 - x) ** 3 / 2
     b0, b3 = (1 - y) ** 3 / 6, y**3 / 6
     b1, b2 = 2 / 3 - y * y + y**3 / 2, 2 / 3 - (1 - y) ** 2 + (1 - y) ** 3 / 2
-    # Cubic splines continue beyond the edge as in a mirror.
+    # Beyond the edge the coefficients are mirrored.
     i0, i2, i3 = abs(i - 1), min(i + 1, 2 * width - 3 - i), min(i + 2, 2 * width - 4 - i)
     value = 0.0
     for k in range(4):
@@ -58,7 +58,7 @@ def _at(coefficients: Coefficients, u: float, v: float) -> float:
 
 @part
 def _standardise(patch: FloatArray, weight: FloatArray) -> float:
-    """Take out a patch's weighted mean and standard deviation; returns the latter."""
+    """Subtract a patch's weighted mean and divide it by its standard deviation, which is returned."""
     mean = np.sum(patch * weight)
     patch -= mean
     spread = math.sqrt(max(np.sum(patch * patch * weight), 1e-12))
@@ -66,24 +66,26 @@ def _standardise(patch: FloatArray, weight: FloatArray) -> float:
     return spread
 
 
-@part
+@inlined
 def _search(
     image_b: Coefficients,
     x: float,
     y: float,
-    affine: FloatArray,
+    affine: tuple[float, float, float, float],
     rx: int,
     ry: int,
     template: FloatArray,
     weight: FloatArray,
     around: FloatArray,
     scores: FloatArray,
-) -> tuple[int, int, float]:
-    """Shift (pixels of a, along u and v) of the best correlation within the reach, and the second best peak.
+) -> tuple[float, float, float]:
+    """The pixel of b around (x, y) whose patch has the highest correlation with the template.
 
-    `around` and `scores` are work space.
+    On a grid of pixels of a, up to `rx` and `ry` to either side. Returns the pixel, and the highest
+    correlation away from it (-1: none). `around` and `scores` are overwritten.
     """
-    m00, m01, m10, m11 = affine[0, 0], affine[0, 1], affine[1, 0], affine[1, 1]
+    m00, m01, m10, m11 = affine
+    second = -1.0
     for j in range(_SIDE + 2 * ry):
         for i in range(_SIDE + 2 * rx):
             du, dv = i - HALF_WIDTH_PX - rx, j - HALF_WIDTH_PX - ry
@@ -92,7 +94,7 @@ def _search(
     for j in range(2 * ry + 1):
         for i in range(2 * rx + 1):
             total, square, product = 0.0, 0.0, 0.0
-            for k in range(_SIDE * _SIDE):
+            for k in range(len(weight)):
                 w, value = weight[k], around[j + k // _SIDE, i + k % _SIDE]
                 total += w * value
                 square += w * value * value
@@ -100,12 +102,53 @@ def _search(
             scores[j, i] = product / math.sqrt(max(square - total * total, 1e-12))
             if scores[j, i] > best:
                 best, best_i, best_j = scores[j, i], i, j
-    second = -1.0
     for j in range(2 * ry + 1):
         for i in range(2 * rx + 1):
             if max(abs(i - best_i), abs(j - best_j)) > _SAME_PEAK_PX:
                 second = max(second, scores[j, i])
-    return best_i - rx, best_j - ry, second
+    du, dv = best_i - rx, best_j - ry
+    x, y = x + m00 * du + m01 * dv, y + m10 * du + m11 * dv
+    return x, y, second
+
+
+@inlined
+def _differentiate(
+    image_a: Coefficients,
+    u: float,
+    v: float,
+    contrast: float,
+    affine: tuple[float, float, float, float],
+    offset: FloatArray,
+    weight: FloatArray,
+    template: FloatArray,
+    jacobian: FloatArray,
+) -> None:
+    """Derivatives of the patch in b by two shifts and four entries of the map, to `jacobian` (taps, 6).
+
+    The part that a gain or an offset could explain is taken out, as from the patches.
+    """
+    m00, m01, m10, m11 = affine
+    determinant = m00 * m11 - m01 * m10
+    for k in range(len(weight)):
+        pu, pv = u + offset[k, 0], v + offset[k, 1]
+        gu = (_at(image_a, pu + 0.5, pv) - _at(image_a, pu - 0.5, pv)) / contrast
+        gv = (_at(image_a, pu, pv + 0.5) - _at(image_a, pu, pv - 0.5)) / contrast
+        gx, gy = (gu * m11 - gv * m10) / determinant, (gv * m00 - gu * m01) / determinant
+        jacobian[k] = (
+            gx,
+            gy,
+            gx * offset[k, 0],
+            gx * offset[k, 1],
+            gy * offset[k, 0],
+            gy * offset[k, 1],
+        )
+    for c in range(6):
+        mean, along = 0.0, 0.0
+        for k in range(len(weight)):
+            mean += weight[k] * jacobian[k, c]
+            along += weight[k] * template[k] * jacobian[k, c]
+        for k in range(len(weight)):
+            jacobian[k, c] -= mean + along * template[k]
 
 
 @entry
@@ -119,16 +162,16 @@ def align_patches(
     reach: IntArray,
     steps: int,
     uv_b: FloatArray,
-    found: FloatArray,
+    quality: FloatArray,
 ) -> None:
     """Where the patches around pixels of a lie in b, for rows `first` to `last`.
 
     `uv_a` (n, 2); `affine` (n, 2, 2) is the derivative of the pixel in b by that in a, and `uv_b` (n, 2) the
     pixel in b, both at the start; `uv_b` is moved. `reach` (n, 2) is how many pixels of a the search by
-    correlation goes from the start to either side, along u and v. `found` (n, 5) gets the correlation where
-    the least-squares matching starts, where it ends, the second best of the search, and how far from its
-    start it ended, in pixels of b; and there too, but for a factor that is the same for all, how uncertain
-    that makes the place that the patches still differ.
+    correlation goes from the start to either side, along u and v. `quality` (n, 5) gets: the correlation
+    where the least-squares matching starts; that where it ends; the second best of the search; the distance
+    between start and end, in pixels of b; and the standard deviation of the end, in pixels of b times a
+    factor that is the same for all patches, from how much the patches still differ.
     """
     n_taps = _SIDE * _SIDE
     offset, weight = np.empty((n_taps, 2)), np.empty(n_taps)
@@ -148,36 +191,15 @@ def align_patches(
         m00, m01, m10, m11 = affine[row, 0, 0], affine[row, 0, 1], affine[row, 1, 0], affine[row, 1, 1]
         x, y = uv_b[row]
 
-        # The search, on a grid of pixels of a.
         rx, ry = reach[row]
         second = -1.0
         if rx > 0 or ry > 0:
-            du, dv, second = _search(image_b, x, y, affine[row], rx, ry, template, weight, around, scores)
-            x, y = x + m00 * du + m01 * dv, y + m10 * du + m11 * dv
+            x, y, second = _search(
+                image_b, x, y, (m00, m01, m10, m11), rx, ry, template, weight, around, scores
+            )
         x_start, y_start = x, y
 
-        # Columns: two of shift, four of the affine map; gain and offset are taken out as from the patches.
-        determinant = m00 * m11 - m01 * m10
-        for k in range(n_taps):
-            pu, pv = u + offset[k, 0], v + offset[k, 1]
-            gu = (_at(image_a, pu + 0.5, pv) - _at(image_a, pu - 0.5, pv)) / contrast
-            gv = (_at(image_a, pu, pv + 0.5) - _at(image_a, pu, pv - 0.5)) / contrast
-            gx, gy = (gu * m11 - gv * m10) / determinant, (gv * m00 - gu * m01) / determinant
-            jacobian[k] = (
-                gx,
-                gy,
-                gx * offset[k, 0],
-                gx * offset[k, 1],
-                gy * offset[k, 0],
-                gy * offset[k, 1],
-            )
-        for c in range(6):
-            mean, along = 0.0, 0.0
-            for k in range(n_taps):
-                mean += weight[k] * jacobian[k, c]
-                along += weight[k] * template[k] * jacobian[k, c]
-            for k in range(n_taps):
-                jacobian[k, c] -= mean + along * template[k]
+        _differentiate(image_a, u, v, contrast, (m00, m01, m10, m11), offset, weight, template, jacobian)
         normal = np.zeros((6, 6))
         for k in range(n_taps):
             for c in range(6):
@@ -217,7 +239,7 @@ def align_patches(
             m11 += min(max(change[5], -_MAX_AFFINE_STEP), _MAX_AFFINE_STEP)
             moving = math.hypot(change[0], change[1]) > _CONVERGED_PX
         uv_b[row, 0], uv_b[row, 1] = x, y
-        found[row, 0], found[row, 1], found[row, 2] = at_start, correlation, second
-        found[row, 3] = math.hypot(x - x_start, y - y_start)
-        # The standardised patches differ by 2 (1 - correlation): the noise of the fit's observations.
-        found[row, 4] = math.sqrt(max(1.0 - correlation, 0.0) * (inverse[0, 0] + inverse[1, 1]))
+        quality[row, 0], quality[row, 1], quality[row, 2] = at_start, correlation, second
+        quality[row, 3] = math.hypot(x - x_start, y - y_start)
+        # The patches' mean squared difference is 2 (1 - correlation): the variance of the noise.
+        quality[row, 4] = math.sqrt(max(1.0 - correlation, 0.0) * (inverse[0, 0] + inverse[1, 1]))

@@ -38,7 +38,7 @@ def refine_tracks(
     differ by more than a factor of 2.
     """
     refined = np.zeros(len(image), dtype=bool)
-    found = uv_px.copy()
+    refined_px = uv_px.copy()
     first = np.searchsorted(track, track)
     other = np.flatnonzero(first != np.arange(len(track)))
     pairs = np.column_stack([image[first[other]], image[other]])
@@ -46,9 +46,9 @@ def refine_tracks(
         pair = PairGeometry(traverse, int(a), int(b), options.mount_sigma_rad)
         rows = other[(pairs[:, 0] == a) & (pairs[:, 1] == b)]
         uv_b, good = _refine_pair(pair, spline, uv_px[first[rows]], uv_px[rows], options)
-        found[rows[good]] = uv_b[good]
+        refined_px[rows[good]] = uv_b[good]
         refined[rows[good]] = refined[first[rows[good]]] = True
-    return found, refined
+    return refined_px, refined
 
 
 def _refine_pair(
@@ -72,9 +72,9 @@ def _refine_pair(
     at_start, correlation, _, moved, _ = fit.T
     good = moved < _MAX_SHIFT_PX * np.maximum(magnification[rows], 1.0)
     good &= (correlation > _MIN_CORRELATION) & (correlation >= at_start)
-    found, refined = uv_b.copy(), np.zeros(len(uv_b), dtype=bool)
-    found[rows], refined[rows] = position, good
-    return found, refined
+    matched_px, refined = uv_b.copy(), np.zeros(len(uv_b), dtype=bool)
+    matched_px[rows], refined[rows] = position, good
+    return matched_px, refined
 
 
 def _affine(pair: PairGeometry, uv_a: FloatArray, uv_b: FloatArray, options: FrontEndOptions) -> FloatArray:

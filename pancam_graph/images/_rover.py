@@ -1,4 +1,4 @@
-"""Where images show the rover itself: what stands still relative to the mast while the rover drives."""
+"""Where images show the rover itself: it stands still relative to the mast while the rover drives."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -39,16 +39,16 @@ _Moves = tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Windows:
-    """An image (height, width) by its windows: brightness that varies across them, and by how much."""
+    """An image (height, width) with its smooth part taken out, and the contrast in a window at each pixel."""
 
     detail: NDArray[np.float32]
     mean: NDArray[np.float32]
     spread: NDArray[np.float32]
-    """Standard deviation in each window; infinite where it is hardly more than noise."""
+    """Standard deviation in each pixel's window; infinite where that is hardly more than noise."""
 
     @staticmethod
     def of(grey: NDArray[np.float32]) -> "_Windows":
-        # Vignetting and haze are alike in all images.
+        # Vignetting and haze look alike in all images: the smooth part is taken out.
         detail = grey - cv2.GaussianBlur(grey, (0, 0), _HIGH_PASS_PX)
         mean = _window_mean(detail)
         spread = np.sqrt(np.maximum(_window_mean(detail * detail) - mean**2, 0.0))
@@ -56,7 +56,7 @@ class _Windows:
         return _Windows(detail=detail, mean=mean, spread=shown)
 
     def padded(self, margin: int) -> "_Windows":
-        """The same with a margin all around that shows nothing."""
+        """This image with an empty margin on all sides."""
         detail, mean = (np.pad(x, margin) for x in (self.detail, self.mean))
         shown = np.pad(self.spread, margin, constant_values=np.float32(np.inf))
         return _Windows(detail=detail, mean=mean, spread=shown)
@@ -67,9 +67,9 @@ def _window_mean(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def rover_partners(traverse: Traverse, row: int, *, available: BoolArray) -> list[int]:
-    """Images of other stops in which the same eye looks the same way, nearest stops first; a few.
+    """Rows of a few images of other stops in which the same eye looks the same way, nearest stops first.
 
-    `available` (images,) are those that may be asked for.
+    `available` (images,) says which images may be used.
     """
     angles = traverse.pan_tilt_rad[traverse.image_frame]
     pan, tilt = wrap_angle(angles[:, 0] - angles[row, 0]), angles[:, 1] - angles[row, 1]
@@ -91,20 +91,20 @@ def find_rover(
     """Which pixels of an image (height, width) show the rover, its shadow, or dust on the lens.
 
     Each partner (see `rover_partners`) is laid over the image as if the rover had not moved. Where the two
-    then look alike, window by window, what they show moved along. Nothing is said where terrain would look
-    alike too: within 3 degrees of the horizontal and above, and where ground 0.8 to 3 m below the eye would
-    hardly move in the image between the two stops.
+    then look alike, window by window, what they show moved along. No pixel is called rover where terrain
+    would look alike too: within 3 degrees of the horizontal and above, and where ground 0.8 to 3 m below the
+    eye would hardly move in the image between the two stops.
     """
     image = images[row]
     assert image is not None  # an image without a file has no partners
-    found = np.zeros(image.shape, dtype=bool)
+    rover = np.zeros(image.shape, dtype=bool)
     for partner in partners:
         other = images[partner]
         if other is not None:
-            found |= _standing_still(
+            rover |= _standing_still(
                 PairGeometry(traverse, row, partner, options.mount_sigma_rad), image, other, options
             )
-    return found
+    return rover
 
 
 def _standing_still(
@@ -118,7 +118,7 @@ def _standing_still(
     size = (round(scale * image_a.shape[1]), round(scale * image_a.shape[0]))
     greys = [_resized(x.astype(np.float32), size) for x in (image_a, laid_over)]
     there = cv2.resize(decided.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-    # The pointing's error moves the rover as a whole: its shift is sought on small images, then refined.
+    # An error of pointing shifts the rover as a whole: the shift is found in small images, then refined.
     small = (max(1, size[0] // _COARSER), max(1, size[1] // _COARSER))
     coarse_a, coarse_b = (_Windows.of(_resized(x, small)) for x in greys)
     there_small = cv2.resize(there.astype(np.uint8), small, interpolation=cv2.INTER_NEAREST) > 0
@@ -139,7 +139,7 @@ def _standing_still(
 def _prediction(
     pair: PairGeometry, shape: tuple[int, ...], options: FrontEndOptions
 ) -> tuple[BoolArray, float, NDArray[np.float32], NDArray[np.float32]]:
-    """Where standing still can be told, how far the pointing may err in pixels, and where b shows the deck.
+    """Where terrain would move visibly, the pointing's error in pixels, and where b would show the deck.
 
     The two maps (height, width) have the pixel of b for each pixel of a: u, v.
     """
@@ -231,13 +231,13 @@ def _correlation(a: _Windows, b: _Windows, shift: tuple[int, int]) -> NDArray[np
 
 
 def _noise(grey: NDArray[np.float32]) -> float:
-    """Of the quietest tenth of the image."""
+    """Standard deviation of the noise, from the quietest tenth of the image."""
     change = cv2.blur(np.abs(np.diff(grey, axis=1)), (_WINDOW_PX, _WINDOW_PX))
     return max(float(np.quantile(change, 0.1)) / 1.128, _HALF_STEP)
 
 
 def _tidied(region: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Without what chance may make, bridged where the rover is smooth, holes filled, and a little wider."""
+    """The region without specks, with gaps on smooth parts and holes closed, and a little wider."""
     bridge = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_BRIDGED_PX, _BRIDGED_PX))
     padded = np.pad(region, _BRIDGED_PX, mode="edge")
     closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, bridge)

@@ -1,4 +1,4 @@
-"""Where an image shows nothing but sky."""
+"""Which pixels of an image show only sky."""
 
 from typing import Any
 
@@ -41,13 +41,12 @@ def find_sky(image: NDArray[Any], elevation_rad: FloatArray) -> BoolArray:
     gradient = np.hypot(du, dv)
     plain = _filled((gradient < _EDGE * level).astype(np.uint8), round(_SPECK * grey.size))
     plain &= elevation_rad > _LOWEST_RAD
-    # No edge above: what lies below the skyline is not sky, and a weak piece of skyline does not let through
-    # more than its neighbours do.
+    # Sky ends at the first edge from above. A column in which that edge is weak ends where its neighbours do.
     down = np.where(plain.all(axis=0), len(plain), plain.argmin(axis=0)).astype(np.float32)
     down = cv2.erode(down[None], np.ones((1, _NEIGHBOURS_PX), np.uint8))[0]
     reached = np.arange(len(plain))[:, None] < down
     _, labels = cv2.connectedComponents((plain & reached).astype(np.uint8), connectivity=4)
-    # Of a smooth slope above the horizontal few blocks are as quiet as noise.
+    # On a smooth slope above the horizontal few blocks are as quiet as noise.
     above, count = elevation_rad > _SEED_RAD, int(labels.max()) + 1
     quiet = 2 * np.bincount(labels[seeds & above], minlength=count)
     is_sky = quiet > np.maximum(np.bincount(labels[above], minlength=count), 1)
@@ -60,9 +59,9 @@ def _seeds(grey: NDArray[np.float32], elevation_rad: FloatArray) -> tuple[BoolAr
     change = np.abs(np.diff(grey, axis=1, append=grey[:, -2:-1]))
     noise = np.maximum(_blocks(change).mean(axis=2) / 1.128, _HALF_STEP)
     du, dv = (_blocks(g) for g in _gradient(grey, _SEED_BLUR_PX))
-    # A sky brightens towards the horizon, and lenses darken towards the corners: slopes are no structure.
+    # Skies brighten towards the horizon and lenses darken towards the corners: a gradient is no structure.
     slopeless = np.hypot(du - du.mean(axis=2, keepdims=True), dv - dv.mean(axis=2, keepdims=True))
-    # The median gradient of white noise.
+    # The median gradient that white noise has.
     expected = 1.177 * noise / (np.sqrt(8 * np.pi) * _SEED_BLUR_PX**2)
     high = _blocks(elevation_rad).min(axis=2) > _SEED_RAD
     quiet = high & (np.median(slopeless, axis=2) < _NOISE_RATIO * expected)
@@ -94,7 +93,7 @@ def _filled(region: NDArray[np.uint8], largest_px: int) -> BoolArray:
 
 
 def _blocks(values: NDArray[Any]) -> NDArray[Any]:
-    """Whole blocks of an image, (rows of blocks, columns of blocks, pixels); one where it is smaller."""
+    """Whole blocks of an image, (rows of blocks, columns of blocks, pixels); one block of a smaller image."""
     tall, wide = (max(1, n // _BLOCK_PX) for n in values.shape)
     high, broad = min(_BLOCK_PX, values.shape[0]), min(_BLOCK_PX, values.shape[1])
     blocks = values[: tall * high, : wide * broad].reshape(tall, high, wide, broad)

@@ -1,4 +1,4 @@
-"""Images as cubic splines, blurred as far as they are to be compared."""
+"""Images as cubic splines, blurred as a comparison with coarser images needs."""
 
 from collections import OrderedDict
 from collections.abc import Sequence
@@ -24,10 +24,10 @@ class _Kept:
 
 
 class Splines:
-    """Spline coefficients of images, the ones asked for last kept; for any number of threads."""
+    """Spline coefficients of images. The latest are kept. Several threads may ask at once."""
 
     def __init__(self, images: Sequence[GreyImage | None]) -> None:
-        """Of images that are there wherever coefficients are asked for."""
+        """Coefficients are asked for only of images that are not None."""
         self._images = images
         self._kept = OrderedDict[tuple[int, int], _Kept]()
         self._lock = Lock()
@@ -40,7 +40,7 @@ class Splines:
             self._kept.move_to_end(key)
             if len(self._kept) > _CACHED_IMAGES:
                 self._kept.popitem(last=False)
-        with kept.lock:  # who asks for the same at the same time waits for it
+        with kept.lock:  # a thread that asks for the same coefficients waits
             if kept.coefficients is None:
                 grey = self._images[row]
                 assert grey is not None  # it has features

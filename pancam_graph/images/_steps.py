@@ -40,7 +40,7 @@ __all__ = ["Progress", "Steps", "step_key"]
 
 _LOG = logging.getLogger(__name__)
 _WORLD_UP = np.array([0.0, 0.0, 1.0])
-_PATCH_PX = 8  # how far from its pixel a refined observation looks at the image
+_PATCH_PX = 8  # half width of the patch that refinement compares
 _OVER_EXPOSED = 0.3
 _MOST = 0.5
 _WHY = {
@@ -171,7 +171,7 @@ class Steps:
 
     @cached_property
     def feature_keys(self) -> list[str]:
-        """Digest of all that each image's features depend on."""
+        """Key of each image's features."""
         return [
             step_key(
                 "features",
@@ -184,7 +184,7 @@ class Steps:
 
     @cached_property
     def features(self) -> list[Features]:
-        """Of every image where it overlaps others; none for an image without a file."""
+        """Features of each image where it overlaps others; none for an image without a file."""
         world_R_camera, _ = self.traverse.camera_poses()
         keys, masks, all_wanted = self.feature_keys, self.masks, self.wanted
 
@@ -250,10 +250,10 @@ class Steps:
         return Splines(self.pictures.images)
 
     def refined(self, image: IntArray, track: IntArray, uv_px: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Better positions, and which observations have one; see `refine_tracks`.
+        """Positions after least-squares matching, and which observations it moved; see `refine_tracks`.
 
-        Tracks are refined by the image of their first observation. Where the patch around an observation, or
-        around the first of its track, has pixels that are left out, it stays as it was found.
+        One part of the work are the tracks that begin in one image. An observation keeps its position if the
+        patch around it, or around the first of its track, has pixels that are left out.
         """
         first = np.searchsorted(track, track)
         firsts = np.unique(image[first])
@@ -278,14 +278,15 @@ class Steps:
         clear = self._clear(image, track, fitted_px) & self._clear(image, track, uv_px)
         moved = refined & clear & clear[first] & (first != np.arange(len(first)))
         good = moved.copy()
-        good[first[moved]] = True  # it stays where it was found: the others fit to it
+        good[first[moved]] = True  # the first of a track keeps its position, to which the others are fitted
         return np.where(moved[:, None], fitted_px, uv_px), good
 
     def tied(self, observations: Observations, feature: IntArray) -> tuple[Observations, list[StopMatching]]:
-        """Observations within stops with what pairs of stops see of each other's terrain added.
+        """Observations within stops, with ties between stops added, and a report of each pair of stops.
 
-        They are sorted by track, then image; `feature` says of which feature each is. A solve of these places
-        the terrain of each stop. Each direction of each pair of stops is kept as soon as it is done.
+        The observations are sorted by track, then image; `feature` (n,) is the row of each in its image's
+        features. A solve of them places the terrain of each stop, which is then sought in the images of other
+        stops. The result for each direction of each pair of stops is kept in the cache as soon as it is done.
         """
         traverse = self.traverse.with_observations(observations)
         usable = [
@@ -296,7 +297,7 @@ class Steps:
         def place() -> Arrays:
             self.tell("terrain of the stops", 0, 1)
             solution = solve(traverse)
-            # A solve finds one factor for all noise: the ties' is stated in the units of the others'.
+            # A solve scales all noise by one factor, and the ties' noise must be in the same unit.
             unit = np.median(observations.sigma_px / solution.sigma_px)
             self.tell("terrain of the stops", 1, 1)
             return {**terrain_arrays(solution), "unit": np.array(unit)}
@@ -334,7 +335,7 @@ class Steps:
         return joined(observations, terrain, ties, unit * ties.sigma_px), [each.report for each in stop_ties]
 
     def _clear(self, image: IntArray, track: IntArray, uv_px: FloatArray) -> BoolArray:
-        """Whether no pixel is left out within a patch around each observation."""
+        """Which observations (n,) have no left-out pixel in the patch around them."""
         stop = self.traverse.image_stop[image]
         low, high = (np.full(int(track.max()) + 1, fill) for fill in (len(self.traverse.stops), -1))
         np.minimum.at(low, track, stop)

@@ -1,4 +1,4 @@
-"""The terrain that the images of single stops place, and how other stops should see it."""
+"""Terrain points that the images of single stops place, and how images of other stops should show them."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -28,13 +28,13 @@ class Sighting:
     """How an image of another stop should see n points of a terrain."""
 
     uv_px: FloatArray
-    """(n, 2)"""
+    """(n, 2) pixels."""
     d_pose: FloatArray
-    """(n, 2, 6) how the pixels move with the other mast's pose, in GTSAM's tangent."""
+    """(n, 2, 6) derivatives of the pixels by the other mast's pose, in GTSAM's tangent."""
     d_inverse_depth: FloatArray
-    """(n, 2) how they move with the points' inverse depths."""
+    """(n, 2) derivatives of the pixels by the points' inverse depths."""
     cosine: FloatArray
-    """(n,) of the angle between both lines of sight."""
+    """(n,) cosine of the angle between both lines of sight."""
     zoom: FloatArray
     """(n,) how much larger the other image shows what faces the camera, by lengths."""
     valid: BoolArray
@@ -45,7 +45,7 @@ class Sighting:
         return Sighting(**{name: column[rows] for name, column in vars(self).items()})
 
     def covariance_px2(self, pose_covariance: FloatArray, sigma_inverse_m: FloatArray) -> FloatArray:
-        """(n, 2, 2) what the pose (6, 6) and the inverse depths (n,) leave open."""
+        """(n, 2, 2) covariance of the pixels, from that of the pose (6, 6) and the depths' sigmas (n,)."""
         depth = self.d_inverse_depth * sigma_inverse_m[:, None]
         pose = self.d_pose @ pose_covariance @ np.swapaxes(self.d_pose, 1, 2)
         return np.asarray(pose + depth[:, :, None] * depth[:, None, :])
@@ -56,9 +56,9 @@ class Terrain:
     """Points with the image that each was first seen in, sorted by track."""
 
     traverse: Traverse
-    """At the stops and angles that the stops' own images give; its observations are those of the stops."""
+    """With poses and angles from each stop's own images, and the observations within stops."""
     track: IntArray
-    """(n,)"""
+    """(n,) track of each point in the traverse."""
     row: IntArray
     """(n,) the first observation of each track."""
     inverse_depth: FloatArray
@@ -75,23 +75,23 @@ class Terrain:
 
     @property
     def observations(self) -> Observations:
-        """Those of the stops."""
+        """The observations within stops."""
         assert self.traverse.observations is not None
         return self.traverse.observations
 
     @cached_property
     def image(self) -> IntArray:
-        """(n,) where each was first seen."""
+        """(n,) image in which each point was first seen."""
         return np.asarray(self.observations.image[self.row])
 
     @cached_property
     def uv_px(self) -> FloatArray:
-        """(n, 2) pixel there."""
+        """(n, 2) pixel of each point in that image."""
         return np.asarray(self.observations.uv_px[self.row])
 
     @cached_property
     def stop(self) -> IntArray:
-        """(n,) of that image."""
+        """(n,) stop of that image."""
         return self.traverse.image_stop[self.image]
 
     @cached_property
@@ -121,7 +121,7 @@ class Terrain:
 
     @cached_property
     def _along(self) -> FloatArray:
-        """(n, 3) how the points move with their depths, in the world."""
+        """(n, 3) derivatives of the points, in the world, by their depths."""
         R, centre = (p[self.image] for p in self._poses)
         axis = np.einsum("nij,nj->ni", R, self._forward[self.traverse.image_eye[self.image]])
         to_a = self._world_m - centre
@@ -150,7 +150,7 @@ class Terrain:
             k = np.flatnonzero(eye == e)
             uv[k], d_point[k], valid[k] = t.rig.eyes[e].camera.project_with_jacobian(in_camera[k])
         d_mast = d_point @ np.swapaxes(mast_R, 1, 2)
-        # A turn of the mast by w takes what it sees by -w x p, a shift by -v.
+        # In the mast's frame a turn w of the mast moves a point p by -w x p, a shift v moves it by -v.
         d_pose = np.concatenate([np.cross(d_mast, in_mast[:, None]), -d_mast], axis=2)
         inverse = np.maximum(self.inverse_depth[rows], _NEAREST_INVERSE_M)
         d_inverse = np.einsum("nij,nj->ni", d_mast @ R_m.T, -self._along[rows] / inverse[:, None] ** 2)
@@ -253,7 +253,10 @@ def terrain_from(
 def _sigma_inverse_m(
     solution: Solution, tracks: IntArray, to_point: FloatArray, image: IntArray
 ) -> FloatArray:
-    """Of inverse depths (n,), by the longest baseline across the line of sight; infinite without any."""
+    """Standard deviations (n,) of inverse depths, by the longest baseline across the line of sight.
+
+    Infinite without a baseline.
+    """
     t, obs = solution.traverse, solution.traverse.observations
     assert obs is not None
     rows = np.flatnonzero(solution.used & np.isin(obs.track, tracks))

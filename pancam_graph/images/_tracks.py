@@ -13,7 +13,7 @@ _CELLS = 16
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Links:
-    """Matches over all pairs of images: a feature of one image is the same thing as one of another."""
+    """Matches over all pairs of images: each says that two features show the same point."""
 
     image_a: IntArray
     """(n,)"""
@@ -24,7 +24,7 @@ class Links:
     feature_b: IntArray
     """(n,)"""
     distance: FloatArray
-    """(n,) how unlike the two are; smaller is trusted more."""
+    """(n,) distance of the two descriptors; the smaller, the better."""
 
     @staticmethod
     def concatenate(parts: "list[Links]") -> "Links":
@@ -39,10 +39,10 @@ def join_tracks(links: Links) -> tuple[IntArray, IntArray, IntArray]:
     """Join links to tracks that hold at most one feature of each image.
 
     Links are taken best first (ties: in the order of their images and features). One that would put two
-    features of an image into a track is refused, and only it: both its ends stay in the tracks they have.
-    So of two features that compete for a track the worse one leaves, alone or with what hangs on it, and
-    never the whole track. Returns columns `image`, `feature`, `track` of equal length, sorted by track,
-    then image; tracks are numbered from 0 in the order of their first image and feature.
+    features of an image into a track is refused, and only it: both its ends stay in the tracks they have. So
+    if two features of an image compete for a track, the worse one stays out, alone or with the features
+    linked to it, and the track remains. Returns columns `image`, `feature`, `track` of equal length, sorted
+    by track, then image; tracks are numbered from 0 in the order of their first image and feature.
     """
     ends = np.concatenate(
         [

@@ -23,7 +23,7 @@ _MIN_PARALLAX_PX = 0.05
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PairFit:
-    """Corrections of a pair's geometry (see `PairGeometry`) that its matches ask for."""
+    """Corrections p of a pair's geometry (see `PairGeometry`) by its matches."""
 
     p: FloatArray
     """Corrections."""
@@ -39,7 +39,7 @@ class _Lines:
     direction: FloatArray
     uv_b: FloatArray
     noise: FloatArray
-    """(n,) what noise of one pixel per coordinate in both images amounts to in b."""
+    """(n,) standard deviation in b of noise of one pixel per coordinate in both images."""
 
     @staticmethod
     def of(geometry: PairGeometry, uv_a: FloatArray, uv_b: FloatArray) -> "_Lines":
@@ -57,7 +57,7 @@ class _Lines:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Misfit:
-    """How the lines of sight, at some depths, miss the pixels of b."""
+    """Distances between the pixels of b and the projections of a's lines of sight at some depths."""
 
     residual_px: FloatArray
     """(n, 2) measured minus projected."""
@@ -73,7 +73,7 @@ class _Misfit:
         return _Misfit(residual_px=lines.uv_b - uv, d_uv=d_uv, slope=np.einsum("nij,nj->ni", d_uv, d_point))
 
     def across(self, inverse_depth: FloatArray, nearest: float) -> FloatArray:
-        """Projection (n, 2, 2) onto what no change of depth can mend.
+        """Projection (n, 2, 2) onto the part of a residual that no change of depth can reduce.
 
         That is the component across the epipolar line; both components where the inverse depth is at the
         end of its range, 0 to `nearest`, or moves nothing (no baseline).
@@ -94,7 +94,7 @@ def fit_pair(
     start_scale_px: float,
     options: FrontEndOptions,
 ) -> PairFit:
-    """Corrections that bring most matches onto their epipolar lines, against the prior of the telemetry.
+    """Corrections that bring most matches onto their epipolar lines, with telemetry as a prior.
 
     `uv_a`, `uv_b` are (n, 2) matched pixels, of which many may be wrong: weights follow Geman and McClure
     with a scale that shrinks from `start_scale_px` to half a pixel (graduated non-convexity: Blake and
@@ -129,7 +129,7 @@ def fit_pair(
 def epipolar_px(
     geometry: PairGeometry, p: FloatArray, uv_a: FloatArray, uv_b: FloatArray, options: FrontEndOptions
 ) -> tuple[FloatArray, FloatArray]:
-    """How far matched pixels (n, 2) are from agreeing, at the corrections p, and at which inverse depths.
+    """Distances (n,) of matched pixels (n, 2) from their epipolar lines, and the inverse depths of these.
 
     The distance (n,) is that of the pixel in b from the line of sight of the pixel in a, whose depth may
     be anything from `options.min_depth_m` to infinity; it is divided by what one pixel of noise in both

@@ -64,8 +64,8 @@ class Bearings(NamedTuple):
     plain: BoolArray
     """(segments,) whether the variable's tangent is the base's twist: the segment is the unit matrix"""
     chain: FloatArray
-    """(segments, rows, widest) takes a variable's tangent to the base's twist (6 rows, rotation first), and to
-    changes of fx, fy, skew, cx and cy (5 more rows, where calibrations are free)"""
+    """(segments, rows, widest) takes a variable's tangent to the base's twist (6 rows, rotation first), and
+    to changes of fx, fy, skew, cx and cy (5 more rows, where calibrations are free)"""
 
 
 class Reduced(NamedTuple):
