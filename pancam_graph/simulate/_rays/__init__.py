@@ -1,6 +1,6 @@
 """Rays against ground, rocks, pebbles and the rover's deck, and the light that comes back.
 
-All detail is a function of the place on the surface, never of the image: the same point looks the same from
+All detail is a function of the place on the surface, not of the image: a point looks the same from
 everywhere. Detail finer than a pixel's footprint is left out, octave by octave.
 """
 

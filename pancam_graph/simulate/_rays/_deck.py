@@ -15,7 +15,10 @@ RIM_M = 0.03
 def hit_deck(
     deck: Deck, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, end: float
 ) -> tuple[float, int, float, float, float]:
-    """The first plate before `end`: distance, plate (-1: none), x and y on it, distance to its rim."""
+    """The first plate that a ray meets nearer than `end`.
+
+    Returns its distance, the plate (-1: none), x and y on the plate, and the distance to the plate's rim.
+    """
     best, plate, hit_x, hit_y, hit_rim = end, -1, 0.0, 0.0, 0.0
     r, c = deck.rotation, deck.centre_m
     px, py, pz = ox - c[0], oy - c[1], oz - c[2]

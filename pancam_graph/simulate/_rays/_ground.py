@@ -1,4 +1,4 @@
-"""The ground: nested height fields, bilinear between nodes, and what they carry beside heights."""
+"""The ground: nested grids of heights, bilinear between nodes, with slopes, reflectance, rock and shade."""
 
 import math
 
@@ -25,13 +25,13 @@ from pancam_graph.simulate._rays._world import (
 __all__ = ["NEAREST_M", "height_at", "heights", "level_at", "march", "march_start", "sample"]
 
 NEAREST_M = 0.05
-_RIM = 1  # meshes at the border of a grid that are left to the next one
-_COARSEST = 5  # squaring with which a ray from the camera begins
+_RIM = 1  # meshes along the border of a grid for which the next coarser grid is used
+_COARSEST = 5  # size of squares, 2^k meshes, with which a ray from the camera begins
 
 
 @uncounted.inlined
 def level_at(scene: Scene, x: float, y: float) -> int:
-    """The finest grid that has ground around a place; the last one outside all."""
+    """The finest grid that covers a place; the coarsest where none does."""
     out = len(scene.height_shape) - 1
     for level in range(len(scene.height_shape) - 1):
         a = (x - scene.frame_m[level, 0, X]) / scene.frame_m[level, 0, STEP]
@@ -45,7 +45,7 @@ def level_at(scene: Scene, x: float, y: float) -> int:
 
 @uncounted.inlined
 def height_at(scene: Scene, level: int, x: float, y: float) -> float:
-    """Height of a grid at a place; nothing that means anything beside the grid."""
+    """Height of a grid at a place; without meaning outside the grid."""
     a = (x - scene.frame_m[level, 0, X]) / scene.frame_m[level, 0, STEP]
     b = (y - scene.frame_m[level, 0, Y]) / scene.frame_m[level, 0, STEP]
     wide, deep = scene.height_shape[level, ALONG_X], scene.height_shape[level, ALONG_Y]
@@ -72,7 +72,7 @@ def heights(scene: Scene, xy_m: FloatArray) -> FloatArray:
 def sample(
     scene: Scene, level: int, x: float, y: float, foot: float
 ) -> tuple[float, float, float, float, float]:
-    """What the ground carries around a place, over a round footprint: the channels in their order."""
+    """Means of the ground's channels, in their order, over a round footprint of diameter `foot`."""
     last = scene.surface_shape.shape[1] - 1
     wider = foot / scene.frame_m[level, 0, STEP]
     mip = math.log2(wider) if wider > 1 else 0.0
@@ -111,10 +111,9 @@ def sample(
 def march_start(
     scene: Scene, dx: float, dy: float, dz: float, ex: float, ey: float, ez: float, reached: float
 ) -> float:
-    """From where a ray may be followed, when another from the same place met the ground at `reached`.
+    """Distance before which a ray d cannot meet the ground: a ray e from the same place met it at `reached`.
 
-    A ray that rises above the other by more than the ground does sideways between them is free as long as
-    the other was.
+    If d rises over e by more than the ground may rise sideways between them, d is free as far as e was.
     """
     across, other = math.sqrt(dx * dx + dy * dy), math.sqrt(ex * ex + ey * ey)
     rise, aside = dz * other - ez * across, abs(dx * ey - dy * ex)
@@ -161,7 +160,7 @@ def march(
                 scene.ceiling_shape[level, squaring, ALONG_X],
                 scene.ceiling_shape[level, squaring, ALONG_Y],
             )
-            # A little onward, or rounding might hold a ray on a border for ever.
+            # A little further on, since rounding might keep a ray on a border for ever.
             beyond = t + 1e-9 * (1 + t)
             i = min(max(int((ox + beyond * dx - x0) / size), 0), wide_c - 1)
             j = min(max(int((oy + beyond * dy - y0) / size), 0), deep_c - 1)
@@ -169,7 +168,7 @@ def march(
             end = max(min(end_i, end_j, leave), beyond)
             if min(oz + t * dz, oz + end * dz) > scene.ceiling_m[start_c + j * wide_c + i]:
                 t = end
-                # In another square of the next size: that may be free as a whole.
+                # The ray enters another square of the next size, which may be free as a whole.
                 on = (i & 1) == to_i if end_i < end_j else (j & 1) == to_j
                 if on and squaring < scene.ceiling_shape.shape[1] - 1:
                     squaring += 1

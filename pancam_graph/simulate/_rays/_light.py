@@ -1,4 +1,4 @@
-"""What comes back from ground, stones, rocks and sky: radiance, over the footprint of a pixel."""
+"""Radiance of ground, stones, rocks and sky over the footprint of a pixel."""
 
 import math
 
@@ -21,10 +21,10 @@ from pancam_graph.simulate._rays._world import (
 
 __all__ = ["of_ground", "of_rock", "of_sky", "of_stone", "reflected", "sunlit"]
 
-_SKYLIGHT = 0.28  # of a clear sky on level ground, over that of the sun on ground that faces it
+_SKYLIGHT = 0.28  # light of the sky on level ground, over that of the sun on ground that faces it
 _MAX_TAPS = 4
 _FINEST_M = 0.0008
-_AVERAGED = 4.0  # waves along a footprint of which nothing is left
+_AVERAGED = 4.0  # detail is left out with so many waves along a footprint
 
 
 @uncounted.inlined
@@ -38,7 +38,7 @@ def reflected(
 
 @uncounted.inlined
 def sunlit(shade_m: float, z: float, foot: float) -> float:
-    """How much of the sun is seen at a height where ground keeps it away up to `shade_m`."""
+    """Share of the sun that is seen from height z, where other ground hides it up to the height `shade_m`."""
     return min(1.0, max(0.0, 0.5 - (shade_m - z) / (0.004 + 0.5 * foot)))
 
 
@@ -77,8 +77,8 @@ def of_ground(
 ) -> float:
     """Radiance of the ground over a footprint `across` wide and `along` long in the direction (ux, uy).
 
-    `here` is a sample of the middle. Detail is averaged along the footprint, not around it: far ground, seen
-    at a glance, would be smeared sideways.
+    `here` is a sample of the middle. Detail is averaged along the footprint, not over a circle as long as it:
+    that would smear far ground, which is seen at a low angle, sideways.
     """
     step = scene.frame_m[level, 0, STEP]
     taps = min(max(int(0.5 * along / max(across, step) + 0.5), 1), _MAX_TAPS)
@@ -139,7 +139,7 @@ def of_stone(
     sun: float,
     sky: float,
 ) -> float:
-    """Radiance of a pebble's surface of that normal."""
+    """Radiance of a pebble at a point of its surface with the normal n; `number` is the pebble's."""
     albedo = 0.11 + 0.11 * (number & 0xFF) / 255.0
     length, key = 0.8 * size, number >> 8
     while length > 2 * pixel_m and length > _FINEST_M:
@@ -166,7 +166,7 @@ def of_rock(
     sun: float,
     sky: float,
 ) -> float:
-    """Radiance of a rock's surface, met through that plane of its form (-1: its ball)."""
+    """Radiance of a rock at a point of its surface; `face` is the plane of its form there (-1: the ball)."""
     rocks = scene.rocks
     px, py, pz = x - rocks[rock, ROCK_X], y - rocks[rock, ROCK_Y], z - rocks[rock, ROCK_Z]
     if face < 0:

@@ -10,7 +10,7 @@ from pancam_graph.simulate._rays._world import Grids
 
 __all__ = ["hashed", "make_lattice", "noise", "noise_in_space", "noises"]
 
-_SIDE = 256  # noise repeats after so many wavelengths
+_SIDE = 256  # the number of wavelengths after which noise repeats
 _LAST = _SIDE - 1
 
 
@@ -21,7 +21,7 @@ def make_lattice(rng: np.random.Generator) -> Grids:
 
 @uncounted.part
 def hashed(i: int, j: int, key: int) -> int:
-    """32 random bits of a cell."""
+    """32 random bits that depend on the cell (i, j) and the key alone."""
     h = (i * 374761393 + j * 668265263 + key * 974711) & 0xFFFFFFFF
     h = ((h ^ (h >> 15)) * 1274126177) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 1103515245) & 0xFFFFFFFF
@@ -84,7 +84,7 @@ def noises(
 ) -> FloatArray:
     """Fractal noise at n places: octaves from the longest wavelength down, each `gain` of the one before.
 
-    Each octave is turned against the last, so that no lattice shows.
+    Each octave is rotated against the one before, so that the lattice of the noise does not show.
     """
     out = np.zeros(len(x))
     for n in range(len(x)):

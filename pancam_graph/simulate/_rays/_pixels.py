@@ -1,4 +1,4 @@
-"""Rays to what they meet first, and the light that comes back from there."""
+"""What rays meet first, and the radiance of that."""
 
 import math
 
@@ -13,7 +13,7 @@ from pancam_graph.simulate._rays._world import Deck, Scene
 
 __all__ = ["trace"]
 
-_FACES = 64  # more than a form has
+_FACES = 64  # more than the planes of a form
 _DECK_REACH_M = 8.0
 
 
@@ -31,13 +31,17 @@ def _trace(
     start: float,
     lit: bool,
 ) -> tuple[float, float, int, float]:
-    """Radiance (if `lit`) and distance of a ray, a number that changes at edges, the ground's distance."""
+    """Follow one ray.
+
+    Returns the radiance (if `lit`) and the distance of what it meets first, a number that changes at edges of
+    the picture, and the distance of the ground.
+    """
     ground = math.inf
     for _ in range(2):
         ground = march(scene, ox, oy, oz, dx, dy, dz, start)
         if ground > start or start == NEAREST_M:
             break
-        start = NEAREST_M  # it began below ground
+        start = NEAREST_M  # the start was below ground
     t, rock, face = hit_rocks(scene, ox, oy, oz, dx, dy, dz, ground)
     t, plate, plate_x, plate_y, rim = hit_deck(deck, ox, oy, oz, dx, dy, dz, t)
     light, key = 0.0, -1
@@ -55,7 +59,7 @@ def _trace(
                     scene, ox, oy, oz, dx, dy, dz, t, over, slope_x, slope_y, across
                 )
         if lit:
-            # From a little above the surface, or it would shade itself.
+            # From a little above the surface, which otherwise would shade itself.
             lift = 1e-4 + 1e-5 * t
             dark, sky = rock_shade(scene, x, y, z + lift, rock)
             if not dark and t < _DECK_REACH_M:
@@ -127,11 +131,11 @@ def trace(
 ) -> None:
     """Follow rays (n, 3) in the world, of pixels `pixel_rad` (n,) wide, from the last to the first.
 
-    `origin_m` has one row, or n. Where `below` (n,) is not negative it tells the row of `below_direction`
-    and `below_m` that has another ray from the same place, and the distance at which that met the ground:
-    a ray over it begins there. Of rays of no width nothing is asked. Written are the radiance (if `lit`),
-    the distance of what is met first (infinite in the sky), that of the ground alone, and a number that
-    changes where the picture has an edge (-2 for rays of no width).
+    `origin_m` has one row, or n. `below` (n,) is the row of another ray from the same place in
+    `below_direction` and `below_m`, its direction and its distance to the ground; negative: none. A ray above
+    it is followed from there on (see `march_start`). Rays of width 0 are not followed. Written are: radiance
+    (if `lit`), the distance of what is met first (infinite in the sky), the distance of the ground, and a
+    number that changes where the picture has an edge (-2 for rays of width 0).
     """
     for i in range(len(direction) - 1, -1, -1):
         if not pixel_rad[i] > 0:

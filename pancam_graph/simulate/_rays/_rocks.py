@@ -1,4 +1,4 @@
-"""Rocks: balls, squeezed and cut by planes, in a grid of cells."""
+"""Rocks: ellipsoids cut by planes, listed by the cells of a grid."""
 
 import math
 
@@ -21,9 +21,9 @@ from pancam_graph.simulate._rays._world import (
 __all__ = ["BLOCK", "DIM_FOOT", "hit_rocks", "normal_of_ball", "rock_shade", "through_form", "to_ball"]
 
 BLOCK = 8
-"""Cells along each side of a block."""
+"""Cells along each side of a block, which a ray above all its rocks passes in one step."""
 DIM_FOOT = 1.6
-"""How far around a rock, in its radii, it hides some of the sky."""
+"""Distance from a rock's centre, in its radii, up to which it hides some of the sky."""
 
 
 @uncounted.part
@@ -38,9 +38,10 @@ def through_form(
     by: float,
     bz: float,
 ) -> tuple[float, float, int]:
-    """Where the ray a + t b enters and leaves the first planes of a form, and through which (-1: the ball).
+    """Where a ray a + t b enters and leaves the unit ball cut by the first `planes` planes of a form.
 
-    It enters at infinity where it misses.
+    Returns t at both, and the plane through which it enters (-1: the ball). A ray that misses enters at
+    infinity.
     """
     bb, ab, aa = bx * bx + by * by + bz * bz, ax * bx + ay * by + az * bz, ax * ax + ay * ay + az * az
     inside = ab * ab - bb * (aa - 1)
@@ -109,7 +110,11 @@ def _cut(
 def hit_rocks(
     scene: Scene, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, far: float
 ) -> tuple[float, int, int]:
-    """The first rock nearer than `far`: distance, rock (-1: none, at `far`), plane. Walks the cells below."""
+    """The first rock that a ray meets nearer than `far`, found cell by cell along the ray.
+
+    Returns its distance (`far` if there is none), the rock (-1: none), and the plane of its form (-1: the
+    ball).
+    """
     rocks, forms, cells = scene.rocks, scene.forms, scene.cells
     cell_rocks, top = scene.cell_rocks, scene.cell_top_m
     best, rock, face = far, -1, -1
@@ -163,7 +168,10 @@ def hit_rocks(
 
 @uncounted.inlined
 def rock_shade(scene: Scene, x: float, y: float, z: float, but: int) -> tuple[bool, float]:
-    """Whether a rock but that one hides the sun, and the share of the sky's light that rocks leave."""
+    """Whether a rock hides the sun from a point, and the share of the sky's light that rocks leave to it.
+
+    The rock `but` is left out.
+    """
     wide, deep = scene.cell_shape
     i = math.floor((x - scene.cell_frame_m[X]) / scene.cell_frame_m[STEP])
     j = math.floor((y - scene.cell_frame_m[Y]) / scene.cell_frame_m[STEP])

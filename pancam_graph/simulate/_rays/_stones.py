@@ -1,4 +1,6 @@
-"""Pebbles and granules, too many to store: at most one in each cell of a few nested grids, hashed from it.
+"""Pebbles and granules, which are too many to store: each is computed from the number of its cell.
+
+A cell of one of a few nested grids holds at most one stone.
 
 All sizes take the same share of the ground, so that the number larger than D goes as D^-2, which is what
 small fragments on Mars follow within a factor of two. They are forms like rocks, partly buried.
@@ -14,12 +16,12 @@ from pancam_graph.simulate._rays._world import Grids, Scene
 
 __all__ = ["TALLEST_M", "hit_stones", "stone_shade"]
 
-_CELL_M = 0.12  # the coarsest grid's: stones up to 4 cm; what is larger is a rock
+_CELL_M = 0.12  # of the coarsest grid, whose stones reach 4 cm; larger ones are rocks
 _CLASSES = 6
-_RADIUS = 0.16  # of the largest, over the width of its cell
-_TALL = 0.15  # how far the tallest rises over the ground, over the same
-_SMALLEST = 1.0  # radius of the largest of a class below which the class is left out, over the pixel's width
-_ROUND = 2.0  # half axes, over the pixel's width, up to which a stone is as good as an ellipsoid
+_RADIUS = 0.16  # of the largest stone of a grid, over the width of a cell
+_TALL = 0.15  # height of the tallest stone over the ground, over the width of a cell
+_SMALLEST = 1.0  # a grid is left out if its largest radius, over the pixel's width, is below this
+_ROUND = 2.0  # a stone whose half axis, over the pixel's width, is below this is taken for an ellipsoid
 _SHARE = 0.45  # of cells with a stone, on average
 TALLEST_M = _TALL * _CELL_M
 _BYTE = 1 / 255.0
@@ -27,7 +29,10 @@ _BYTE = 1 / 255.0
 
 @uncounted.part
 def _place(i: int, j: int, cell: float, key: int) -> tuple[float, float, float, float]:
-    """Centre of what may be a cell's stone, its radius (none: no stone), and how unlikely it is there."""
+    """Centre and radius (0: no stone) of the stone that a cell may hold, and a random number in [0, 1].
+
+    The stone is there if the number is below the share of cells with a stone around there; see `_stone`.
+    """
     h = hashed(i, j, key)
     chance = (h & 0xFF) * _BYTE
     radius = _RADIUS * cell / math.sqrt(1 + 3 * (h >> 8 & 0xFF) * _BYTE)
@@ -43,8 +48,12 @@ def _place(i: int, j: int, cell: float, key: int) -> tuple[float, float, float, 
 def _stone(
     lattice: Grids, i: int, j: int, x: float, y: float, chance: float, radius: float, key: int
 ) -> tuple[float, float, float, float, float, float, int]:
-    """Half axes along (0: no stone), across and up, turn (cos, sin), depth of the centre, number."""
-    if chance > _SHARE * (1 + 2.2 * noise(lattice, 0.8 * x, 0.8 * y, 0)[0]):  # they gather here and there
+    """The stone of a cell.
+
+    Returns half axes along (0: no stone), across and up, cosine and sine of its heading, the height of its
+    centre over the ground, and its number.
+    """
+    if chance > _SHARE * (1 + 2.2 * noise(lattice, 0.8 * x, 0.8 * y, 0)[0]):  # stones gather here and there
         return 0.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0
     g = hashed(i, j, key + 1)
     along, across = radius * (1 + 0.5 * (g & 0xFF) * _BYTE), radius * (0.7 + 0.3 * (g >> 8 & 0xFF) * _BYTE)
@@ -69,9 +78,10 @@ def hit_stones(
     slope_y: float,
     pixel_m: float,
 ) -> tuple[float, float, float, float, float, float, int]:
-    """The first stone before `far`, where the ray is `over` a ground of that slope.
+    """The first stone that a ray meets before `far`, where it is `over` metres above sloping ground.
 
-    Distance, how much of the pixel it fills (0: none), unit normal, its largest radius, and its number.
+    Returns its distance, the share of the pixel that it fills (0: no stone), its unit normal, its largest
+    radius, and its number.
     """
     dx = dx if abs(dx) > 1e-12 else 1e-12
     dy = dy if abs(dy) > 1e-12 else 1e-12
@@ -104,7 +114,7 @@ def hit_stones(
                 bx, by, bz = (c * dx + s * dy) / along, (c * dy - s * dx) / side, dz / up
                 enter, leave, face = through_form(scene.forms, form, planes, ax, ay, az, bx, by, bz)
                 if enter < best:
-                    # A chord as long as a pixel is wide in the form's own units: half in, half out.
+                    # The pixel is filled by the share that the chord is of the pixel's width.
                     chord = (leave - enter) * math.sqrt(bx * bx + by * by + bz * bz)
                     part_of = min(1.0, chord * side / pixel_m)
                     if part_of > 0.5 or (cover <= 0.5 and part_of > cover):
@@ -126,7 +136,7 @@ def hit_stones(
 
 @uncounted.inlined
 def stone_shade(scene: Scene, x: float, y: float, z: float, pixel_m: float) -> tuple[float, float]:
-    """The share of the sun, and that of the sky, that stones leave to a place on the ground."""
+    """Shares of the sun's and of the sky's light that stones leave to a place on the ground."""
     sun, sky = 1.0, 1.0
     sx, sy, sz = scene.sun
     across = math.hypot(sx, sy) + 1e-9
@@ -156,7 +166,7 @@ def stone_shade(scene: Scene, x: float, y: float, z: float, pixel_m: float) -> t
                 if abs(px * dy - py * dx) < along:
                     w = (z - height_at(scene, level_at(scene, cx, cy), cx, cy) - depth) / up
                     bx, by, bz = (c * dx + s * dy) / along, (c * dy - s * dx) / side, rise / up
-                    # The form itself, not its ball, or a dark ring would lie around what planes cut off.
+                    # The form casts the shadow: that of its ball would lie as a dark ring around it.
                     planes = scene.forms.shape[1] if along > _ROUND * pixel_m else 0
                     enter, leave, _ = through_form(
                         scene.forms, which % len(scene.forms), planes, u, v, w, bx, by, bz

@@ -12,8 +12,8 @@ __all__ = ["ALBEDO", "CHANNELS", "OUTCROP", "SHADE", "SLOPE_X", "SLOPE_Y", "Deck
 Grids = NDArray[np.float32]
 
 SLOPE_X, SLOPE_Y, ALBEDO, OUTCROP, SHADE = range(5)
-"""What a node of the ground has beside its height: slopes, reflectance, 0 soil to 1 bare rock, and the height
-up to which other ground keeps the sun away."""
+"""Channels of a node of the ground: its slopes, its reflectance, its share of bare rock (0 to 1), and the
+height up to which other ground hides the sun."""
 CHANNELS = 5
 
 FIRST, ALONG_X, ALONG_Y = range(3)
@@ -26,25 +26,25 @@ ROCK_X, ROCK_Y, ROCK_Z = range(3)
 ROCK_TO_BALL = 3
 """First of nine columns: rotation and scale, by rows, from the world about the centre to the unit ball."""
 ROCK_TOP, ROCK_FORM, ROCK_ALBEDO, ROCK_RADIUS, ROCK_KEY = range(12, 17)
-"""Height of the top, row in `Scene.forms`, reflectance, radius as seen from above, and which fine detail."""
+"""Height of the top, row in `Scene.forms`, reflectance, radius seen from above, number for fine detail."""
 ROCK_COLUMNS = 17
 
 
 class Scene(NamedTuple):
-    """Everything fixed to the world."""
+    """Everything that stands still in the world."""
 
     height_m: Grids
     """Heights of the nodes of all grids, one grid after the other; x runs fastest."""
     ceiling_m: Grids
-    """Heights that the ground in a square of 2^k x 2^k meshes does not exceed, for all k of all grids."""
+    """Upper bound of the ground in each square of 2^k x 2^k meshes, for all k of all grids."""
     surface: Grids
-    """CHANNELS numbers per node of all mips of all grids."""
+    """Channels of all nodes, mips and grids, CHANNELS numbers a node."""
     height_shape: IntArray
     """(levels, 3): FIRST, ALONG_X and ALONG_Y of each grid in `height_m`."""
     ceiling_shape: IntArray
-    """(levels, squarings, 3): the same for `ceiling_m`."""
+    """(levels, squarings, 3): those in `ceiling_m`."""
     surface_shape: IntArray
-    """(levels, mips, 3): the same for `surface`. A mip halves the one before."""
+    """(levels, mips, 3): those in `surface`. Each mip has half as many nodes along x and y as the last."""
     frame_m: FloatArray
     """(levels, mips, 3): X, Y and STEP of each grid."""
     steep: float
@@ -58,13 +58,13 @@ class Scene(NamedTuple):
     cells: IntArray
     """(cells + 1,) where the rocks over a cell start in `cell_rocks`; x runs fastest."""
     cell_rocks: IntArray
-    """Rocks of all cells."""
+    """Rocks over each cell, one cell after the other."""
     cell_top_m: FloatArray
     """Height of the highest rock over a cell, and after all cells, over blocks of them."""
     shaded: IntArray
-    """(cells + 1,) the same for `shaded_rocks`."""
+    """(cells + 1,) where the rocks that shade a cell start in `shaded_rocks`."""
     shaded_rocks: IntArray
-    """Rocks whose shadow, or dim foot, reaches into a cell."""
+    """Rocks whose shadow, or whose dim surroundings, reach into each cell, one cell after the other."""
     cell_frame_m: FloatArray
     """(3,) x and y of the corner of the first cell, and the width of a cell."""
     cell_shape: tuple[int, int]
@@ -76,9 +76,9 @@ class Scene(NamedTuple):
     sun: FloatArray
     """(3,) unit vector to the sun."""
     haze_m: float
-    """Distance at which 63 % of the light is the haze's."""
+    """Distance from which 63 % of the light that arrives is that of the haze."""
     key: int
-    """Which fine detail."""
+    """Number that all fine detail is computed from."""
 
 
 class Deck(NamedTuple):
