@@ -10,6 +10,11 @@ from pancam_graph.graph._given import check_given as check_given
 from pancam_graph.graph._given import given_factors as given_factors
 from pancam_graph.graph._given import seated as seated
 from pancam_graph.graph._graph_keys import GraphKeys as GraphKeys
+from pancam_graph.graph._graph_options import DEFAULT_FLEX as DEFAULT_FLEX
+from pancam_graph.graph._graph_options import RIGID as RIGID
+from pancam_graph.graph._graph_options import Flex as Flex
+from pancam_graph.graph._graph_options import Model as Model
+from pancam_graph.graph._graph_options import Tie as Tie
 from pancam_graph.graph._hard import HardTemplate as HardTemplate
 from pancam_graph.graph._keys import Kind as Kind
 from pancam_graph.graph._keys import index_of as index_of
@@ -17,11 +22,6 @@ from pancam_graph.graph._keys import key_of as key_of
 from pancam_graph.graph._keys import kind_of as kind_of
 from pancam_graph.graph._keys import read_variable as read_variable
 from pancam_graph.graph._landmarks import ExplicitLandmarks as ExplicitLandmarks
-from pancam_graph.graph._options import DEFAULT_FLEX as DEFAULT_FLEX
-from pancam_graph.graph._options import RIGID as RIGID
-from pancam_graph.graph._options import Flex as Flex
-from pancam_graph.graph._options import Model as Model
-from pancam_graph.graph._options import Tie as Tie
 from pancam_graph.graph._projective import ProjectiveTemplate as ProjectiveTemplate
 from pancam_graph.graph._rig_variables import RigVariables as RigVariables
 from pancam_graph.graph._soft import SoftTemplate as SoftTemplate

@@ -20,8 +20,8 @@ from pancam_graph.data import ENTRIES, Refined, RigCorrection, State, Traverse
 from pancam_graph.elimination import Covariance, Posture
 from pancam_graph.factors import Fixed, Key, projective_factor
 from pancam_graph.graph._factors import FactorList
+from pancam_graph.graph._graph_options import Flex
 from pancam_graph.graph._keys import Kind
-from pancam_graph.graph._options import Flex
 from pancam_graph.graph._soft import SoftTemplate
 from pancam_graph.graph._template import diagonal_noise
 from pancam_graph.landmarks import CameraViews

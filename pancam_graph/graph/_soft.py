@@ -23,8 +23,8 @@ from pancam_graph.elimination import Linkage, Posture
 from pancam_graph.factors import CircleOffset, Fixed, Key, Slot, circle_factor, mast_factor
 from pancam_graph.graph._factors import FactorList
 from pancam_graph.graph._given import Seat
+from pancam_graph.graph._graph_options import Flex, Model
 from pancam_graph.graph._keys import Kind, key_of
-from pancam_graph.graph._options import Flex, Model
 from pancam_graph.graph._template import FactorTemplate, diagonal_noise
 from pancam_graph.landmarks import CameraViews
 

@@ -14,8 +14,8 @@ from pancam_graph.factors import Fixed, Key, Slot
 from pancam_graph.graph._factors import FactorList, Factors
 from pancam_graph.graph._given import GivenFactor, Seat, seated
 from pancam_graph.graph._graph_keys import GraphKeys
+from pancam_graph.graph._graph_options import Model
 from pancam_graph.graph._keys import Kind, index_of, key_of, kind_of, read_variable
-from pancam_graph.graph._options import Model
 from pancam_graph.graph._rig_variables import RigVariables
 from pancam_graph.landmarks import CameraViews
 

@@ -8,10 +8,10 @@ import numpy as np
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.data import Refusal
 from pancam_graph.images._features import Features
+from pancam_graph.images._front_end_options import FrontEndOptions
 from pancam_graph.images._match import beyond_chance, match_in_windows
-from pancam_graph.images._options import FrontEndOptions
 from pancam_graph.images._pairs import Segments
-from pancam_graph.images._terrain import Sighting, Terrain
+from pancam_graph.images._terrain import Sighting, StopTerrain
 
 __all__ = ["Alignment", "Ties", "align_stops", "fit_pose", "telemetry_alignment", "whitened_distance"]
 
@@ -76,7 +76,7 @@ class Ties:
         return len(self.row)
 
 
-def telemetry_alignment(terrain: Terrain, a: int, b: int) -> Alignment:
+def telemetry_alignment(terrain: StopTerrain, a: int, b: int) -> Alignment:
     """Stop b relative to stop a by telemetry, with the pointing that the images of each stop give."""
     first, second = terrain.traverse.stops[a], terrain.traverse.stops[b]
     apart_m = float(np.linalg.norm(first.world_T_mast.translation() - second.world_T_mast.translation()))
@@ -90,7 +90,7 @@ def telemetry_alignment(terrain: Terrain, a: int, b: int) -> Alignment:
 
 
 def align_stops(
-    terrain: Terrain,
+    terrain: StopTerrain,
     features: list[Features],
     feature_of: IntArray,
     a: int,
@@ -120,7 +120,7 @@ def align_stops(
 
 
 def _matched(
-    terrain: Terrain,
+    terrain: StopTerrain,
     features: list[Features],
     feature_of: IntArray,
     stops: tuple[int, int],
@@ -163,14 +163,14 @@ def _matched(
 
 
 def _radius_px(
-    terrain: Terrain, rows: IntArray, seen: Sighting, at: Alignment, options: FrontEndOptions
+    terrain: StopTerrain, rows: IntArray, seen: Sighting, at: Alignment, options: FrontEndOptions
 ) -> FloatArray:
     spread = seen.covariance_px2(at.covariance, terrain.sigma_inverse_m[rows])
     largest = np.linalg.eigvalsh(spread)[:, 1]
     return np.asarray(options.search_sigmas * np.sqrt(largest) + options.search_slack_px)
 
 
-def _comparable(terrain: Terrain, image: int, seen: Sighting, margin_px: FloatArray) -> BoolArray:
+def _comparable(terrain: StopTerrain, image: int, seen: Sighting, margin_px: FloatArray) -> BoolArray:
     """Which points the image can show from a side and distance similar to the first sighting's."""
     camera = terrain.camera(image)
     size = np.array([camera.width_px, camera.height_px])
@@ -179,14 +179,14 @@ def _comparable(terrain: Terrain, image: int, seen: Sighting, margin_px: FloatAr
     return np.asarray(seen.valid & on & alike & (margin_px < size.max() / 4))
 
 
-def whitened_distance(terrain: Terrain, ties: Ties, world_T_mast: gtsam.Pose3) -> FloatArray:
+def whitened_distance(terrain: StopTerrain, ties: Ties, world_T_mast: gtsam.Pose3) -> FloatArray:
     """Distances (n,) of ties from their points' pixels, in units of what noise and depths leave open."""
     residual, root, _ = _whitened(terrain, ties, world_T_mast)
     return np.asarray(np.linalg.norm(np.einsum("nij,nj->ni", root, residual), axis=1))
 
 
 def _whitened(
-    terrain: Terrain, ties: Ties, world_T_mast: gtsam.Pose3
+    terrain: StopTerrain, ties: Ties, world_T_mast: gtsam.Pose3
 ) -> tuple[FloatArray, FloatArray, Sighting]:
     """Residuals (n, 2) in pixels, and the matrices (n, 2, 2) that take them to unit covariance."""
     seen = terrain.sighting(ties.row, ties.image, world_T_mast)
@@ -196,7 +196,7 @@ def _whitened(
 
 
 def fit_pose(
-    terrain: Terrain,
+    terrain: StopTerrain,
     ties: Ties,
     prior: Alignment,
     start: Alignment,

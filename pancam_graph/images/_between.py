@@ -20,11 +20,11 @@ from pancam_graph.images._alignment import (
     whitened_distance,
 )
 from pancam_graph.images._features import Features
+from pancam_graph.images._front_end_options import FrontEndOptions
 from pancam_graph.images._masks import pixels_at
-from pancam_graph.images._options import FrontEndOptions
 from pancam_graph.images._patches import HALF_WIDTH_PX, MAX_REACH_PX, Coefficients, align_patches
 from pancam_graph.images._splines import Splines
-from pancam_graph.images._terrain import Sighting, Terrain
+from pancam_graph.images._terrain import Sighting, StopTerrain
 
 __all__ = ["StopMatcher", "StopTies", "joined", "near_stops", "on_terrain", "stereo_stops"]
 
@@ -95,7 +95,7 @@ class StopTies:
 class StopMatcher:
     """Finds the terrain of one stop in the images of another. Several threads may use it at once."""
 
-    terrain: Terrain
+    terrain: StopTerrain
     """Points of all stops, without those that a mask covers."""
     spline: Splines
     usable: Sequence[BoolArray | None]
@@ -179,7 +179,7 @@ def on_terrain(usable: Sequence[BoolArray | None], image: IntArray, uv_px: Float
     return shows
 
 
-def _spread(terrain: Terrain) -> BoolArray:
+def _spread(terrain: StopTerrain) -> BoolArray:
     """Rows of the points to match: in each cell of an image those whose place is known best."""
     cell = np.floor(terrain.uv_px / _CELL_PX).astype(np.int64)
     order = np.lexsort((terrain.sigma_inverse_m, cell[:, 0], cell[:, 1], terrain.image))
@@ -192,7 +192,7 @@ def _spread(terrain: Terrain) -> BoolArray:
 
 
 def _measured(
-    terrain: Terrain, ties: Ties, stops: tuple[int, int], alignment: Alignment, options: FrontEndOptions
+    terrain: StopTerrain, ties: Ties, stops: tuple[int, int], alignment: Alignment, options: FrontEndOptions
 ) -> Ties:
     """The ties that agree with the pose of most ties, with standard deviations from their scatter.
 
@@ -216,7 +216,7 @@ def _measured(
 
 
 def _found(
-    terrain: Terrain,
+    terrain: StopTerrain,
     spline: Splines,
     rows: IntArray,
     image: int,
@@ -281,7 +281,7 @@ def _found(
 
 
 def _reach(
-    terrain: Terrain,
+    terrain: StopTerrain,
     rows: IntArray,
     seen: Sighting,
     affine: FloatArray,
@@ -316,7 +316,7 @@ def _aligned(
     return uv_b, fit
 
 
-def joined(obs: Observations, terrain: Terrain, ties: Ties, sigma_px: FloatArray) -> Observations:
+def joined(obs: Observations, terrain: StopTerrain, ties: Ties, sigma_px: FloatArray) -> Observations:
     """Observations with the ties added to their points' tracks."""
     image = np.concatenate([obs.image, ties.image])
     track = np.concatenate([obs.track, terrain.track[ties.row]])

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.cameras import Camera
+from pancam_graph.images._front_end_options import FrontEndOptions
 from pancam_graph.images._normalise import normalise, usable_mask
-from pancam_graph.images._options import FrontEndOptions
 
 __all__ = ["DESCRIPTOR_NORM", "Features", "find_features"]
 

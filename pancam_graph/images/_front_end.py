@@ -8,10 +8,10 @@ import numpy as np
 from pancam_graph.base.errors import InputError
 from pancam_graph.data import Matching, Observations, PairMatching, StopMatching, Traverse
 from pancam_graph.images._cache import Cache
+from pancam_graph.images._front_end_options import FrontEndOptions
 from pancam_graph.images._masks import ImageMask
 from pancam_graph.images._match import Matches
 from pancam_graph.images._match_pair import PairMatches
-from pancam_graph.images._options import FrontEndOptions
 from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._read import image_name, listed
 from pancam_graph.images._steps import Progress, Steps

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pancam_graph.base.compiled import entry
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.images._features import DESCRIPTOR_NORM, Features
-from pancam_graph.images._options import FrontEndOptions
+from pancam_graph.images._front_end_options import FrontEndOptions
 from pancam_graph.images._pairs import Segments
 
 __all__ = ["Matches", "beyond_chance", "match_in_windows"]

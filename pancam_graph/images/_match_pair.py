@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.data import Refusal
 from pancam_graph.images._features import Features
+from pancam_graph.images._front_end_options import FrontEndOptions
 from pancam_graph.images._match import Matches, beyond_chance, match_in_windows
-from pancam_graph.images._options import FrontEndOptions
 from pancam_graph.images._pairs import PairGeometry, Segments
 from pancam_graph.images._verify import PairFit, epipolar_px, fit_pair
 

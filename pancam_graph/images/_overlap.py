@@ -8,7 +8,7 @@ import numpy as np
 from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.cameras import Camera
 from pancam_graph.data import Traverse
-from pancam_graph.images._options import FrontEndOptions
+from pancam_graph.images._front_end_options import FrontEndOptions
 from pancam_graph.images._pairs import MAX_TURN_RAD, MAX_ZOOM, PairGeometry, inspected_depths_m
 
 __all__ = ["overlap_cells", "overlapping_pairs"]

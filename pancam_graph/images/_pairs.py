@@ -10,7 +10,7 @@ import numpy as np
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, compose, pose_arrays
 from pancam_graph.cameras import Camera
 from pancam_graph.data import Traverse
-from pancam_graph.images._options import FrontEndOptions
+from pancam_graph.images._front_end_options import FrontEndOptions
 
 __all__ = [
     "FAR_M",

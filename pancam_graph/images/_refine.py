@@ -6,7 +6,7 @@ from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.base.threads import in_parallel
 from pancam_graph.cameras import Camera
 from pancam_graph.data import Traverse
-from pancam_graph.images._options import FrontEndOptions
+from pancam_graph.images._front_end_options import FrontEndOptions
 from pancam_graph.images._pairs import FAR_M, PairGeometry
 from pancam_graph.images._patches import HALF_WIDTH_PX, align_patches
 from pancam_graph.images._splines import Splines

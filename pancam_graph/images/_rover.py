@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pancam_graph.base.geometry import BoolArray, FloatArray, wrap_angle
 from pancam_graph.data import Traverse
-from pancam_graph.images._options import FrontEndOptions
+from pancam_graph.images._front_end_options import FrontEndOptions
 from pancam_graph.images._pairs import MAX_ZOOM, PairGeometry, Relative, move_pixels
 
 __all__ = ["find_rover", "rover_partners"]

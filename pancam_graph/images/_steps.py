@@ -24,9 +24,9 @@ from pancam_graph.images._alignment import Ties
 from pancam_graph.images._between import StopMatcher, StopTies, joined, near_stops, on_terrain, stereo_stops
 from pancam_graph.images._cache import Arrays, Cache, digest
 from pancam_graph.images._features import Features, find_features
+from pancam_graph.images._front_end_options import FrontEndOptions
 from pancam_graph.images._masks import ImageMask, Reason, elevation_rad, mask_image, pixels_at
 from pancam_graph.images._match_pair import PairMatches, match_pair
-from pancam_graph.images._options import FrontEndOptions
 from pancam_graph.images._overlap import overlap_cells, overlapping_pairs
 from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._read import Pictures, image_name, read_pictures

@@ -12,7 +12,7 @@ from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, pose_arr
 from pancam_graph.cameras import Camera
 from pancam_graph.data import Observations, Solution, Traverse
 
-__all__ = ["Sighting", "Terrain", "terrain_arrays", "terrain_from"]
+__all__ = ["Sighting", "StopTerrain", "terrain_arrays", "terrain_from"]
 
 _NEAREST_INVERSE_M = 1e-7
 _NEIGHBOURS = 12
@@ -52,7 +52,7 @@ class Sighting:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Terrain:
+class StopTerrain:
     """Points with the image that each was first seen in, sorted by track."""
 
     traverse: Traverse
@@ -68,7 +68,7 @@ class Terrain:
     slope: FloatArray
     """(n, 2) how the inverse depth of the surface changes by pixel of that camera."""
 
-    def select(self, rows: BoolArray | IntArray) -> "Terrain":
+    def select(self, rows: BoolArray | IntArray) -> "StopTerrain":
         """Some of the points."""
         names = ("track", "row", "inverse_depth", "sigma_inverse_m", "slope")
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
@@ -227,7 +227,7 @@ def terrain_from(
     world_R_mast: FloatArray,
     world_t_mast: FloatArray,
     **columns: Any,
-) -> Terrain:
+) -> StopTerrain:
     """The points that a solution of the traverse places, each with its surface; see `terrain_arrays`."""
     frames = tuple(
         replace(f, pan_rad=float(pan), tilt_rad=float(tilt))
@@ -237,7 +237,7 @@ def terrain_from(
         replace(s, world_T_mast=gtsam.Pose3(gtsam.Rot3(R), t))
         for s, R, t in zip(traverse.stops, world_R_mast, world_t_mast, strict=True)
     )
-    terrain = Terrain(
+    terrain = StopTerrain(
         traverse=replace(traverse, frames=frames, stops=stops),
         **columns,
         slope=np.zeros((len(columns["track"]), 2)),
@@ -284,7 +284,7 @@ def _sights(camera: Camera, uv_px: FloatArray) -> tuple[FloatArray, FloatArray]:
     return rays.origin_m, rays.direction / (rays.direction @ _forward(camera))[:, None]
 
 
-def _slopes(terrain: Terrain, rows: IntArray, world_R_camera: FloatArray) -> FloatArray:
+def _slopes(terrain: StopTerrain, rows: IntArray, world_R_camera: FloatArray) -> FloatArray:
     """Slopes (n, 2) of the inverse depth around points of one image.
 
     The inverse depth of a plane is linear in the pixel of a pinhole. Each plane is fitted to the nearest

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pancam_graph.base.geometry import FloatArray
-from pancam_graph.images._options import FrontEndOptions
+from pancam_graph.images._front_end_options import FrontEndOptions
 from pancam_graph.images._pairs import FAR_M, PairGeometry, Relative, move_pixels
 
 __all__ = ["PairFit", "epipolar_px", "fit_pair"]

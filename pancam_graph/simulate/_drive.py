@@ -10,7 +10,7 @@ from pancam_graph.base.geometry import BoolArray, FloatArray, rz, wrap_angle
 from pancam_graph.cameras import Camera
 from pancam_graph.data import Frame, Image, Observations, Stop, Traverse
 from pancam_graph.rigs import Rig
-from pancam_graph.simulate._options import DriveOptions
+from pancam_graph.simulate._simulation_options import DriveOptions
 from pancam_graph.simulate._wrong_rig import wrong_rig
 
 __all__ = [

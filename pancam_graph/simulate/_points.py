@@ -24,8 +24,8 @@ from pancam_graph.simulate._drive import (
     stand,
     telemetry,
 )
-from pancam_graph.simulate._options import SimulationOptions
-from pancam_graph.simulate._terrain import Terrain
+from pancam_graph.simulate._simulation_options import SimulationOptions
+from pancam_graph.simulate._terrain import GroundModel
 
 __all__ = ["PointsTruth", "Simulation", "simulate"]
 
@@ -40,7 +40,7 @@ _NOMINAL_SIGMA_PX = 0.3  # what observations without noise are said to have
 class PointsTruth(Truth):
     """What really was, and where its landmarks lie."""
 
-    terrain: Terrain
+    terrain: GroundModel
     """The ground, on which the landmarks lie."""
 
 
@@ -146,11 +146,11 @@ def _ellipses(options: SimulationOptions, sigma_px: FloatArray, rng: np.random.G
 
 def _drive(
     rig: Rig, options: SimulationOptions, rng_terrain: np.random.Generator, rng: np.random.Generator
-) -> tuple[Terrain, tuple[gtsam.Pose3, ...]]:
+) -> tuple[GroundModel, tuple[gtsam.Pose3, ...]]:
     """The ground, and the mast standing on it at every stop, upright on the local slope."""
     xy, heading = path(options, rng)
     middle = xy.mean(axis=0)
-    terrain = Terrain.random(
+    terrain = GroundModel.random(
         rng_terrain,
         slope_rad=options.slope_rad,
         rocks=options.rocks,
@@ -164,7 +164,7 @@ def _drive(
 def _find_points(
     rig: Rig,
     options: SimulationOptions,
-    terrain: Terrain,
+    terrain: GroundModel,
     world_T_camera: tuple[FloatArray, FloatArray],
     image_eye: IntArray,
     rng: np.random.Generator,

@@ -21,10 +21,10 @@ from pancam_graph.simulate._drive import (
     stand,
     telemetry,
 )
-from pancam_graph.simulate._options import RenderOptions
 from pancam_graph.simulate._rays import Deck, Scene
 from pancam_graph.simulate._scene import make_deck, make_scene, slopes
 from pancam_graph.simulate._sensor import HALO_PX, GreyImage, expose
+from pancam_graph.simulate._simulation_options import RenderOptions
 
 __all__ = ["Rendering", "render"]
 

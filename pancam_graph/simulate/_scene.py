@@ -9,8 +9,8 @@ import scipy
 
 from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.simulate import _rays
-from pancam_graph.simulate._options import RenderOptions
 from pancam_graph.simulate._rays import Deck, Grids, Scene, heights
+from pancam_graph.simulate._simulation_options import RenderOptions
 
 __all__ = ["make_deck", "make_scene", "slopes"]
 

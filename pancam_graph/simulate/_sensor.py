@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pancam_graph.base.geometry import FloatArray
-from pancam_graph.simulate._options import RenderOptions
+from pancam_graph.simulate._simulation_options import RenderOptions
 
 __all__ = ["HALO_PX", "GreyImage", "expose"]
 

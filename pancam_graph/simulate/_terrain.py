@@ -6,7 +6,7 @@ import numpy as np
 
 from pancam_graph.base.geometry import BoolArray, FloatArray
 
-__all__ = ["Terrain"]
+__all__ = ["GroundModel"]
 
 _WAVES = 12
 _WAVELENGTHS_M = (4.0, 400.0)
@@ -23,7 +23,7 @@ _RIDGE_WIDTH = 0.25  # half width of the ridge over its distance
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Terrain:
+class GroundModel:
     """A height field over the world's x and y, in metres, z up. Same numbers, same ground."""
 
     wave_rad_m: FloatArray
@@ -51,14 +51,14 @@ class Terrain:
         rocks: float,
         ridge_centre_m: FloatArray,
         ridge_distance_m: float,
-    ) -> "Terrain":
+    ) -> "GroundModel":
         """Draw a terrain whose rolling ground has the RMS slope `slope_rad` along either axis."""
         length = np.geomspace(*_WAVELENGTHS_M, _WAVES)
         towards = rng.uniform(0, 2 * np.pi, _WAVES)
         # Each of n waves has the mean square slope (2 pi a / length)^2 / 4 along an axis.
         height = length * np.tan(slope_rad) / (np.pi * np.sqrt(_WAVES))
         wave = 2 * np.pi / length[:, None] * np.column_stack([np.cos(towards), np.sin(towards)])
-        return Terrain(
+        return GroundModel(
             wave_rad_m=wave,
             wave_height_m=height,
             wave_phase_rad=rng.uniform(0, 2 * np.pi, _WAVES),

@@ -2,9 +2,9 @@
 
 from pancam_graph.smoother._file import load_smoother as load_smoother
 from pancam_graph.smoother._file import save_smoother as save_smoother
-from pancam_graph.smoother._options import Closure as Closure
-from pancam_graph.smoother._options import Estimate as Estimate
-from pancam_graph.smoother._options import SmootherOptions as SmootherOptions
-from pancam_graph.smoother._options import Update as Update
 from pancam_graph.smoother._smoother import TraverseSmoother as TraverseSmoother
+from pancam_graph.smoother._smoother_options import Closure as Closure
+from pancam_graph.smoother._smoother_options import Estimate as Estimate
+from pancam_graph.smoother._smoother_options import SmootherOptions as SmootherOptions
+from pancam_graph.smoother._smoother_options import Update as Update
 from pancam_graph.smoother._state import SmootherState as SmootherState

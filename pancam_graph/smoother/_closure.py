@@ -9,8 +9,8 @@ import scipy
 from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.smoother._localise import localise
 from pancam_graph.smoother._map import DriveMap
-from pancam_graph.smoother._options import Closure, SmootherOptions
 from pancam_graph.smoother._sets import distinct
+from pancam_graph.smoother._smoother_options import Closure, SmootherOptions
 from pancam_graph.smoother._station import Station
 
 __all__ = ["Loop", "bridge", "judged", "loops"]

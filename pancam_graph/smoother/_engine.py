@@ -12,7 +12,7 @@ from pancam_graph.graph import Kind, kind_of
 from pancam_graph.smoother._batch import solved_anew
 from pancam_graph.smoother._frame import orthonormal
 from pancam_graph.smoother._map import Change, DriveMap
-from pancam_graph.smoother._options import SmootherOptions
+from pancam_graph.smoother._smoother_options import SmootherOptions
 from pancam_graph.smoother._station import Postures, Station
 from pancam_graph.smoother._tree import Tree
 

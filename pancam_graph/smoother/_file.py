@@ -22,7 +22,7 @@ from pancam_graph.io import (
     traverse_of,
     validated,
 )
-from pancam_graph.smoother._options import SmootherOptions
+from pancam_graph.smoother._smoother_options import SmootherOptions
 from pancam_graph.smoother._state import SmootherState
 
 __all__ = ["load_smoother", "save_smoother"]

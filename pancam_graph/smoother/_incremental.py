@@ -22,8 +22,8 @@ from pancam_graph.data import (
     Traverse,
 )
 from pancam_graph.graph import HardTemplate, UserFactors
-from pancam_graph.smoother._options import SmootherOptions, Update
 from pancam_graph.smoother._smoother import TraverseSmoother
+from pancam_graph.smoother._smoother_options import SmootherOptions, Update
 from pancam_graph.solve import SolveOptions, fitted_elsewhere, judge, prepare, screened_elsewhere, solution_of
 
 __all__ = ["solve_incrementally", "stops_of"]

@@ -22,7 +22,7 @@ from pancam_graph.smoother._localise import localise
 from pancam_graph.smoother._map import Change, DriveMap
 from pancam_graph.smoother._nearness import by_nearness, sample
 from pancam_graph.smoother._odometry import guess, join, local_priors
-from pancam_graph.smoother._options import Estimate, SmootherOptions, Update
+from pancam_graph.smoother._smoother_options import Estimate, SmootherOptions, Update
 from pancam_graph.smoother._state import SmootherState, state_of
 from pancam_graph.smoother._station import Postures, Station, copied
 from pancam_graph.smoother._update_run import UpdateRun

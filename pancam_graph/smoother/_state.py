@@ -10,7 +10,7 @@ from pancam_graph.data import Traverse
 from pancam_graph.graph import Kind, kind_of, read_variable
 from pancam_graph.smoother._batch import whole_traverse
 from pancam_graph.smoother._map import DriveMap
-from pancam_graph.smoother._options import SmootherOptions
+from pancam_graph.smoother._smoother_options import SmootherOptions
 
 __all__ = ["SmootherState", "state_of"]
 

@@ -12,7 +12,7 @@ from pancam_graph.smoother._covariances import relative_covariance
 from pancam_graph.smoother._engine import Engine, Rounds
 from pancam_graph.smoother._ledger import Fate
 from pancam_graph.smoother._map import Change, DriveMap
-from pancam_graph.smoother._options import Closure, SmootherOptions, Update
+from pancam_graph.smoother._smoother_options import Closure, SmootherOptions, Update
 from pancam_graph.smoother._station import Postures, Station
 from pancam_graph.smoother._warnings import warnings_of
 

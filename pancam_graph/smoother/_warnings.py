@@ -7,8 +7,8 @@ import numpy as np
 from pancam_graph.base.geometry import IntArray
 from pancam_graph.smoother._ledger import Fate
 from pancam_graph.smoother._map import DriveMap
-from pancam_graph.smoother._options import Closure
 from pancam_graph.smoother._sets import distinct
+from pancam_graph.smoother._smoother_options import Closure
 from pancam_graph.smoother._station import Station
 from pancam_graph.solve import listed
 

@@ -99,31 +99,31 @@ def test_everything_can_be_imported_at_once() -> None:
     assert set(names) >= PUBLIC
 
 
-@pytest.mark.parametrize("name", ["solve", "simulate"])
+@pytest.mark.parametrize(("name", "module"), [("solve", "_options"), ("simulate", "_simulation_options")])
 @pytest.mark.parametrize(
     "before",
     [
         "",
         "import pancam_graph.{name}",
-        "import pancam_graph.{name}._options",
+        "import pancam_graph.{name}.{module}",
         "from pancam_graph.{name} import {name}",
         "import importlib; importlib.import_module('pancam_graph.{name}')",
         "import pancam_graph; pancam_graph.{name}",
-        "from pancam_graph import {name}; import pancam_graph.{name}._options; import pancam_graph.{name}",
-        "import pancam_graph; from pancam_graph.{name} import _options",
+        "from pancam_graph import {name}; import pancam_graph.{name}.{module}; import pancam_graph.{name}",
+        "import pancam_graph; from pancam_graph.{name} import {module}",
         "import pancam_graph.cli; import pancam_graph.results; import pancam_graph.smoother",
     ],
 )
-def test_no_room_hides_the_function_of_its_name(name: str, before: str) -> None:
+def test_no_room_hides_the_function_of_its_name(name: str, module: str, before: str) -> None:
     code = f"""
-{before.format(name=name)}
+{before.format(name=name, module=module)}
 import pancam_graph, sys
 from pancam_graph import {name}
 from pancam_graph.{name} import {name} as same
 assert {name} is same is pancam_graph.{name}
 assert callable({name}) and {name}.__name__ == "{name}"
 room = sys.modules["pancam_graph.{name}"]
-import pancam_graph.{name}._options
+import pancam_graph.{name}.{module}
 assert pancam_graph.{name} is {name}
 assert sys.modules["pancam_graph.{name}"] is room and room.{name} is {name}
 """

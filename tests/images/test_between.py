@@ -34,7 +34,7 @@ from pancam_graph.images._between import StopMatcher, StopTies
 from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._patches import align_patches
 from pancam_graph.images._splines import Splines
-from pancam_graph.images._terrain import Terrain, terrain_arrays, terrain_from
+from pancam_graph.images._terrain import StopTerrain, terrain_arrays, terrain_from
 from pancam_graph.rigs import Eye, Rig, rig_template
 
 QUICK = FrontEndOptions(max_features=1500, max_ties=700)
@@ -78,7 +78,7 @@ def test_patches_are_found_from_afar_and_through_an_unknown_affine_map() -> None
 
 
 @pytest.fixture(scope="module")
-def simulated() -> tuple[Terrain, tuple[gtsam.Pose3, ...]]:
+def simulated() -> tuple[StopTerrain, tuple[gtsam.Pose3, ...]]:
     """The terrain of two stops that share no track, and the true masts."""
     options = SimulationOptions(
         stops=2, pans=8, tilts_rad=(-0.3,), points_per_image=60, link_stops=0, noise_px=0.1, spacing_m=5.0
@@ -92,7 +92,7 @@ def simulated() -> tuple[Terrain, tuple[gtsam.Pose3, ...]]:
     return terrain_from(ordered, **arrays), simulation.truth.world_T_mast
 
 
-def seen_rows(terrain: Terrain, mast: gtsam.Pose3) -> Ties:
+def seen_rows(terrain: StopTerrain, mast: gtsam.Pose3) -> Ties:
     """What the images of stop 1 see of the terrain of stop 0, without any error."""
     parts = []
     for i in np.unique(terrain.image[terrain.stop == 0]).tolist():
@@ -107,7 +107,7 @@ def seen_rows(terrain: Terrain, mast: gtsam.Pose3) -> Ties:
     return Ties.concatenate(parts)
 
 
-def test_derivatives_of_sightings(simulated: tuple[Terrain, tuple[gtsam.Pose3, ...]]) -> None:
+def test_derivatives_of_sightings(simulated: tuple[StopTerrain, tuple[gtsam.Pose3, ...]]) -> None:
     terrain, masts = simulated
     ties = seen_rows(terrain, masts[1])
     first, image = int(terrain.image[ties.row[0]]), int(ties.image[0])
@@ -126,7 +126,7 @@ def test_derivatives_of_sightings(simulated: tuple[Terrain, tuple[gtsam.Pose3, .
     np.testing.assert_allclose(seen.d_inverse_depth, (ahead - behind) / (2 * step), rtol=1e-4, atol=1e-2)
 
 
-def test_slopes_are_those_of_the_ground(simulated: tuple[Terrain, tuple[gtsam.Pose3, ...]]) -> None:
+def test_slopes_are_those_of_the_ground(simulated: tuple[StopTerrain, tuple[gtsam.Pose3, ...]]) -> None:
     """On a level plane the pixel beside lands on the plane, too."""
     terrain, _ = simulated
     for i in np.unique(terrain.image)[:4].tolist():
@@ -137,7 +137,7 @@ def test_slopes_are_those_of_the_ground(simulated: tuple[Terrain, tuple[gtsam.Po
         assert np.median(np.abs(steepness)) < 0.2
 
 
-def test_pose_is_found_among_wrong_ties(simulated: tuple[Terrain, tuple[gtsam.Pose3, ...]]) -> None:
+def test_pose_is_found_among_wrong_ties(simulated: tuple[StopTerrain, tuple[gtsam.Pose3, ...]]) -> None:
     terrain, masts = simulated
     rng = np.random.default_rng(1)
     ties = seen_rows(terrain, masts[1])
