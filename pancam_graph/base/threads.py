@@ -1,6 +1,7 @@
 """Work on all cores: ranges for compiled loops, and longer tasks that release the interpreter's lock."""
 
 import os
+import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -140,12 +141,18 @@ def blas_on_one_thread() -> AbstractContextManager[object]:
     Matrices here have a few hundred rows. On these, threads of BLAS wait for each other longer than they
     save: with two cores in use, two took twice the time of one.
     """
-    limited: AbstractContextManager[object] = _blas().limit(limits=1, user_api="blas")
+    # A controller limits the libraries that are loaded when it is made. SciPy's own BLAS may not be yet.
+    import scipy.linalg  # noqa: F401, PLC0415  loaded for the controller
+
+    limited: AbstractContextManager[object] = _controller("cv2" in sys.modules).limit(
+        limits=1, user_api="blas"
+    )
     return limited
 
 
 @cache
-def _blas() -> ThreadpoolController:
+def _controller(with_opencv: bool) -> ThreadpoolController:
+    """The controller of all loaded BLAS libraries; OpenCV, which may be loaded later, has one of its own."""
     return ThreadpoolController()
 
 

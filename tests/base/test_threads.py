@@ -1,6 +1,9 @@
 """Ranges over threads: all of them once, the same for any number of threads, and errors that come through."""
 
 import multiprocessing
+import os
+import subprocess
+import sys
 import threading
 import time
 
@@ -161,3 +164,31 @@ def test_after_an_interrupt_ranges_are_for_all_threads_again(monkeypatch: pytest
         in_parallel(interrupted, 1000, grain=1)
     both = threading.Barrier(2, timeout=10)
     in_parallel(lambda begin, end: wait_at(both), 2, grain=1)
+
+
+@pytest.mark.parametrize(
+    "before",
+    [
+        "pass",
+        "import scipy.linalg",
+        "with blas_on_one_thread(): pass\nimport cv2",
+        "from pancam_graph import solve, find_observations",
+    ],
+)
+def test_every_blas_that_is_loaded_within_has_one_thread(before: str) -> None:
+    """NumPy, SciPy and OpenCV bring libraries of their own, whichever of them are imported first."""
+    code = f"""
+from pancam_graph.base.threads import blas_on_one_thread
+{before}
+from threadpoolctl import threadpool_info
+with blas_on_one_thread():
+    import scipy.linalg, scipy.special, scipy.sparse.linalg, scipy.spatial
+    print(*[library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"])
+"""
+    environment = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    numbers = done.stdout.split()
+    assert numbers
+    assert set(numbers) == {"1"}
