@@ -1,9 +1,8 @@
 """One sentence for a name that is not among those that there are."""
 
-from collections.abc import Sequence
-from difflib import get_close_matches
+from collections.abc import Iterable, Sequence
 
-__all__ = ["expected_one_of", "some_of"]
+__all__ = ["expected_one_of", "nearest", "some_of"]
 
 _NAMED = 6
 
@@ -13,9 +12,15 @@ def expected_one_of(what: str, found: str, names: Sequence[str]) -> str:
 
     `what` begins the sentence.
     """
-    near = get_close_matches(str(found), names, n=1, cutoff=0.5)
-    hint = f"; is {near[0]!r} meant?" if near else ""
-    return f"{what}: expected one of {some_of(names)}; found {found!r}{hint}"
+    return f"{what}: expected one of {some_of(names)}; found {found!r}{nearest(found, names)}"
+
+
+def nearest(word: str, names: Iterable[str]) -> str:
+    """The end of a sentence about an unknown word: the name that is probably meant, or nothing."""
+    from difflib import get_close_matches  # noqa: PLC0415  help of the command does not wait for it
+
+    near = get_close_matches(str(word), list(names), n=1, cutoff=0.5)
+    return f"; is {near[0]!r} meant?" if near else ""
 
 
 def some_of(names: Sequence[str]) -> str:

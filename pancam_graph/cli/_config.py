@@ -6,8 +6,9 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
+from pancam_graph.base.choices import nearest
 from pancam_graph.base.errors import InputError
-from pancam_graph.cli._parser import COMMON_OPTIONS, Flag, Parser, Several, degrees, nearest
+from pancam_graph.cli._parser import COMMON_OPTIONS, Flag, Parser, Several, degrees
 
 __all__ = ["read_config"]
 

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pancam_graph import __version__
+from pancam_graph.base.choices import nearest
 from pancam_graph.cli._command import Command, Invocation
 from pancam_graph.cli._config import read_config
 from pancam_graph.cli._ending import run, status_of
 from pancam_graph.cli._log import check_log_outside, logged
-from pancam_graph.cli._parser import CommandParser, LateChoice, Parser, Several, nearest
+from pancam_graph.cli._parser import CommandParser, LateChoice, Parser, Several
 from pancam_graph.cli._progress import Progress, display_for
 from pancam_graph.cli._registry import COMMANDS
 

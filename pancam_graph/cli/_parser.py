@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
+from pancam_graph.base.choices import nearest
+
 __all__ = [
     "COMMON_OPTIONS",
     "CommandParser",
@@ -16,7 +18,6 @@ __all__ = [
     "ScriptParser",
     "Several",
     "degrees",
-    "nearest",
 ]
 
 BAD_INPUT = 2
@@ -27,14 +28,6 @@ COMMON_OPTIONS = ("verbose", "quiet", "log", "progress")
 def degrees(text: str) -> float:
     """An argument in degrees, as radians."""
     return math.radians(float(text))
-
-
-def nearest(word: str, known: Iterable[str]) -> str:
-    """The end of a sentence about an unknown word: the nearest known one, or nothing where none is near."""
-    from difflib import get_close_matches
-
-    close = get_close_matches(word, list(known), n=1)
-    return f"; the nearest is {close[0]}" if close else ""
 
 
 @dataclass(frozen=True)

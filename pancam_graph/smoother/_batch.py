@@ -1,4 +1,4 @@
-"""The whole drive at once, as `solve` takes it: where iSAM2's steps are no good, and for results."""
+"""The whole drive as one batch problem of `solve`: the fallback where iSAM2's steps fail, and for results."""
 
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ def whole_template(drive: DriveMap) -> HardTemplate:
 
 
 def whole_problem(drive: DriveMap, values: gtsam.Values) -> Problem:
-    """What is used of the drive, landmarks as they were linearised last."""
+    """All observations in use as a batch problem; landmarks start where they were linearised last."""
     placed = drive.whole()
     template = whole_template(drive)
     return Problem(
@@ -49,12 +49,12 @@ def whole_problem(drive: DriveMap, values: gtsam.Values) -> Problem:
 
 
 def solved_anew(drive: DriveMap, values: gtsam.Values) -> gtsam.Values:
-    """The optimum near values by Levenberg-Marquardt; landmarks of the blocks are put there too."""
+    """The optimum near `values`, by Levenberg-Marquardt; the landmarks of all blocks are moved to it."""
     problem = whole_problem(drive, values).placed()
-    found, _ = EliminatedSolver(None, is_near=True).adjust(problem, StopRule())
+    optimum, _ = EliminatedSolver(None, is_near=True).adjust(problem, StopRule())
     track = drive.whole().track
     for block in drive.blocks.values():
         at = np.searchsorted(track, block.placed.track)
-        landmarks = Landmarks(vector=found.landmarks.vector[at], origin_m=found.landmarks.origin_m[at])
+        landmarks = Landmarks(vector=optimum.landmarks.vector[at], origin_m=optimum.landmarks.origin_m[at])
         block.replace(replace(block.placed, landmarks=landmarks))
-    return found.values
+    return optimum.values

@@ -1,8 +1,9 @@
-"""A block of landmarks, eliminated: one factor of iSAM2 on the variables of the stops that see them.
+"""A block of landmarks, eliminated: one factor of iSAM2 on the variables of the stops that observe them.
 
-The block is linearised at the point of linearisation that iSAM2 has of these variables, and handed over as
-the quadratic that is left there: GTSAM's own container of a linear factor. It is taken out and put in again
-when its landmarks are seen again, and when iSAM2 moves a variable of it to another point.
+The block is linearised at iSAM2's linearisation point of these variables. Its Schur complement there is one
+quadratic factor, which iSAM2 gets in a gtsam.LinearContainerFactor. The factor is removed and added again
+when the block's landmarks are observed again, and when iSAM2 moves the linearisation point of one of its
+variables.
 """
 
 from dataclasses import replace
@@ -22,21 +23,21 @@ __all__ = ["LandmarkBlock"]
 
 
 class LandmarkBlock:
-    """Landmarks, where they are at the point of linearisation, and what is left of them there."""
+    """Landmarks eliminated together: their places at the linearisation point, and the factor that remains."""
 
     def __init__(self, placed: Placed, room: Room) -> None:
-        """Landmarks placed where the estimate has the cameras; `room` is for all blocks."""
+        """Take landmarks placed at the estimate of the cameras, and scratch memory that blocks share."""
         self._room = room
         self.patch = placed.patch
         self.slot = -1
-        """Of its factor in iSAM2."""
+        """Slot of its factor in iSAM2; -1 before it has one."""
         self.cost = 0.0
-        """At the last estimate that it was evaluated at."""
+        """Half the sum of squared whitened residuals at the estimate evaluated last."""
         self.factor: gtsam.LinearContainerFactor | None = None
         self.replace(placed)
 
     def replace(self, placed: Placed) -> None:
-        """Put its landmarks elsewhere; the block must then be linearised anew."""
+        """Take other places of its landmarks; the caller must linearise the block again afterwards."""
         self._placed = placed
         self.system = LandmarkSystem(
             self.patch.linkage, placed.measurements, placed.landmarks, room=self._room
@@ -45,18 +46,18 @@ class LandmarkBlock:
 
     @property
     def placed(self) -> Placed:
-        """Its landmarks about where the estimate has them."""
+        """Its landmarks at their linearised places, moved with the common motion to the current estimate."""
         return replace(self._placed, landmarks=carried(self.system.landmarks(), self._frame.inverse()))
 
     @property
     def keys(self) -> tuple[int, ...]:
-        """Variables that it touches."""
+        """Keys of the variables that its observations depend on."""
         return self.system.linkage.key
 
     def linearise(self, theta: Postures, estimate: gtsam.Values, unit: FloatArray) -> None:
-        """Make the factor at a point of linearisation, landmarks carried to there from the estimate.
+        """Make the factor at the linearisation point `theta`, with landmarks moved there from `estimate`.
 
-        `unit` (6,) are the rotations and shifts of masts that weigh alike.
+        `unit` (6,) are rotations, radians, and shifts, metres, of a mast that count as equally large.
         """
         link, stations, system = self.system.linkage, self.patch.stations, self.system
         there = [s.world_T_mast(theta.values) for s in stations]
@@ -77,7 +78,7 @@ class LandmarkBlock:
         self.factor = gtsam.LinearContainerFactor(_quadratic(panels, system), self._here)
 
     def apart(self, estimate: gtsam.Values) -> float:
-        """How far masts are, beside a common motion, from where they were linearised, in units."""
+        """Largest motion of a mast since its linearisation, less the common motion, in the given units."""
         stations = self.patch.stations
         delta = [
             a.localCoordinates(s.world_T_mast(estimate)) for a, s in zip(self._theta, stations, strict=True)
@@ -87,14 +88,14 @@ class LandmarkBlock:
         return largest
 
     def left_apart(self, theta: gtsam.Values, estimate: gtsam.Values, moving: set[int]) -> float:
-        """As `apart`, if masts among these variables moved to the estimate and others did not."""
+        """The value of `apart` if only the masts among the keys `moving` were linearised at the estimate."""
         stations = self.patch.stations
         there = [s.world_T_mast(estimate if s.mast in moving else theta) for s in stations]
         delta = [a.localCoordinates(s.world_T_mast(estimate)) for a, s in zip(there, stations, strict=True)]
         return self._common.of(np.concatenate(delta))[1]
 
     def follow(self, estimate: Postures) -> float:
-        """Landmarks follow the cameras to an estimate; the true cost there."""
+        """Move landmarks along with the cameras to an estimate; return the true (nonlinear) cost there."""
         link = self.system.linkage
         self.apart(estimate.values)
         posture = posture_in(self.patch.posture(estimate), self._frame)
@@ -110,20 +111,20 @@ class LandmarkBlock:
         return self.cost
 
     def settle(self, estimate: Postures) -> None:
-        """Landmarks move to where they follow the cameras; the block must then be linearised anew."""
+        """Adopt the landmarks moved by `follow`; the caller must linearise the block again afterwards."""
         self.follow(estimate)
         self.system.adopt()
 
     def modelled_cost(self, values: gtsam.Values) -> float:
-        """Cost at an estimate as the block was linearised."""
+        """Cost at `values` by the block's linear model."""
         return 0.0 if self.factor is None else float(self.factor.error(values))
 
 
 def _quadratic(panels: Panels, system: LandmarkSystem) -> gtsam.HessianFactor:
-    """What is left of all landmarks, as one factor.
+    """The Schur complement of the landmarks as one Hessian factor f + s'x + x'Sx / 2.
 
-    GTSAM takes three variables at a time, so it is summed up from such parts: f + s'x + x'Sx / 2, f what
-    the cost is once landmarks have moved while the cameras stand.
+    Here f is the cost with the cameras held and the landmarks at their optimum. GTSAM's constructors take
+    three variables at most, so the factor is a sum of such parts.
     """
     link, structure = system.linkage, system.structure
     graph = gtsam.GaussianFactorGraph()
@@ -136,29 +137,29 @@ def _quadratic(panels: Panels, system: LandmarkSystem) -> gtsam.HessianFactor:
     for g, panel in enumerate(panels.panel):
         n = int(link.group_dim[g])
         upper = np.triu(panel[:, :n])
-        own = upper + np.triu(upper, 1).T
+        diagonal_block = upper + np.triu(upper, 1).T
         for i, v in enumerate(members[g]):
             a = slice(column[v], column[v] + dims[v])
-            graph.push_back(gtsam.HessianFactor(link.key[v], own[a, a], -panel[a, -1], constant))
+            graph.push_back(gtsam.HessianFactor(link.key[v], diagonal_block[a, a], -panel[a, -1], constant))
             constant = 0.0
-            rest = [(w, own, int(column[w])) for w in members[g][i + 1 :]]
+            rest = [(w, diagonal_block, int(column[w])) for w in members[g][i + 1 :]]
             after, begin = structure.after[g], structure.begin[g]
             for h, first in zip(after[1:], begin[1:-1], strict=True):
                 rest += [(w, panel, int(first) + int(column[w])) for w in members[h]]
             for j in range(0, len(rest), 2):
                 w, source, c = rest[j]
-                own_zero, right = zeros[dims[v], dims[v]], zero[dims[v]]
+                diagonal_zero, right = zeros[dims[v], dims[v]], zero[dims[v]]
                 one, keys = source[a, c : c + dims[w]], (link.key[v], link.key[w])
                 a1 = dims[w]
                 if j + 1 == len(rest):
-                    part = gtsam.HessianFactor(*keys, own_zero, one, right, zeros[a1, a1], zero[a1], 0.0)
+                    part = gtsam.HessianFactor(*keys, diagonal_zero, one, right, zeros[a1, a1], zero[a1], 0.0)
                 else:
                     x, source, c = rest[j + 1]
                     a2 = dims[x]
                     two = source[a, c : c + a2]
                     part = gtsam.HessianFactor(
                         *(*keys, link.key[x]),
-                        *(own_zero, one, two, right),
+                        *(diagonal_zero, one, two, right),
                         *(zeros[a1, a1], zeros[a1, a2], zero[a1], zeros[a2, a2], zero[a2], 0.0),
                     )
                 graph.push_back(part)

@@ -1,4 +1,4 @@
-"""Covariances of where the stops of a drive stand, from iSAM2."""
+"""Covariances of the mast poses of a drive, from iSAM2."""
 
 from collections.abc import Sequence
 
@@ -30,7 +30,7 @@ def joint_covariance(engine: Engine, stations: Sequence[Station]) -> FloatArray:
 
 
 def relative_covariance(engine: Engine, a: Station, b: Station) -> FloatArray:
-    """Covariance (6, 6) of a_T_b; see `relative_pose_covariance`. 0 of a station to itself."""
+    """Covariance (6, 6) of a_T_b; see `relative_pose_covariance`. 0 for a station and itself."""
     if a is b:
         return np.zeros((6, 6))
     values = engine.estimate

@@ -1,4 +1,4 @@
-"""Rounds of iSAM2 until nothing is far from where it was linearised, and the true cost of each."""
+"""Rounds of iSAM2 until every variable is near its linearisation point, with the true cost after each."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,26 +19,30 @@ from pancam_graph.smoother._tree import Tree
 __all__ = ["Engine", "Rounds"]
 
 _RISE = 1e-6
-"""A step that raises the cost by more than this share is a bad one."""
+"""Relative rise of the cost beyond which a step has failed."""
 _UNLIKE = 1.0
-"""Blocks whose true cost differs from that of their linear model by more are linearised anew: an observation
-more adds as much."""
+"""Difference of true and modelled cost beyond which a block is linearised again: about the cost of one more
+observation."""
 _PIXELS = 100.0
-"""Calibrations are in pixels, of which so many are about what a unit of the other entries is."""
+"""Pixels of a calibration entry that count as one unit of another entry of the rig."""
 _LEFT = 0.3
-"""A block whose moved and unmoved stops are no more than this many units apart need not be linearised
-anew."""
+"""Largest motion between moved and unmoved stops of a block, in units, that needs no new linearisation."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rounds:
-    """What a number of rounds did."""
+    """Summary of some rounds."""
 
     rounds: int
+    """Updates of iSAM2."""
     relinearised: int
+    """Variables linearised again; one in two rounds counts twice."""
     blocks: int
+    """Factors of landmark blocks added or replaced."""
     cost: float
+    """Total cost after the last round."""
     fell_back: bool
+    """Whether Levenberg-Marquardt solved the whole drive, since the rounds did not converge."""
 
 
 class Engine:
@@ -48,23 +52,23 @@ class Engine:
         self._drive, self._options = drive, options
         self._tree = Tree()
         self._priors = gtsam.NonlinearFactorGraph()
-        """All factors but those of landmarks, for the cost."""
+        """All factors except landmark blocks, for the cost."""
         self._bent: list[int] = []
         self._apart: dict[int, float] = {}
         self._unit = np.repeat([options.relinearise_rad, options.relinearise_m], 3)
 
     @property
     def estimate(self) -> gtsam.Values:
-        """All variables where they are now."""
+        """Estimates of all variables."""
         return self._tree.estimate
 
     @property
     def theta(self) -> gtsam.Values:
-        """All variables where they were linearised."""
+        """Linearisation points of all variables."""
         return self._tree.theta
 
     def covariance(self, keys: Sequence[int]) -> FloatArray:
-        """Joint covariance of variables."""
+        """Joint marginal covariance of variables, in the order of their keys."""
         return self._tree.covariance(keys)
 
     def advance(
@@ -74,7 +78,10 @@ class Engine:
         station: Station | None = None,
         values: gtsam.Values | None = None,
     ) -> Rounds:
-        """Add what is new and go on until it is settled; `values` are those of a new station, about right."""
+        """Add new factors and blocks, and iterate to convergence.
+
+        `values` are initial values of the variables of a new station.
+        """
         for factor in factors:
             self._priors.push_back(factor)
         new = values or gtsam.Values()
@@ -86,7 +93,7 @@ class Engine:
         return self._settle(change, factors, new, new, bends=False)
 
     def _frame_at(self, world_T_mast: gtsam.Pose3) -> gtsam.Pose3:
-        """How the world about a place moved since it was linearised, undone; as the nearest stop has it."""
+        """Motion from the estimate back to the linearisation point, of the stop nearest to a pose."""
         stations = [s for s in self._drive.stations if s.mast is not None and self.theta.exists(s.mast)]
         if not stations:
             return gtsam.Pose3()
@@ -96,7 +103,7 @@ class Engine:
         return nearest.world_T_mast(self.theta) * nearest.world_T_mast(self.estimate).inverse()
 
     def bend(self, factor: gtsam.NonlinearFactor) -> Rounds:
-        """Bring the drive to where one more factor wants it, which the next advance takes out again."""
+        """Add a temporary factor and iterate to convergence; the next `advance` removes the factor."""
         none = gtsam.Values()
         return self._settle(Change(), [factor], none, none, bends=True)
 
@@ -121,7 +128,7 @@ class Engine:
             rounds, relinearised, handled = rounds + 1, relinearised + len(moving), handled + len(affected)
             unlike, cost = self._evaluate(affected)
             moving = self._to_move(unlike)
-            # What bends the drive is no part of the cost, which may rise.
+            # The temporary factor of `bend` is not part of the cost, which may therefore rise.
             failed = rounds >= self._options.max_rounds or (cost > previous * (1 + _RISE) and not bends)
             if not moving or failed:
                 break
@@ -144,7 +151,7 @@ class Engine:
     def _linearise(
         self, touched: set[int], new: gtsam.Values, theta: gtsam.Values, moving: set[int], removed: list[int]
     ) -> set[int]:
-        """Blocks that are touched, or of variables that move, at the next point of linearisation."""
+        """Linearise, at the next point, blocks that are touched or have a moving variable; their names."""
         blocks, values = self._drive.blocks, gtsam.Values(self._tree.estimate)
         values.insert(new)
         estimate = Postures(values)
@@ -164,9 +171,9 @@ class Engine:
         return affected
 
     def _to_move(self, unlike: set[int]) -> set[int]:
-        """Variables to linearise anew: all of blocks that are too far from where they were, or `unlike`.
+        """Keys to linearise again: those of blocks that moved too far or are `unlike` their linear model.
 
-        And those of their neighbours that would else be left apart from them.
+        Blocks that share stops with these are added where their other stops would stay too far behind.
         """
         o, moved, blocks = self._options, self._tree.moved, self._drive.blocks
         limit = {Kind.ANGLES: o.relinearise_rad, Kind.CALIBRATION: _PIXELS * o.relinearise_rig}
@@ -176,7 +183,7 @@ class Engine:
             if (kind := kind_of(key)) is not Kind.MAST
             and np.any(np.abs(delta) > limit.get(kind, o.relinearise_rig))
         }
-        # A factor of the caller's may change with where the whole drive is, as a block does not.
+        # A caller's factor may depend on absolute poses; a block depends on relative poses alone.
         named = {key for factor in self._drive.seated for key in factor.keys()}  # noqa: SIM118  a gtsam factor
         masts = (key for key in named if kind_of(key) is Kind.MAST and key in moved)
         far |= {key for key in masts if np.any(np.abs(moved[key]) > self._unit)}
@@ -198,7 +205,7 @@ class Engine:
         return moving
 
     def restart(self, values: gtsam.Values) -> None:
-        """A new tree of all factors, linearised at these values, where landmarks are already."""
+        """Build a new tree of all factors, linearised at `values`, for which landmarks are placed already."""
         self._tree, self._bent, theta = Tree(), [], Postures(values)
         blocks = list(self._drive.blocks.values())
         for block in blocks:
@@ -219,7 +226,7 @@ class Engine:
         moving: set[int],
         affected: set[int],
     ) -> list[int]:
-        """One update of iSAM2, with the factors of these blocks anew; the slots of the other factors."""
+        """Update iSAM2 once, with new factors of the `affected` blocks; return the slots of `factors`."""
         blocks = [self._drive.blocks[b] for b in sorted(affected)]
         pairs = [(block, made) for block in blocks if (made := block.factor) is not None]
         slots = self._tree.update([*factors, *(made for _, made in pairs)], values, removed, moving)
@@ -228,7 +235,7 @@ class Engine:
         return slots[: len(factors)]
 
     def _evaluate(self, affected: set[int]) -> tuple[set[int], float]:
-        """Blocks that are less linear than they were taken for, and the cost of everything."""
+        """Names of blocks whose true cost differs much from their linear model, and the total cost."""
         estimate, unlike, blocks = Postures(self._tree.estimate), set(), self._drive.blocks
         for b in affected:
             estimate.of_all(blocks[b].patch.stations)
@@ -244,6 +251,6 @@ class Engine:
 
     @property
     def cost(self) -> float:
-        """Of everything, where blocks were evaluated last."""
+        """Total cost; each landmark block as evaluated last."""
         blocks = sum(block.cost for block in self._drive.blocks.values())
         return float(self._priors.error(self._tree.estimate)) + blocks

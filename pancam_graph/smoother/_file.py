@@ -1,4 +1,4 @@
-"""A drive that is kept to go on from: one archive of arrays, with a header in JSON."""
+"""The file of a smoother's state: one NumPy archive of arrays, with a header in JSON."""
 
 import io
 import json

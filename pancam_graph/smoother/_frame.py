@@ -1,8 +1,8 @@
-"""The common motion of stops, which changes nothing in what a block of landmarks says.
+"""The common motion of a block's stops, under which the block's linearisation stays valid.
 
-A block's quadratic, in the body-frame tangents of its mast poses, is exact under a motion of the whole: with
-T_i = exp(xi) theta_i the tangent is Ad(theta_i)^-1 xi, however large xi is. So only the motion of stops
-against each other limits where a linearisation is good; landmarks are carried along by the common motion.
+A block's quadratic, in the body-frame tangents of its mast poses, is exact under a rigid motion of the world:
+with T_i = exp(xi) theta_i the tangent is Ad(theta_i)^-1 xi, however large xi is. So only the motion of stops
+relative to each other limits a linearisation; landmarks are moved with the common motion.
 """
 
 from collections.abc import Sequence
@@ -18,12 +18,12 @@ __all__ = ["CommonMotion", "carried", "orthonormal", "posture_in"]
 
 
 class CommonMotion:
-    """The motion of the world that moves some masts from where they were linearised as they moved."""
+    """Least-squares rigid motion of the world that explains how masts moved since they were linearised."""
 
     def __init__(self, theta: Sequence[gtsam.Pose3], unit: FloatArray, *, held: bool) -> None:
-        """`unit` (6,) are the angles and distances that weigh alike.
+        """Take linearisation points and `unit` (6,), the angles and distances of equal weight.
 
-        `held`: one of the masts cannot move, and so neither can the world.
+        `held`: one of the masts is fixed, and the common motion is therefore zero.
         """
         self._unit = np.tile(unit, len(theta))
         alike = np.concatenate([np.zeros((0, 6)), *(pose.inverse().AdjointMap() for pose in theta)])
@@ -31,14 +31,17 @@ class CommonMotion:
         self._solve = np.linalg.pinv(self._alike)
 
     def of(self, delta: FloatArray) -> tuple[FloatArray, float]:
-        """Twist (6,) of the world, and the most that masts do beside it in units, from tangents (6n,)."""
+        """Fit the common motion to tangents (6n,) of masts: its twist (6,), and the largest residual.
+
+        The residual is the motion of a mast that remains, in units.
+        """
         scaled = delta / self._unit
         twist = self._solve @ scaled
         return twist, float(np.abs(scaled - self._alike @ twist).max(initial=0.0))
 
 
 def carried(landmarks: Landmarks, by: gtsam.Pose3) -> Landmarks:
-    """Landmarks moved with the world."""
+    """Landmarks after a rigid motion of the world."""
     rotation, shift = by.rotation().matrix(), by.translation()
     vector = landmarks.vector.copy()
     vector[:, :3] = vector[:, :3] @ rotation.T
@@ -46,7 +49,7 @@ def carried(landmarks: Landmarks, by: gtsam.Pose3) -> Landmarks:
 
 
 def posture_in(posture: Posture, by: gtsam.Pose3) -> Posture:
-    """Cameras moved with the world; how they hang on the variables does not change."""
+    """Cameras after a rigid motion of the world; the chain rule in body-frame tangents stays the same."""
     rotation, shift, views = by.rotation().matrix(), by.translation(), posture.views
     return Posture(
         views=CameraViews(
@@ -61,9 +64,9 @@ def posture_in(posture: Posture, by: gtsam.Pose3) -> Posture:
 
 
 def orthonormal(pose: gtsam.Pose3) -> gtsam.Pose3:
-    """The same pose, its rotation freed of rounding.
+    """The pose with the rotation matrix nearest to its own, free of rounding.
 
-    Where each stop's pose is a product with those of the stops before, rounding triples at every stop: after
-    thirty it is no rotation any more.
+    Where each stop's pose is a product with the poses before, rounding errors triple at every stop; after
+    thirty stops the product is no rotation matrix.
     """
     return gtsam.Pose3(gtsam.Rot3.ClosestTo(pose.rotation().matrix()), pose.translation())

@@ -1,4 +1,4 @@
-"""A traverse followed stop by stop, as the rover would have: its solution, and what each stop took."""
+"""A recorded traverse solved stop by stop: its solution, with cost and time of each stop."""
 
 import logging
 import time
@@ -43,9 +43,9 @@ def stops_of(traverse: Traverse) -> Iterator[tuple[Stop, list[Frame], list[Image
     for number, stop in enumerate(traverse.stops):
         frames = [traverse.frames[i] for i in np.flatnonzero(traverse.frame_stop == number)]
         rows = np.flatnonzero(traverse.image_stop == number)
-        own = observations.select(of_stop == number)
+        of_this_stop = observations.select(of_stop == number)
         images = [traverse.images[i] for i in rows]
-        yield stop, frames, images, replace(own, image=np.searchsorted(rows, own.image))
+        yield stop, frames, images, replace(of_this_stop, image=np.searchsorted(rows, of_this_stop.image))
 
 
 def solve_incrementally(
@@ -55,22 +55,22 @@ def solve_incrementally(
     on_stop: Callable[[Update], None] | None = None,
     factors: UserFactors | None = None,
 ) -> Solution:
-    """As `solve`, by adding stop after stop in their order; `on_stop` is told of every one.
+    """Solve a traverse by adding its stops in order to a smoother; `on_stop` is called after each.
 
     `factors` as for `solve`; they are added after the last stop.
 
-    Raises InputError for what the smoother has not: another model than the rigid mast, explicit landmarks,
-    alternation, and a robust loss other than that observations are judged as they come.
+    Raises InputError for options that the smoother lacks: another model than the rigid mast, explicit
+    landmarks, and alternation. Of the robust loss only "none" counts, which turns the test for outliers off.
     """
     options = options or SolveOptions()
-    for name, found, expected in (
+    for name, chosen, expected in (
         ("model", options.model, "mast"),
         ("tie", options.firm_tie, "hard"),
         ("landmarks", options.landmarks, "eliminated"),
         ("method", options.method, "joint"),
     ):
-        if found != expected:
-            raise InputError(f"incremental: {name}: expected {expected}, found {found}")
+        if chosen != expected:
+            raise InputError(f"incremental: {name}: expected {expected}, found {chosen}")
     begin = time.perf_counter()
     smoother = TraverseSmoother(
         traverse.rig,
@@ -101,7 +101,7 @@ def _as_solution(
     updates: list[Update],
     factors: UserFactors | None,
 ) -> Solution:
-    """What the smoother found, as a solution of the traverse."""
+    """The smoother's estimate as a solution of the traverse."""
     assert traverse.observations is not None
     used = np.zeros(len(traverse.observations), dtype=bool)
     used[_rows_as_added(traverse)] = smoother.used

@@ -1,4 +1,4 @@
-"""All observations ever given, and what became of each."""
+"""All observations that a smoother was given, and the present use of each."""
 
 from enum import IntEnum
 from typing import Any
@@ -13,17 +13,20 @@ __all__ = ["Fate", "Ledger"]
 
 
 class Fate(IntEnum):
-    """What became of an observation."""
+    """Present use of an observation."""
 
     WAITING = 0
-    """Its track was seen once: one ray places nothing."""
+    """Its track has one observation so far; a single ray determines no landmark."""
     USED = 1
+    """It takes part in the adjustment."""
     OUTLIER = 2
+    """It contradicts the other observations of its track."""
     OUTSIDE = 3
     """Outside the domain of its camera model."""
     CLOSURE = 4
-    """Of a loop closure that is not believed."""
+    """Part of a loop closure that was rejected."""
     REMOVED = 5
+    """Taken back by the caller."""
 
 
 _COLUMNS: dict[str, tuple[tuple[int, ...], type]] = {
@@ -39,7 +42,7 @@ _COLUMNS: dict[str, tuple[tuple[int, ...], type]] = {
 
 
 class Ledger:
-    """Columns of equal length that grow; a row never moves."""
+    """A table of observations that grows by rows; the number of a row never changes."""
 
     def __init__(self) -> None:
         self._n = 0
@@ -60,7 +63,11 @@ class Ledger:
         whitening: FloatArray,
         valid: BoolArray,
     ) -> IntArray:
-        """Add observations of images (n,) of the drive, carried to pinholes; their rows (n,)."""
+        """Append observations of images (n,), rows of the drive's images; return their rows (n,).
+
+        `carried_px` (n, 2) are their pixels in the pinhole of the same camera; `valid` (n,) whether these
+        exist.
+        """
         n, new = len(observations), np.zeros(0)
         rows = np.arange(self._n, self._n + n)
         for name, column in self._column.items():
@@ -93,7 +100,7 @@ class Ledger:
 
     @property
     def track(self) -> IntArray:
-        """(n,) number of each one's track."""
+        """(n,) track number of each observation."""
         return self._all("track")
 
     @property
@@ -103,17 +110,17 @@ class Ledger:
 
     @property
     def whitening(self) -> FloatArray:
-        """(n, 2, 2) takes a residual of the pinhole to raw pixels of unit covariance."""
+        """(n, 2, 2) takes a residual in pixels of the pinhole to one of unit covariance."""
         return self._all("whitening")
 
     @property
     def fate(self) -> NDArray[np.int8]:
-        """(n,) of Fate; may be written to."""
+        """(n,) values of `Fate`, as a writable view."""
         return self._all("fate")
 
     @property
     def observations(self) -> Observations:
-        """As they were given, images counted over the whole drive."""
+        """All observations as given; `image` counts the images of the whole drive."""
         covariance = self._all("covariance_px2").copy() if self.has_covariances else None
         return Observations(
             image=self.image.copy(),
@@ -124,7 +131,7 @@ class Ledger:
         )
 
     def find(self, image: IntArray, track: IntArray) -> IntArray:
-        """Rows (n,) of observations of tracks (n,) in images (n,); -1 where none is, or was removed."""
+        """Rows (n,) of observations of tracks (n,) in images (n,); -1 for one that is not in the ledger."""
         there = np.flatnonzero(self.fate != int(Fate.REMOVED))
         if not len(there):
             return np.full(len(track), -1)
@@ -134,19 +141,19 @@ class Ledger:
         return np.where(known[at] == wanted, there[at], -1)
 
     def with_fate(self, rows: IntArray, fate: Fate) -> IntArray:
-        """Which of the rows have this fate."""
-        found: IntArray = rows[self.fate[rows] == int(fate)]
-        return found
+        """Those of the rows that have this fate."""
+        with_it: IntArray = rows[self.fate[rows] == int(fate)]
+        return with_it
 
     def all_with(self, fate: Fate) -> IntArray:
         """All rows that have this fate."""
         return np.flatnonzero(self.fate == int(fate))
 
     def set_fate(self, rows: IntArray, fate: Fate) -> None:
-        """Say what became of some."""
+        """Set the fate of some rows."""
         self.fate[rows] = int(fate)
 
 
 def _pairs(image: IntArray, track: IntArray) -> IntArray:
-    """One number for an image and a track."""
+    """One number (n,) for each pair of an image and a track."""
     return np.asarray(track * (1 << 24) + image)

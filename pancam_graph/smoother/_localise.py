@@ -1,4 +1,4 @@
-"""Where a stop is: its own variables fitted to its observations, everything else held."""
+"""Localisation of one stop: its own variables are fitted to its observations, all others held."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,11 +22,11 @@ _RULE = StopRule(max_iterations=15, relative_decrease=1e-4)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Located:
-    """A stop's own variables where its observations put them."""
+    """Optimum of a stop's own variables."""
 
     values: gtsam.Values
     squares: FloatArray
-    """(n,) squared whitened residuals of what `localise` was given; infinite behind the camera"""
+    """(n,) squared whitened residuals of the measurements; infinite for a landmark behind the camera"""
 
 
 def localise(
@@ -37,10 +37,10 @@ def localise(
     *,
     robust: bool,
 ) -> Located:
-    """Fit a station's own variables, by a robust loss if asked for, landmarks following.
+    """Fit a station's own variables and the landmarks that it sees; by Huber's loss if `robust`.
 
-    `values` are those of all stations of the patch, whose linkage has the one station free. `seen` are
-    landmarks with a place, or fresh ones; `priors` are of the station's variables.
+    `values` has the variables of all stations in the patch of `seen`, in which this station alone is free.
+    `seen` has known and new landmarks; `priors` are factors on the station's variables.
     """
     patch, postures = seen.placed.patch, Postures(values)
     seen = placed_anew(seen, patch.views(postures))
@@ -48,8 +48,8 @@ def localise(
     loss = loss_of("huber" if robust else "none")
     system = LandmarkSystem(patch.linkage, placed.measurements, placed.landmarks, loss)
 
-    def posture(own: gtsam.Values) -> Posture:
-        return patch.posture(postures.moved(station, own))
+    def posture(station_values: gtsam.Values) -> Posture:
+        return patch.posture(postures.moved(station, station_values))
 
     blocks = LandmarkBlocks(system, read_variable, posture)
     graph = gtsam.NonlinearFactorGraph()

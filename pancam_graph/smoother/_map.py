@@ -30,25 +30,26 @@ __all__ = ["Change", "DriveMap"]
 
 @dataclass(kw_only=True)
 class Change:
-    """What an update has done to the blocks before they are linearised."""
+    """Changes of blocks by an update, before iSAM2 has them."""
 
     touched: set[int] = field(default_factory=set)
-    """Blocks with other observations than before."""
+    """Names of blocks whose observations changed."""
     slots: list[int] = field(default_factory=list)
-    """Factors of iSAM2 whose blocks are no more."""
+    """Slots of factors in iSAM2 whose blocks were removed."""
     rejected: int = 0
+    """Number of observations that became outliers."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Rebuilt:
-    """A block made anew."""
+    """Result of rebuilding a block."""
 
     seen: Seen
-    """All that it might have, and what of that is believed."""
+    """All candidate observations, and whether each is accepted."""
     stays: BoolArray
-    """(landmarks,) that have two observations or more"""
+    """(landmarks,) whether two or more observations are accepted."""
     block: LandmarkBlock | None
-    """Of those; None: there are none."""
+    """The block of these landmarks; None if no landmark is left."""
 
 
 class DriveMap:
@@ -60,18 +61,18 @@ class DriveMap:
         self.ledger = Ledger()
         self.blocks: dict[int, LandmarkBlock] = {}
         self.given: list[GivenFactor] = []
-        """Factors of the caller's."""
+        """The caller's factors, on the keys that the caller knows."""
         self.seated: list[gtsam.NonlinearFactor] = []
-        """The same on the drive's variables."""
+        """The same factors on the drive's variables."""
         self.image_station = np.zeros(0, dtype=np.int64)
-        """(images,) of the whole drive"""
+        """(images,) number of each image's station, over the whole drive"""
         self._track, self._home = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
 
     def add(self, station: Station) -> None:
-        """Add a station; its number is that of stations so far."""
+        """Add a station, whose number must be the number of stations so far."""
         self.stations.append(station)
-        own = np.full(len(station.traverse.images), station.number)
-        self.image_station = np.concatenate([self.image_station, own])
+        numbers = np.full(len(station.traverse.images), station.number)
+        self.image_station = np.concatenate([self.image_station, numbers])
 
     def factors(self, *, firm: bool) -> list[gtsam.NonlinearFactor]:
         """All factors but those of landmarks and of the caller; see `Station.factors`."""
@@ -79,7 +80,7 @@ class DriveMap:
         return [*shared, *(factor for s in self.stations for factor in s.factors(firm=firm))]
 
     def take_factors(self, template: HardTemplate, factors: UserFactors, values: gtsam.Values) -> FactorList:
-        """Take factors of the caller's, on keys of a template of the whole drive; those on its variables.
+        """Add the caller's factors, on a template of the whole drive; return them on the drive's variables.
 
         `values` are those of the drive. Raises InputError, and changes nothing, for a factor that cannot be
         evaluated there.
@@ -93,18 +94,18 @@ class DriveMap:
         return new
 
     def station_of(self, rows: IntArray) -> IntArray:
-        """Station (n,) of rows of the ledger."""
+        """Number (n,) of the station of each row of the ledger."""
         return self.image_station[self.ledger.image[rows]]
 
     def home(self, track: IntArray) -> IntArray:
-        """Block (n,) of tracks; -1 for those without a place."""
+        """Name (n,) of the block of each track; -1 for tracks without a landmark."""
         at = np.searchsorted(self._track, track).clip(max=max(len(self._track) - 1, 0))
         if not len(self._track):
             return np.full(len(track), -1)
         return np.where(self._track[at] == track, self._home[at], -1)
 
     def near(self, number: int) -> set[int]:
-        """Stations that share landmarks with one, itself among them."""
+        """Numbers of the stations that share landmarks with station `number`, itself included."""
         out = {number}
         for block in self.blocks.values():
             if number in block.patch.place:
@@ -112,51 +113,52 @@ class DriveMap:
         return out
 
     def restore(self, track: IntArray, home: IntArray, landmarks: Landmarks) -> None:
-        """Blocks of landmarks (landmarks,) as they were, with all observations that are used."""
+        """Rebuild the blocks of a saved drive from its landmarks (landmarks,) and observations in use."""
         used, none = self.ledger.all_with(Fate.USED), np.zeros(0, dtype=np.int64)
         order = np.argsort(track)
         self._track, self._home = track[order], home[order]
         of_row = self.home(self.ledger.track[used])
         for name in distinct(home).tolist():
-            rows, own = used[of_row == name], home == name
+            rows, of_block = used[of_row == name], home == name
             numbers = distinct(self.station_of(rows))
             patch = Patch([self.stations[i] for i in numbers])
             placed = gathered(self.ledger, self.image_station, patch, None, rows, none).placed
-            at = np.flatnonzero(own)[np.argsort(track[own])]
+            at = np.flatnonzero(of_block)[np.argsort(track[of_block])]
             where = Landmarks(vector=landmarks.vector[at], origin_m=landmarks.origin_m[at])
             self.blocks[name] = LandmarkBlock(replace(placed, landmarks=where), self._room)
 
     def idle(self, track: IntArray, *fates: Fate) -> IntArray:
-        """Rows of tracks that have one of these fates."""
+        """Rows of the ledger of these tracks that have one of these fates."""
         rows = np.concatenate([self.ledger.all_with(fate) for fate in fates])
         return rows[np.isin(self.ledger.track[rows], track)]
 
     def near_blocks(self, track: IntArray) -> set[int]:
-        """Stations of the blocks that tracks are of."""
+        """Numbers of the stations that observe any block of these tracks."""
         home = self.home(track)
         return {s for name in distinct(home[home >= 0]).tolist() for s in self.blocks[name].patch.place}
 
     def take_in(self, rows: IntArray, cameras: Postures, change: Change, but: IntArray) -> None:
-        """Give observations to landmarks, known or new.
+        """Assign observations to landmarks, known or new, and rebuild their blocks.
 
-        Observations that waited for a second ray take part too. `but` are rows that go on waiting.
+        Waiting observations of the same tracks take part too, except the rows `but`.
         """
         ledger = self.ledger
         track = distinct(ledger.track[rows])
         rows = distinct(rows, np.setdiff1d(self.idle(track, Fate.WAITING, Fate.OUTLIER), but))
-        # Observations near by may have been rejected too early: they are judged again.
+        # Outliers at the same stops may have been rejected for lack of other observations: they are tested
+        # again.
         around = self.near_blocks(track) | set(self.station_of(rows).tolist())
         out = ledger.all_with(Fate.OUTLIER)
         rows = distinct(rows, out[np.isin(self.station_of(out), list(around))])
         track = distinct(ledger.track[rows])
-        own, station = np.searchsorted(track, ledger.track[rows]), self.station_of(rows)
+        track_of_row, station = np.searchsorted(track, ledger.track[rows]), self.station_of(rows)
         home = self.home(track)
         known = home >= 0
-        enough = np.bincount(own, minlength=len(track)) >= 2
+        enough = np.bincount(track_of_row, minlength=len(track)) >= 2
         first = np.full(len(track), len(self.stations))
-        np.minimum.at(first, own, station)
+        np.minimum.at(first, track_of_row, station)
         home = np.where(known, home, np.where(enough, first, -1))
-        of_row = home[own]
+        of_row = home[track_of_row]
         self._rebuild(
             [(name, rows[of_row == name], rows[:0]) for name in distinct(of_row[of_row >= 0]).tolist()],
             cameras,
@@ -164,7 +166,10 @@ class DriveMap:
         )
 
     def give_up(self, rows: IntArray, cameras: Postures, change: Change) -> None:
-        """Landmarks lose observations, whose fate is set; others that these had ruled out may come back."""
+        """Rebuild blocks without these rows, whose fate is set already.
+
+        Outliers of their tracks are tested again.
+        """
         ledger = self.ledger
         track = distinct(ledger.track[rows])
         idle = self.idle(track, Fate.OUTLIER)
@@ -173,7 +178,7 @@ class DriveMap:
         self._rebuild([(b, idle[home_idle == b], rows[home == b]) for b in names], cameras, change)
 
     def drop_behind(self, cameras: Postures, change: Change) -> None:
-        """Landmarks lose observations of cameras that they have come to lie behind of."""
+        """Reject observations by cameras that their landmark now lies behind."""
         for name in [name for name, block in self.blocks.items() if block.system.any_behind]:
             block = self.blocks[name]
             placed, views = block.placed, block.patch.views(cameras)
@@ -191,14 +196,14 @@ class DriveMap:
                 self.ledger.set_fate(lost, Fate.OUTLIER)
                 change.rejected += len(lost)
                 self._rebuild([(name, lost[:0], lost)], cameras, change)
-            else:  # found in front after all
+            else:  # placed anew, every landmark is in front
                 block.replace(placed)
                 change.touched.add(name)
 
     def _rebuild(
         self, parts: Sequence[tuple[int, IntArray, IntArray]], cameras: Postures, change: Change
     ) -> None:
-        """Make blocks anew: of each its name, the rows that it gets, and those that it loses."""
+        """Rebuild blocks, given for each its name, the rows to add and the rows to remove."""
         names: list[int] = []
         work: list[tuple[Placed | None, Patch, IntArray, IntArray]] = []
         for name, rows, lost in parts:
@@ -219,7 +224,7 @@ class DriveMap:
     def _rebuilt(
         self, known: Placed | None, patch: Patch, rows: IntArray, lost: IntArray, cameras: Postures
     ) -> "_Rebuilt":
-        """What becomes of a block; nothing else changes yet."""
+        """The rebuilt block; the state of the drive is not changed."""
         seen = gathered(self.ledger, self.image_station, patch, known, rows, lost)
         if not len(seen.placed.track):
             return _Rebuilt(seen=seen, stays=np.zeros(0, dtype=bool), block=None)
@@ -234,7 +239,7 @@ class DriveMap:
         return _Rebuilt(seen=seen, stays=stays, block=block)
 
     def _settle(self, name: int, made: "_Rebuilt", change: Change) -> None:
-        """Say what became of observations, and take the block of what is left."""
+        """Record the fates of a rebuilt block's observations, and store the block."""
         placed, accepted, fate = made.seen.placed, made.seen.accepted, self.ledger.fate
         m = placed.measurements
         idle = np.where(accepted, int(Fate.WAITING), int(Fate.OUTLIER))
@@ -257,12 +262,12 @@ class DriveMap:
         self._home = np.insert(self._home, at[~known], name)
 
     def seen_from(self, track: IntArray, stations: set[int]) -> BoolArray:
-        """(n,) whether known tracks are seen from any of some stations; False of unknown ones."""
+        """(n,) whether each track is observed from any of the stations; False for one without a landmark."""
         out, home = np.zeros(len(track), dtype=bool), self.home(track)
         for name in distinct(home[home >= 0]).tolist():
-            block, own = self.blocks[name], np.flatnonzero(home == name)
+            block, of_block = self.blocks[name], np.flatnonzero(home == name)
             if block.patch.place.keys() <= stations:
-                out[own] = True
+                out[of_block] = True
                 continue
             placed = block.placed
             of_image = np.repeat(
@@ -270,11 +275,11 @@ class DriveMap:
             )
             m = placed.measurements
             any_of = np.bincount(m.landmark, of_image[m.image], minlength=m.n_landmarks) > 0
-            out[own] = any_of[np.searchsorted(placed.track, track[own])]
+            out[of_block] = any_of[np.searchsorted(placed.track, track[of_block])]
         return out
 
     def excerpt(self, track: IntArray, rows: IntArray, free: Station) -> Seen:
-        """Some tracks (ascending) with all their observations, and new rows, as if one station moved."""
+        """Some tracks (ascending) with all observations and new rows, in a patch with one free station."""
         home = self.home(track)
         parts = []
         for name in distinct(home[home >= 0]).tolist():

@@ -1,4 +1,4 @@
-"""Which observations of a stop are of what its neighbours see, and which may close a loop."""
+"""Observations of a stop split into those of landmarks near by and those that may close a loop."""
 
 import numpy as np
 
@@ -12,23 +12,23 @@ from pancam_graph.smoother._station import Station
 __all__ = ["by_nearness", "sample"]
 
 _ENOUGH_PER_IMAGE = 60
-"""Observations of an image that place a new stop well enough to linearise there."""
+"""Observations per image that suffice to localise a new stop before it is linearised."""
 
 
 def by_nearness(drive: DriveMap, rows: IntArray, around: dict[int, set[int]]) -> tuple[IntArray, IntArray]:
-    """Rows of tracks that stations near their own see, and of tracks that are far off.
+    """Split rows into those of tracks observed from stations near their own, and all others.
 
-    `around` says which stations are near one, where that is not what shares landmarks with it. A track
-    without a place is of where its first observations are.
+    `around` gives the numbers of stations near a station; default: those that share landmarks with it. A
+    track without a landmark belongs to the station that observed it first.
     """
     ledger = drive.ledger
     track, station = ledger.track[rows], drive.station_of(rows)
     is_near = np.zeros(len(rows), dtype=bool)
     unknown = drive.home(track) < 0
     waiting = drive.idle(distinct(track[unknown]), Fate.WAITING)
-    names, own = np.unique(ledger.track[waiting], return_inverse=True)
+    names, name_of_waiting = np.unique(ledger.track[waiting], return_inverse=True)
     first = np.full(len(names), len(drive.stations))
-    np.minimum.at(first, own, drive.station_of(waiting))
+    np.minimum.at(first, name_of_waiting, drive.station_of(waiting))
     first_of = np.full(len(rows), -1)
     first_of[unknown] = first[np.searchsorted(names, track[unknown])]
     for number in distinct(station).tolist():
@@ -40,11 +40,11 @@ def by_nearness(drive: DriveMap, rows: IntArray, around: dict[int, set[int]]) ->
 
 
 def sample(drive: DriveMap, station: Station, rows: IntArray) -> Seen | None:
-    """Tracks enough to say where a station is: with a place, or seen from there twice."""
+    """A sample of tracks that localises a station: with a landmark, or observed from it twice."""
     track = drive.ledger.track[rows]
-    names, own, count = np.unique(track, return_inverse=True, return_counts=True)
+    names, name_of_row, count = np.unique(track, return_inverse=True, return_counts=True)
     names = names[(count >= 2) | (drive.home(names) >= 0)]
     enough = _ENOUGH_PER_IMAGE * len(station.traverse.images)
-    names = names[:: max(1, len(own) // enough)]
+    names = names[:: max(1, len(name_of_row) // enough)]
     rows = rows[np.isin(track, names)]
     return drive.excerpt(names, rows, station) if len(rows) and station.own else None

@@ -1,4 +1,4 @@
-"""How a stop is joined to the one before it, if stops are known by how the rover moved."""
+"""Odometry as a factor between a stop and the stop before it."""
 
 import gtsam
 
@@ -10,7 +10,7 @@ __all__ = ["guess", "join", "local_priors"]
 
 
 def join(station: Station, previous: Station) -> None:
-    """Give a station the odometry from another one, in place of a prior on where it is.
+    """Give a station a factor of odometry from another one, in place of the prior on its mast pose.
 
     Raises InputError where that motion has no sigmas.
     """
@@ -29,7 +29,7 @@ def join(station: Station, previous: Station) -> None:
 
 
 def guess(station: Station, previous: Station | None, estimate: gtsam.Values) -> gtsam.Pose3:
-    """Where odometry from the previous stop leads; without one, where telemetry has it."""
+    """Initial mast pose: odometry from the previous stop's estimate; without one, telemetry's pose."""
     said = station.traverse.stops[0].world_T_mast
     if previous is None or station.mast is None:
         return said
@@ -44,11 +44,11 @@ def local_priors(
     between = station.motion
     if previous is None or previous.mast is None or not isinstance(between, gtsam.BetweenFactorPose3):
         return station.factors(firm=True)
-    assert station.mast is not None  # odometry leads to masts that move
-    own = copied(values, [previous.mast])
+    assert station.mast is not None  # `join` gives odometry to free masts only
+    previous_mast = copied(values, [previous.mast])
     held = gtsam.PriorFactorPose3(
         station.mast,
-        orthonormal(own.atPose3(previous.mast) * between.measured()),
+        orthonormal(previous_mast.atPose3(previous.mast) * between.measured()),
         between.noiseModel(),
     )
     return [held, *station.other_priors(firm=True)]

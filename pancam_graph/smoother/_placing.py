@@ -1,4 +1,4 @@
-"""Landmarks seen again or for the first time: where they are, and which of their observations to believe."""
+"""Triangulation and refinement of landmarks with new observations, and rejection of outliers among these."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -24,22 +24,23 @@ from pancam_graph.solve import snoop
 __all__ = ["Placed", "Seen", "believed", "combined", "gathered", "placed_anew"]
 
 _FEW_VIEWS = 4
-"""Landmarks with no more observations may hide an outlier in residuals that are all small."""
+"""Landmarks with at most this many observations may have an outlier though all their residuals are small."""
 _WIDEST = 3.0
-"""Noise is not taken to be more than so many times what observations say of themselves."""
+"""Largest ratio assumed of the actual noise to the sigmas of observations."""
 _HIDDEN = 3.0
-"""Other landmarks hide no outlier where their largest squared residual is this many times below the limit."""
+"""A landmark of more observations is tested if its largest squared residual, times this, reaches the
+limit."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Placed:
-    """Landmarks with their observations, as a patch of stations sees them."""
+    """Landmarks with their observations from the stations of a patch."""
 
     patch: Patch
     track: IntArray
-    """(landmarks,) ascending"""
+    """(landmarks,) track numbers, ascending"""
     measurements: Measurements
-    """Their `row` is that of the ledger."""
+    """Of these landmarks; `row` counts rows of the ledger, `image` images of the patch."""
     landmarks: Landmarks
 
     def part(self, which: BoolArray, rows: BoolArray) -> "Placed":
@@ -54,19 +55,19 @@ class Placed:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Seen:
-    """Landmarks of which some are seen anew."""
+    """Landmarks of which some have new observations."""
 
     placed: Placed
     touched: BoolArray
-    """(landmarks,) that have new observations, or lost some"""
+    """(landmarks,) whether observations were added or removed"""
     fresh: BoolArray
-    """(landmarks,) that had no place before"""
+    """(landmarks,) whether it is new, without a place yet"""
     accepted: BoolArray
-    """(n,)"""
+    """(n,) whether each measurement takes part"""
 
 
 def combined(ledger: Ledger, image_station: IntArray, patch: Patch, parts: Sequence[Placed]) -> Placed:
-    """Landmarks of several blocks together, as another patch sees them."""
+    """Landmarks of several blocks joined in another patch."""
     track = np.concatenate([p.track for p in parts])
     order = np.argsort(track)
     rank = np.empty_like(order)
@@ -88,7 +89,7 @@ def combined(ledger: Ledger, image_station: IntArray, patch: Patch, parts: Seque
 def _measurements(
     ledger: Ledger, image_station: IntArray, patch: Patch, row: IntArray, landmark: IntArray
 ) -> Measurements:
-    """Rows of the ledger (n,) that see landmarks (n,), sorted by these and then by image."""
+    """Measurements from rows of the ledger (n,) of landmarks (n,), sorted by landmark and then by image."""
     image = ledger.image[row]
     image = patch.image(image, image_station[image])
     # Mostly runs that are in order already: a stable sort merges them.
@@ -111,9 +112,9 @@ def gathered(
     rows: IntArray,
     lost: IntArray,
 ) -> Seen:
-    """Known landmarks, less rows of the ledger that they lose, and new rows, of these tracks or others.
+    """Known landmarks without the rows `lost`, and with `rows` added, of their tracks or of new ones.
 
-    Rows that are outliers take part as such.
+    Outliers among the rows are included, but not accepted.
     """
     new, gone = ledger.track[rows], distinct(ledger.track[lost])
     if known is not None and len(lost):
@@ -149,15 +150,15 @@ def gathered(
 
 
 def placed_anew(seen: Seen, views: CameraViews) -> Seen:
-    """Fresh landmarks from their rays, and all that are touched where they fit best with these cameras."""
+    """Triangulate fresh landmarks and refine all touched ones, with the cameras held."""
     placed = seen.placed
     m, landmarks, weight = placed.measurements, placed.landmarks, seen.accepted.astype(float)
     if seen.fresh.any():
         rows = np.flatnonzero(seen.fresh[m.landmark])
         part = m.part(rows)
-        found = triangulate(*rays_of(part, views), part.landmark, weight[rows])
+        triangulated = triangulate(*rays_of(part, views), part.landmark, weight[rows])
         vector, origin = landmarks.vector.copy(), landmarks.origin_m.copy()
-        vector[seen.fresh], origin[seen.fresh] = found.vector, found.origin_m
+        vector[seen.fresh], origin[seen.fresh] = triangulated.vector, triangulated.origin_m
         landmarks = Landmarks(vector=vector, origin_m=origin)
     which = np.flatnonzero(seen.touched)
     landmarks = refine(landmarks, m, views, weight, beyond_infinity=True, only=which)
@@ -165,21 +166,21 @@ def placed_anew(seen: Seen, views: CameraViews) -> Seen:
 
 
 def believed(seen: Seen, views: CameraViews, cutoff_sigma: float | None) -> Seen:
-    """Touched landmarks without the observations that contradict the others; see `snoop`.
+    """Reject observations of touched landmarks that contradict the others, by data snooping (`snoop`).
 
-    Only those that may hide an outlier are looked at. Observations of landmarks behind their camera go;
-    with no cutoff nothing else does.
+    Only landmarks that may have an outlier are tested. Observations of a landmark behind its camera are
+    always rejected; with no cutoff, these alone.
     """
     placed = seen.placed
     m, n = placed.measurements, placed.measurements.n_landmarks
     whitened, in_front = residuals(placed.landmarks, m, views)
     if cutoff_sigma is None:
-        # A landmark behind a camera that sees it for the first time was placed by few rays: place it by all.
-        astray = (np.bincount(m.landmark, ~in_front, minlength=n) > 0) & seen.touched
-        if astray.any():
-            all_of = seen.accepted | astray[m.landmark]
+        # A landmark behind a camera may have been triangulated from too few rays: triangulate it from all.
+        behind = (np.bincount(m.landmark, ~in_front, minlength=n) > 0) & seen.touched
+        if behind.any():
+            all_of = seen.accepted | behind[m.landmark]
             seen = replace(
-                placed_anew(replace(seen, touched=astray, fresh=astray, accepted=all_of), views),
+                placed_anew(replace(seen, touched=behind, fresh=behind, accepted=all_of), views),
                 touched=seen.touched,
                 fresh=seen.fresh,
             )
@@ -196,7 +197,7 @@ def believed(seen: Seen, views: CameraViews, cutoff_sigma: float | None) -> Seen
     suspect &= seen.touched
     if not suspect.any():
         return seen
-    # By all landmarks of the block: those touched may be few, and all wrong.
+    # The noise scale comes from all landmarks of the block: the touched ones may be few, and all wrong.
     judged = count > 2
     scale = float(np.sqrt(np.median(total[judged] / (2 * count[judged] - 3)))) if judged.any() else 1.0
     rows = np.flatnonzero(suspect[m.landmark])

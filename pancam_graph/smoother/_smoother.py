@@ -1,4 +1,4 @@
-"""The rover drives: an estimate that follows stop by stop."""
+"""The smoother of a drive: an estimate that is updated after every stop."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -39,7 +39,7 @@ class TraverseSmoother:
     """
 
     def __init__(self, rig: Rig, options: SmootherOptions | None = None) -> None:
-        """Nothing is known yet."""
+        """Begin an empty drive of a rover with this rig."""
         self.rig, self.options = rig, options or SmootherOptions()
         self._sharing = (self.options.sharing or Sharing()).for_model("mast")
         self._drive = DriveMap(self.options.outlier_sigma)
@@ -48,7 +48,7 @@ class TraverseSmoother:
         self._image_row: dict[str, int] = {}
         self._frame_ids: set[str] = set()
 
-    # --- what is known ---
+    # --- estimates ---
 
     @property
     def stops(self) -> tuple[str, ...]:
@@ -61,7 +61,7 @@ class TraverseSmoother:
         return tuple(self._image_row)
 
     def values(self) -> gtsam.Values:
-        """All variables where they are now, under the keys that a batch of the drive has."""
+        """Estimates of all variables, under the keys of a batch template of the drive."""
         return gtsam.Values(self._engine.estimate)
 
     @property
@@ -71,7 +71,7 @@ class TraverseSmoother:
 
     @property
     def used(self) -> BoolArray:
-        """(observations,) which of the traverse's take part."""
+        """(observations,) whether each observation of `traverse` takes part."""
         return np.asarray(self._drive.ledger.fate == int(Fate.USED))
 
     @property
@@ -80,7 +80,7 @@ class TraverseSmoother:
         return self._engine.cost if self._stop else 0.0
 
     def estimate(self) -> Estimate:
-        """Where all stops are, and where all frames point."""
+        """Estimated mast poses of all stops and angles of all frames."""
         values, stations = self._engine.estimate, self._drive.stations
         angles = [s.pan_tilt_rad(values) for s in stations]
         return Estimate(
@@ -95,7 +95,7 @@ class TraverseSmoother:
         return joint_covariance(self._engine, [self._station(stop)])
 
     def relative_covariance(self, stop_a: str, stop_b: str) -> FloatArray:
-        """Covariance (6, 6) of a_T_b, where b's mast is as a's sees it; rotation first, in the frame of b."""
+        """Covariance (6, 6) of a_T_b, the pose of b's mast in a's frame; rotation first, in b's frame."""
         return relative_covariance(self._engine, self._station(stop_a), self._station(stop_b))
 
     def _station(self, stop: str) -> Station:
@@ -118,7 +118,7 @@ class TraverseSmoother:
 
         `observations.image` are rows of `images`; tracks have the same numbers over the whole drive. `after`
         is the stop from which odometry leads here; default: the one added last. Raises InputError, and
-        changes nothing, where an id or a number makes no sense or was added before.
+        changes nothing, for an id that was added before and for a number out of its range.
         """
         entries = Traverse(
             name="",
@@ -159,13 +159,13 @@ class TraverseSmoother:
                     )
 
     def _follow(self, station: Station, previous: Station) -> None:
-        """Note which station one comes after, and the odometry if that counts."""
+        """Record the station before, and the odometry from it where that replaces the mast's prior."""
         station.after = previous.number
         if self.options.telemetry == "odometry":
             join(station, previous)
 
     def _enter(self, station: Station, observations: Observations | None) -> IntArray:
-        """Make a station known; the ledger's rows of its observations."""
+        """Register a station and its observations; return the rows of these in the ledger."""
         t = station.traverse
         self._stop[station.id] = station
         self._frame_ids |= {f.id for f in t.frames}
@@ -180,16 +180,16 @@ class TraverseSmoother:
         carried, turn = np.empty((len(image), 2)), np.empty((len(image), 2, 2))
         valid = np.empty(len(image), dtype=bool)
         for i, one in enumerate(self.rig.eyes):
-            own = eye == i
-            range_m = np.full(int(own.sum()), _TYPICAL_RANGE_M)
-            carried[own], turn[own], valid[own] = carry_to_pinhole(
-                one.camera, observations.uv_px[own], range_m
+            of_eye = eye == i
+            range_m = np.full(int(of_eye.sum()), _TYPICAL_RANGE_M)
+            carried[of_eye], turn[of_eye], valid[of_eye] = carry_to_pinhole(
+                one.camera, observations.uv_px[of_eye], range_m
             )
         whitening = observations.noise.whiten(turn)
         return self._drive.ledger.append(image, observations, carried, whitening, valid)
 
     def _place(self, station: Station, previous: Station | None, run: UpdateRun) -> None:
-        """Find where a new station is, and let its observations take part."""
+        """Localise a new station, and add its observations."""
         drive, engine = self._drive, self._engine
         known, new = gtsam.Values(engine.estimate), gtsam.Values()
         start = station.start(guess(station, previous, engine.estimate))
@@ -213,9 +213,9 @@ class TraverseSmoother:
     def add_observations(self, observations: Observations) -> Update:
         """Add observations of images that were added before; `observations.image` are rows of `images`.
 
-        Tracks far off that are seen again close a loop: they are believed if they agree on a pose of the stop
-        that does not contradict the drive. Raises InputError, and changes nothing, for an image that was not
-        added and for an image that has seen a track already.
+        Observations of tracks far off are tested as a loop closure: they take part if they agree on a pose of
+        the stop that does not contradict the drive. Raises InputError, and changes nothing, for an image that
+        was not added and for an image that has seen a track already.
         """
         run, drive, engine = self._run(), self._drive, self._engine
         image = self._rows_of_images(observations)
@@ -250,7 +250,7 @@ class TraverseSmoother:
         return whole_template(self._drive)
 
     def add_factors(self, factors: UserFactors) -> Update:
-        """Add GTSAM factors of the caller's, on `keys`; they count from now on, as `solve` counts them.
+        """Add GTSAM factors of the caller's, on `keys`; they take part from now on, as in `solve`.
 
         Raises InputError, and changes nothing, for a factor that cannot be evaluated where the drive is.
         """
@@ -300,17 +300,20 @@ class TraverseSmoother:
             )
         return observations.image
 
-    # --- what is kept ---
+    # --- saving and loading ---
 
     def state(self) -> SmootherState:
-        """Everything, to go on from later. Raises InputError where no stop was added."""
+        """The state of the drive, from which `of` makes a smoother that continues.
+
+        Raises InputError where no stop was added.
+        """
         if not self._stop:
             raise InputError("smoother: expected at least one stop to keep, found none")
         return state_of(self._drive, self.options, self._engine.estimate)
 
     @staticmethod
     def of(state: SmootherState, factors: UserFactors = ()) -> "TraverseSmoother":
-        """A smoother that goes on from a state: all is linearised where it was estimated to be.
+        """A smoother that continues from a state, linearised at its estimate.
 
         `factors` are those that the caller had added: a state cannot keep them. Raises InputError for another
         number of them.
@@ -322,8 +325,8 @@ class TraverseSmoother:
             for number, stop in enumerate(t.stops):
                 frames = tuple(t.frames[i] for i in np.flatnonzero(t.frame_stop == number))
                 images = tuple(t.images[i] for i in np.flatnonzero(t.image_stop == number))
-                own = Traverse(name="", rig=t.rig, stops=(stop,), frames=frames, images=images)
-                station = Station(number, own, smoother._sharing, len(smoother._image_row))
+                entries = Traverse(name="", rig=t.rig, stops=(stop,), frames=frames, images=images)
+                station = Station(number, entries, smoother._sharing, len(smoother._image_row))
                 if (after := int(state.after[number])) >= 0:
                     smoother._follow(station, drive.stations[after])
                 smoother._enter(station, None)
@@ -342,9 +345,9 @@ class TraverseSmoother:
         return smoother
 
     def save(self, path: Path | str) -> None:
-        """Keep everything in a file (`.npz`), to go on from with `load`; an older one stays till it is whole.
+        """Write the state to a file (`.npz`) for `load`; only a complete file replaces an older one.
 
-        Raises InputError where there is nothing to keep or the file cannot be written.
+        Raises InputError where no stop was added or the file cannot be written.
         """
         from pancam_graph.smoother._file import save_smoother  # noqa: PLC0415  io imports this module
 
@@ -352,7 +355,7 @@ class TraverseSmoother:
 
     @staticmethod
     def load(path: Path | str, factors: UserFactors = ()) -> "TraverseSmoother":
-        """A smoother as it was saved; `factors` as for `of`.
+        """A smoother that continues from a saved file; `factors` as for `of`.
 
         Raises InputError for a file of another version or a damaged one.
         """

@@ -1,4 +1,4 @@
-"""What a smoother is told, and what its updates return."""
+"""Options of a smoother, and the results of its updates."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -15,30 +15,32 @@ __all__ = ["Closure", "Estimate", "SmootherOptions", "Update"]
 
 @dataclass(frozen=True, kw_only=True)
 class SmootherOptions:
-    """How to follow a drive. Raises InputError naming the option that makes no sense."""
+    """Options of a smoother. Raises InputError naming an option that is out of its range."""
 
     telemetry: Literal["absolute", "odometry"] = "absolute"
-    """How stops' poses and sigmas are meant: "absolute": each is a prior of its own, as `solve` takes it;
-    "odometry": of all but the first, only the motion from one stop to the next counts, and the sigmas are
-    that motion's, in the body frame of the later stop."""
+    """Meaning of the stops' poses and sigmas: "absolute": each is a prior on its mast pose, as in `solve`;
+    "odometry": after the first stop a pose counts only by the motion from the stop before, and the sigmas are
+    those of that motion, in the body frame of the later stop."""
     sharing: Sharing | None = None
-    """What of the rig is free, and who shares it; None: nothing is. As for `solve` with the model `mast`."""
+    """Free entries of the rig and who shares them, as for `solve` with the model `mast`; None: the rig is
+    fixed."""
     relinearise_rad: float = 1e-3
-    """A block of landmarks is linearised anew where an angle, or how its masts are turned against each
-    other, has moved by more."""
+    """Change of an angle, or of the rotation between two masts of a block, radians, beyond which the block is
+    linearised again."""
     relinearise_m: float = 1e-2
-    """The same for how its masts stand to each other."""
+    """The same for the translation between two masts of a block, metres."""
     relinearise_rig: float = 1e-3
-    """The same for free entries of the rig: radians, metres, shares of a focal length; a hundred times as
-    much for pixels."""
+    """The same for free entries of the rig: radians, metres, or shares of a focal length; a hundred times as
+    much for entries in pixels."""
     outlier_sigma: float | None = 4.0
-    """An observation goes where noise would take it less often than a Gaussian beyond this many sigmas; None:
-    all are kept."""
+    """Cutoff of the test for outliers, in sigmas of a Gaussian of equal probability; None: no observation is
+    rejected."""
     closure_probability: float = 1e-6
-    """A loop closure is believed unless a right one would contradict the drive as much less often than so."""
+    """Significance level of the test of loop closures: one is rejected where a right closure would contradict
+    the drive as much with a smaller probability."""
     max_rounds: int = 8
-    """So many times at most an update is linearised anew; then, or where a step raises the cost, all is
-    solved by Levenberg-Marquardt, as `solve` does."""
+    """Largest number of rounds of iSAM2 in an update; after these, or where a step raises the cost,
+    Levenberg-Marquardt solves the whole drive, as `solve` does."""
 
     def __post_init__(self) -> None:
         """Check the choices."""
@@ -60,52 +62,62 @@ class SmootherOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Closure:
-    """Observations of a stop that join it to a part of the drive that odometry had left behind."""
+    """A loop closure: observations of a stop that join it to a part of the drive far off."""
 
     stop: str
+    """Id of the stop that observes."""
     other: str
-    """The stop of that part which shares most of the tracks."""
+    """Id of the stop of that part which shares most of the tracks."""
     observations: int
+    """Their number."""
     inliers: float
-    """The share of them that agrees on one pose of the stop."""
+    """Share of the observations that agree on one pose of the stop."""
     sigmas: float
-    """By how much that pose contradicts the drive: the sigma beyond which a Gaussian is as rare."""
+    """Deviation of that pose from the drive, in sigmas of a Gaussian of equal probability."""
     shift_m: float
-    """How far it is from where the drive had the stop."""
+    """Distance of that pose from the drive's estimate, metres."""
     accepted: bool
+    """Whether the observations take part."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Update:
-    """What an update did."""
+    """Summary of an update."""
 
     stop: str | None
-    """Of `add_stop`."""
+    """Id of the stop that `add_stop` added; None for other updates."""
     observations: int
-    """New ones, or those removed."""
+    """Number of observations added or removed."""
     rejected: int
-    """Observations that this update rejected, old ones too."""
+    """Number of observations rejected by this update, old ones included."""
     blocks: int
-    """Blocks of landmarks that were removed and added again, or added."""
+    """Number of landmark blocks added, or removed and added again."""
     rounds: int
-    """Updates of iSAM2."""
+    """Number of updates of iSAM2."""
     relinearised: int
-    """Variables that moved to another point of linearisation; one that moved twice counts twice."""
+    """Number of variables linearised again; one in two rounds counts twice."""
     cost: float
-    """Of everything, after: half the sum of squares. Blocks far from what changed by their linear model."""
+    """Total cost after the update: half the sum of squared whitened residuals. Blocks far from the changes
+    count by their linear model."""
     seconds: float
+    """Wall-clock time."""
     fell_back: bool
-    """Whether all was solved anew by Levenberg-Marquardt, since iSAM2's steps did not lower the cost."""
+    """Whether Levenberg-Marquardt solved the whole drive, since the steps of iSAM2 did not lower the cost."""
     closures: tuple[Closure, ...] = ()
+    """Loop closures that were tested."""
     warnings: tuple[str, ...] = ()
+    """Sentences for the user."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Estimate:
-    """Where everything is, in the order in which it was added."""
+    """Estimated mast poses and angles, in the order in which stops were added."""
 
     stops: tuple[str, ...]
+    """Ids."""
     world_T_mast: tuple[gtsam.Pose3, ...]
+    """Of each stop."""
     frames: tuple[str, ...]
+    """Ids."""
     pan_tilt_rad: FloatArray
-    """(frames, 2)"""
+    """(frames, 2) pan and tilt"""

@@ -1,4 +1,4 @@
-"""The state of a smoother, for files and for going on later."""
+"""The state of a smoother, as files keep it."""
 
 from dataclasses import dataclass
 
@@ -17,31 +17,31 @@ __all__ = ["SmootherState", "state_of"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SmootherState:
-    """A drive as far as it was followed. The tree of iSAM2 follows from this."""
+    """State of a drive, from which the tree of iSAM2 is rebuilt."""
 
     traverse: Traverse
     """All stops with all observations, in the order in which they were added."""
     options: SmootherOptions
     after: IntArray
-    """(stops,) from which stop odometry led to each; -1: from none"""
+    """(stops,) number of the stop from which odometry leads to each; -1: none"""
     fate: IntArray
-    """(observations,) what became of each"""
+    """(observations,) values of `Fate`"""
     track: IntArray
-    """(landmarks,) ascending"""
+    """(landmarks,) track numbers, ascending"""
     home: IntArray
-    """(landmarks,) stop whose block each is of"""
+    """(landmarks,) number of the stop that names each landmark's block"""
     vector: FloatArray
-    """(landmarks, 4)"""
+    """(landmarks, 4) homogeneous coordinates about `origin_m`"""
     origin_m: FloatArray
-    """(landmarks, 3)"""
+    """(landmarks, 3) in the world"""
     key: IntArray
-    """(variables,) in GTSAM's numbering"""
+    """(variables,) keys as GTSAM's integers"""
     width: IntArray
-    """(variables,) numbers of each"""
+    """(variables,) how many entries of `value` each has"""
     value: FloatArray
-    """Of all variables one after the other; of a pose the first three rows of its matrix."""
+    """Numbers of all variables, one after the other; of a pose the first three rows of its matrix."""
     n_given: int = 0
-    """Number of factors of the caller's, which no file can keep."""
+    """Number of the caller's factors, which a file cannot keep."""
 
     @staticmethod
     def numbers(values: gtsam.Values, key: int) -> FloatArray:
@@ -63,7 +63,7 @@ class SmootherState:
 
 
 def state_of(drive: DriveMap, options: SmootherOptions, values: gtsam.Values) -> SmootherState:
-    """What is to be kept of a drive with these values."""
+    """The state of a drive at these values of its variables."""
     numbers = SmootherState.numbers
     blocks = [(name, block.placed) for name, block in sorted(drive.blocks.items())]
     keys = list(values.keys())

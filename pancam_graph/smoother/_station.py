@@ -1,4 +1,4 @@
-"""One stop as a template of its own, and several of them joined into the structure of a landmark system."""
+"""One stop as a factor template, and several stops joined into the linkage of a landmark system."""
 
 from collections.abc import Iterable
 from functools import cached_property
@@ -25,7 +25,8 @@ class Station:
         self.template = HardTemplate(traverse, sharing)
         self.link = self.template.linkage
         self.global_key = self._global_keys()
-        """Of each of the template's keys; what stops share has one key for all of them."""
+        """Key in the whole drive of each of the template's keys; entries of the rig that stops share have one
+        key."""
         slot = self.template.mast(0)
         self.mast = self.global_key[slot.key] if isinstance(slot, Key) else None
         """Key of the mast pose; None where it is held."""
@@ -34,14 +35,14 @@ class Station:
         self.after = -1
         """Number of the station from which odometry led here; -1: from none."""
         self.motion: gtsam.NonlinearFactor | None = None
-        """From another station, where that is known in place of the mast's pose."""
+        """Factor of odometry from another station, in place of the prior on the mast pose."""
         self.own = tuple(
             self.global_key[k] for k, g in zip(self.link.key, self.link.group, strict=True) if g == 0
         )
         self.shared = tuple(k for k, g in zip(self.link.key, self.link.group, strict=True) if g == 1)
 
     def _global_keys(self) -> dict[int, int]:
-        """The keys that a template of the whole drive has."""
+        """Key of each variable in a template of the whole drive, by its key in this stop's template."""
         out = {key: key_of(kind_of(key), self.number) for key in self.link.key}
         for v in self.template.rig_variables.variables:
             index = index_of(v.key)
@@ -56,7 +57,7 @@ class Station:
 
     @property
     def id(self) -> str:
-        """Of the stop."""
+        """Id of the stop."""
         return self.traverse.stops[0].id
 
     @property
@@ -68,14 +69,14 @@ class Station:
         )
 
     def local(self, values: gtsam.Values) -> gtsam.Values:
-        """The template's own variables, out of those of the whole drive."""
+        """Values of the template's variables, from those of the whole drive."""
         out = gtsam.Values()
         for key, name in self.global_key.items():
             out.insert(key, read_variable(values, name))
         return out
 
     def start(self, world_T_mast: gtsam.Pose3) -> gtsam.Values:
-        """Its own variables with the mast at a pose, angles and rig as they are said to be."""
+        """Initial values of its variables: the mast at a pose, angles from telemetry, the rig uncorrected."""
         t = self.traverse
         rotation, centre = t.camera_poses([world_T_mast])
         state = State(
@@ -91,7 +92,7 @@ class Station:
         return out
 
     def world_T_mast(self, values: gtsam.Values) -> gtsam.Pose3:
-        """Where it stands at values of the whole drive."""
+        """Mast pose at values of the whole drive."""
         return self.traverse.stops[0].world_T_mast if self.mast is None else values.atPose3(self.mast)
 
     def pan_tilt_rad(self, values: gtsam.Values) -> FloatArray:
@@ -100,7 +101,7 @@ class Station:
         return self.template.state(local, np.zeros((0, 3))).pan_tilt_rad
 
     def factors(self, *, firm: bool) -> list[gtsam.NonlinearFactor]:
-        """Priors of what is its own, or of the mast the motion that led here.
+        """Priors of its own variables; odometry, if any, takes the place of the mast's prior.
 
         `firm`: components that telemetry holds (sigma 0) are constraints of the prior. Else their sigma in
         the prior is 1, for callers who hold these components themselves.
@@ -115,7 +116,7 @@ class Station:
         return out + self.other_priors(firm=firm)
 
     def other_priors(self, *, firm: bool) -> list[gtsam.NonlinearFactor]:
-        """Those of `factors` that are not of the mast."""
+        """The priors of `factors` that are not on the mast."""
         t, out = self.traverse, list[gtsam.NonlinearFactor]()
         sigmas = np.array([[f.sigma_pan_rad, f.sigma_tilt_rad] for f in t.frames])
         free = sigmas.any(axis=1)
@@ -125,7 +126,7 @@ class Station:
         return out + self._rig_priors(0)
 
     def shared_priors(self) -> list[gtsam.NonlinearFactor]:
-        """Priors of what of the rig all stops share."""
+        """Priors of the entries of the rig that all stops share."""
         return self._rig_priors(None)
 
     def _rig_priors(self, owner: int | None) -> list[gtsam.NonlinearFactor]:
@@ -139,7 +140,7 @@ class Station:
 
 
 class Postures:
-    """Cameras of stations at some values, each worked out once."""
+    """Postures of stations at some values, each computed once."""
 
     def __init__(self, values: gtsam.Values) -> None:
         self.values = values
@@ -147,21 +148,21 @@ class Postures:
 
     def of(self, station: Station) -> Posture:
         """The posture of one station."""
-        found = self._of.get(station.number)
-        if found is None:
-            found = self._of[station.number] = station.template.posture(station.local(self.values))
-        return found
+        posture = self._of.get(station.number)
+        if posture is None:
+            posture = self._of[station.number] = station.template.posture(station.local(self.values))
+        return posture
 
     def of_all(self, stations: Iterable[Station]) -> list[Posture]:
         """The postures of stations. To be called before threads read any of them."""
         return [self.of(station) for station in stations]
 
-    def moved(self, station: Station, own: gtsam.Values) -> "Postures":
-        """The same with one station's own variables elsewhere."""
+    def moved(self, station: Station, station_values: gtsam.Values) -> "Postures":
+        """The same with other values of one station's own variables."""
         values = gtsam.Values(self.values)
-        values.update(own)
+        values.update(station_values)
         twin = Postures(values)
-        twin._of = {number: found for number, found in self._of.items() if number != station.number}
+        twin._of = {number: posture for number, posture in self._of.items() if number != station.number}
         return twin
 
 
@@ -174,7 +175,7 @@ class Patch:
     def __init__(self, stations: Iterable[Station], free: Station | None = None) -> None:
         """`free` is the only station whose own variables move; None: all variables move."""
         self.stations = tuple(stations)
-        # Which segments of each station there are.
+        # Mask of the segments of each station whose variables move.
         self._segments = [
             np.ones(len(s.link.segment_variable), dtype=bool)
             if free is None
@@ -190,7 +191,7 @@ class Patch:
 
     @cached_property
     def linkage(self) -> Linkage:
-        """One group per free station, then one of what these share."""
+        """One group per free station, then one group of the variables that stations share."""
         dim_of = {
             s.global_key[k]: int(d)
             for s in self.stations
@@ -198,7 +199,7 @@ class Patch:
         }
         keys = [*(key for s in self._movable for key in s.own), *self._shared]
         row = {key: i for i, key in enumerate(keys)}
-        # A station that nothing moves has no group: all others are numbered without gaps.
+        # A station without variables has no group, so that groups are numbered without gaps.
         owners = [s for s in self._movable if s.own]
         group = [g for g, s in enumerate(owners) for _ in s.own] + [len(owners)] * len(self._shared)
         units, counts, variables, columns, widths, plain = [], [], [], [], [], []
@@ -227,7 +228,7 @@ class Patch:
         )
 
     def posture(self, postures: Postures) -> Posture:
-        """Cameras and chain rule."""
+        """Cameras of all images of the patch, and the chain rule from variables to them."""
         of = postures.of_all(self.stations)
         views = [p.views for p in of]
         chains = [p.chain[taken] for p, taken in zip(of, self._segments, strict=True)]
@@ -243,7 +244,7 @@ class Patch:
         )
 
     def views(self, postures: Postures) -> CameraViews:
-        """Cameras alone."""
+        """Cameras of all images of the patch."""
         return self.posture(postures).views
 
     def held_columns(self) -> dict[int, IntArray]:
@@ -256,7 +257,7 @@ class Patch:
         )
 
     def image(self, image: IntArray, station: IntArray) -> IntArray:
-        """Rows among the patch's images, of images (n,) of the whole drive that are of stations (n,)."""
+        """Rows among the patch's images of images (n,) of the whole drive, given their stations (n,)."""
         shift = np.zeros(max(self.place) + 1, dtype=np.int64)
         for number, i in self.place.items():
             shift[number] = self.image_begin[i] - self.stations[i].first_image
@@ -268,7 +269,7 @@ def _noise(sigmas: FloatArray, *, firm: bool) -> gtsam.noiseModel.Base:
 
 
 def copied(values: gtsam.Values, keys: Iterable[int], into: gtsam.Values | None = None) -> gtsam.Values:
-    """Some of the values, added to others if given."""
+    """Copy the values of some keys, into other values if given."""
     out = gtsam.Values() if into is None else into
     for key in keys:
         out.insert(key, read_variable(values, key))

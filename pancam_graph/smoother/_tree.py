@@ -11,11 +11,12 @@ from pancam_graph.base.geometry import FloatArray
 __all__ = ["Tree"]
 
 _WILDFIRE = 1e-8
-"""Changes of the solution that are passed on through the tree, radians and metres: far below any sigma."""
+"""Changes of the solution below this are not propagated in the tree, radians and metres: far below any
+sigma."""
 
 
 _ANY = 1e-15
-"""A threshold that every variable exceeds but one that has not moved at all."""
+"""A relinearisation threshold that every variable with any change exceeds."""
 
 
 class Tree:
@@ -28,7 +29,7 @@ class Tree:
         steps = gtsam.ISAM2GaussNewtonParams()
         steps.setWildfireThreshold(_WILDFIRE)
         parameters.setOptimizationParams(steps)
-        # Which variables move is decided elsewhere, and GTSAM told by its list of those that must not.
+        # `Engine` chooses the variables to linearise again; `noRelinKeys` names all others to GTSAM.
         parameters.setRelinearizeThreshold(_ANY)
         self._isam = gtsam.ISAM2(parameters)
         self.theta, self.estimate = gtsam.Values(), gtsam.Values()
@@ -36,11 +37,11 @@ class Tree:
 
     @property
     def moved(self) -> dict[int, FloatArray]:
-        """By how much each variable is from where it was linearised."""
+        """Tangent vector from linearisation point to estimate of each variable, by key."""
         return self._delta
 
     def next_theta(self, new: gtsam.Values, moving: Iterable[int]) -> gtsam.Values:
-        """The point of linearisation after an update that adds variables and moves some."""
+        """Linearisation point after an update that adds `new` variables and moves the keys `moving`."""
         values = gtsam.Values(self.theta)
         values.insert(new)
         moved = gtsam.VectorValues()
@@ -55,9 +56,9 @@ class Tree:
         removed: Sequence[int],
         moving: set[int],
     ) -> list[int]:
-        """Take factors out, put others in, and move some variables; the new factors' slots.
+        """Remove and add factors, and linearise the keys `moving` again; return the slots of new factors.
 
-        Raises SolveError where a direction is held by nothing.
+        Raises SolveError where a direction is undetermined.
         """
         graph = gtsam.NonlinearFactorGraph()
         for factor in factors:
@@ -80,8 +81,8 @@ class Tree:
         return list(result.getNewFactorsIndices())
 
     def covariance(self, keys: Sequence[int]) -> FloatArray:
-        """Joint covariance of variables, one after the other, all else marginalised."""
+        """Joint marginal covariance of variables, in the order of the keys."""
         if len(keys) == 1:
             return np.asarray(self._isam.marginalCovariance(keys[0]))
-        found = self._isam.jointMarginalCovariance(list(keys))
-        return np.block([[found.at(a, b) for b in keys] for a in keys])
+        joint = self._isam.jointMarginalCovariance(list(keys))
+        return np.block([[joint.at(a, b) for b in keys] for a in keys])

@@ -1,4 +1,4 @@
-"""One update of a drive: iSAM2 brought up to date, loops closed, and what is said of it at the end."""
+"""One update of a drive: rounds of iSAM2, loop closures, and the summary for the caller."""
 
 import time
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ __all__ = ["UpdateRun"]
 
 
 class UpdateRun:
-    """An update under way, and a record of what it did; its clock starts when it is made."""
+    """An update in progress and the record of its work; its time counts from construction."""
 
     def __init__(
         self, drive: DriveMap, engine: Engine, options: SmootherOptions, station: Station | None = None
@@ -29,7 +29,7 @@ class UpdateRun:
         self._begin = time.perf_counter()
         self._drive, self._engine, self._options, self._station = drive, engine, options, station
         self.rows: IntArray = np.zeros(0, dtype=np.int64)
-        """Rows of the ledger that the update is about"""
+        """(n,) rows of the ledger that are added or removed"""
         self._rejected = 0
         self._rounds: list[Rounds] = []
         self._closures: list[Closure] = []
@@ -40,9 +40,9 @@ class UpdateRun:
         factors: Sequence[gtsam.NonlinearFactor] = (),
         values: gtsam.Values | None = None,
     ) -> None:
-        """Bring the estimate up to date, and set aside what has come to lie behind its cameras.
+        """Update the estimate, then reject observations of landmarks that have moved behind their cameras.
 
-        `values` are those of the new station, about right; None: no station is new.
+        `values` are initial values of the new station's variables; None: no station is new.
         """
         station = None if values is None else self._station
         self._rounds.append(self._engine.advance(change, factors, station, values))
@@ -54,20 +54,20 @@ class UpdateRun:
         self._rejected += change.rejected
 
     def advance_if_changed(self, change: Change) -> None:
-        """The same, unless no block has changed."""
+        """Call `advance`, unless no block has changed."""
         if change.touched or change.slots:
             self.advance(change)
         else:
             self._rejected += change.rejected
 
     def close_loops(self, far: IntArray) -> None:
-        """Close loops with those of these rows that see known tracks far off; the others take part after."""
+        """Test rows of known tracks far off as loop closures, then add the rows of unknown tracks."""
         drive, engine, ledger = self._drive, self._engine, self._drive.ledger
         known = far[drive.home(ledger.track[far]) >= 0]
         for loop in loops(drive, known):
             self._close(loop, far)
         late = ledger.with_fate(np.setdiff1d(far, known), Fate.WAITING)
-        # Pairs of rays across a loop say too little to be judged alone: they share the fate of the others.
+        # Two rays across a loop are too few for a test: they are rejected where the stop's closures were.
         believed = {c.stop for c in self._closures if c.accepted}
         doubted = {c.stop for c in self._closures if not c.accepted} - believed
         numbers = [station.number for station in drive.stations if station.id in doubted]
@@ -81,7 +81,7 @@ class UpdateRun:
             self.advance_if_changed(change)
 
     def _close(self, loop: Loop, far: IntArray) -> None:
-        """Judge one loop closure, and let its observations take part if it is believed."""
+        """Test one loop closure, and add its observations if it is accepted."""
         drive, engine = self._drive, self._engine
         covariance = relative_covariance(engine, loop.anchor, loop.station)
         closure, pose = judged(drive, loop, engine.estimate, covariance, self._options)
@@ -98,7 +98,7 @@ class UpdateRun:
         self.advance(change)
 
     def finished(self) -> Update:
-        """What the update did."""
+        """Summary of the update."""
         station, rounds = self._station, self._rounds
         return Update(
             stop=None if station is None else station.id,

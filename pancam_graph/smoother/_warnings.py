@@ -35,9 +35,9 @@ def warnings_of(
             out.append(
                 f"stop {c.stop}: {c.observations} observations of tracks at {c.other} are not believed: {why}"
             )
-    # A place that a stop sees twice or more, and is not the one that the track has elsewhere.
-    astray = drive.idle(distinct(ledger.track[rows]), Fate.OUTLIER)
-    pairs = np.column_stack([ledger.track[astray], drive.station_of(astray)])
+    # Tracks that a stop observes twice or more, all as outliers: it probably sees another point.
+    outliers = drive.idle(distinct(ledger.track[rows]), Fate.OUTLIER)
+    pairs = np.column_stack([ledger.track[outliers], drive.station_of(outliers)])
     pairs, counts = np.unique(pairs, axis=0, return_counts=True)
     track = distinct(pairs[counts >= 2, 0])
     if len(track):

@@ -84,17 +84,17 @@ def test_the_command_line_wins(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("[refine]\nmodle = 'mast'", "[refine] modle: expected the long name of an option of refine, found an unknown key; the nearest is model"),  # noqa: E501  the whole sentence
+        ("[refine]\nmodle = 'mast'", "[refine] modle: expected the long name of an option of refine, found an unknown key; is 'model' meant?"),  # noqa: E501  the whole sentence
         ("[refine]\nstop = 3", "[refine] stop: expected text, found 3"),
         ("[refine]\nmosaic = 'yes'", "[refine] mosaic: expected true or false, found 'yes'"),
         ("[refine]\nmodel = 'ring'", "[refine] model: expected one of mast, circle, free, projective"),
-        ("[refine]\nexport = 'colmop'", "[refine] export: expected one of colmap, cahvor; found 'colmop'; the nearest is colmap"),  # noqa: E501  the whole sentence
+        ("[refine]\nexport = 'colmop'", "[refine] export: expected one of colmap, cahvor; found 'colmop'; is 'colmap' meant?"),  # noqa: E501  the whole sentence
         ("[refine]\nexport = []", "[refine] export: expected one entry or more, found an empty list"),
         ("[refine]\nout = ['a', 'b']", "[refine] out: expected text, found a list of 2"),
         ("[refine]\nreport = true\nno-report = true", "no-report: expected report or no-report, found both"),
         ("[refine]\nconfig = 'more.toml'", "[refine] config: expected the long name of an option of refine"),
         ("[refin]\nmodel = 'mast'", "refin: expected a table of a subcommand"),
-        ("[refin]\nmodel = 'mast'", "found another key; the nearest is refine"),
+        ("[refin]\nmodel = 'mast'", "found another key; is 'refine' meant?"),
         ("model = 'mast'", "found another key; model belongs into [refine]"),
         ("refine = 3", "refine: expected a table [refine], found 3"),
         ("quiet = 1", "quiet: expected true or false, found 1"),

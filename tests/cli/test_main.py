@@ -55,14 +55,14 @@ def test_python_m_is_the_command() -> None:
     ("words", "says"),
     [
         ([], "expected a subcommand (refine, simulate, render, drive, completion), found none"),
-        (["refin"], "found 'refin'; the nearest is refine"),
-        (["--versoin"], "expected one of its options, found --versoin; the nearest is --version"),
-        (["refine", "F", "--moddel", "mast"], "found --moddel; the nearest is --model"),
+        (["refin"], "found 'refin'; is 'refine' meant?"),
+        (["--versoin"], "expected one of its options, found --versoin; is '--version' meant?"),
+        (["refine", "F", "--moddel", "mast"], "found --moddel; is '--model' meant?"),
         (["refine", "F", "--out", "o", "more"], "expected no more arguments, found 'more'"),
         (["refine", "--out", "o"], "FOLDER"),
         (["refine", "F", "--out", "o", "--model", "ring"], "'ring'"),
-        (["refine", "F", "--out", "o", "--export", "colmop"], "expected one of colmap, cahvor; found 'colmop'; the nearest is colmap"),  # noqa: E501  the whole sentence
-        (["drive", "page.html", "--rig", "mer-navcan"], "found 'mer-navcan'; the nearest is mer-navcam"),
+        (["refine", "F", "--out", "o", "--export", "colmop"], "expected one of colmap, cahvor; found 'colmop'; is 'colmap' meant?"),  # noqa: E501  the whole sentence
+        (["drive", "page.html", "--rig", "mer-navcan"], "found 'mer-navcan'; is 'mer-navcam' meant?"),
         (["refine", "F", "--out", "o", "--quiet", "--verbose"], "expected --verbose or --quiet, found both"),
     ],
 )  # fmt: skip
