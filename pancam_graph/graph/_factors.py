@@ -1,4 +1,4 @@
-"""The factors of a problem, kept apart by what they are."""
+"""The factors of a problem, grouped by kind."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -21,27 +21,27 @@ class Factors:
     telemetry: tuple[gtsam.NonlinearFactor, ...]
     """Priors of masts and angles, and motions from stop to stop."""
     ties: tuple[gtsam.NonlinearFactor, ...] = ()
-    """What joins camera poses, or projection matrices, to the mast."""
+    """Factors that tie camera poses, or projection matrices, to the mast."""
     rig: tuple[gtsam.NonlinearFactor, ...] = ()
     """Priors of free entries of the rig."""
     given: tuple[GivenFactor, ...] = ()
-    """Factors of the caller's, on the keys that the caller knows."""
+    """The caller's factors, on the keys that the caller knows."""
     seated: tuple[gtsam.NonlinearFactor, ...] = ()
-    """The same on the template's own variables; fewer where all variables of one are held."""
+    """The caller's factors on the template's variables; without those whose variables are all held."""
 
     @property
     def priors(self) -> tuple[gtsam.NonlinearFactor, ...]:
-        """What is known beside images and given factors, ties apart."""
+        """Priors of telemetry and of the rig."""
         return (*self.telemetry, *self.rig)
 
     @property
     def all(self) -> tuple[gtsam.NonlinearFactor, ...]:
-        """All of them, on the template's variables."""
+        """All factors, on the template's variables."""
         return (*self.telemetry, *self.ties, *self.rig, *self.seated)
 
     @cached_property
     def graph(self) -> gtsam.NonlinearFactorGraph:
-        """All of them as a graph."""
+        """All factors as a graph."""
         return graph_of(self.all)
 
     def joined(self, linkage: Linkage) -> list[set[int]]:
@@ -53,7 +53,7 @@ class Factors:
         return float(self.graph.error(values))
 
     def linearize(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
-        """All of them, linearised at values of the template's variables."""
+        """All factors, linearised at values of the template's variables."""
         return self.graph.linearize(values)
 
 

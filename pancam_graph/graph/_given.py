@@ -1,8 +1,8 @@
-"""GTSAM factors of the caller's, checked, and taken to the variables that a template works on.
+"""GTSAM factors of the caller, checked and expressed on the variables of a template.
 
 The caller writes factors on masts, on pan and tilt of single frames, and on corrections of the rig
-(`GraphKeys`). A template may have these in another form: held by telemetry, or the angles of all frames of a
-stop in one vector. A `Seat` says where each of the caller's variables is among the template's.
+(`GraphKeys`). A template may have these in another form: fixed, where telemetry holds them, or as part of a
+vector of all angles of a stop. A `Seat` reads one of the caller's variables from the template's.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -20,26 +20,26 @@ from pancam_graph.graph._keys import read_variable
 __all__ = ["GivenFactor", "Seat", "UserFactors", "check_given", "given_factors", "seated"]
 
 UserFactors = Sequence[gtsam.NonlinearFactor] | gtsam.NonlinearFactorGraph | gtsam.NonlinearFactor
-"""What a caller may give: some factors, a graph of them, or one."""
+"""Factors as a caller may pass them: a sequence, a graph, or one factor."""
 
 _T = TypeVar("_T")
 _WORST = 1e30
-"""Cost of a step to where a factor has no finite error: no optimiser takes it."""
+"""Cost that stands for an error that is not finite, so that an optimiser rejects the step."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Seat:
-    """Where a variable of the caller's is among the variables of a template."""
+    """How a variable of the caller depends on the variables of a template."""
 
     read: Callable[[gtsam.Values], Any]
-    """Takes values of the template to the variable's own: gtsam.Pose3, vector or number."""
+    """Takes values of the template to the value of the variable: gtsam.Pose3, vector or number."""
     parts: tuple[tuple[int, FloatArray], ...]
-    """By key of the template, how the variable's tangent moves with that of the key (dim, dim of the key);
-    none where the variable is held."""
+    """Keys of the template, each with the Jacobian (dim, dim of the key) of the variable's tangent by that of
+    the key; none where the variable is held."""
 
     @staticmethod
     def same(key: int, dim: int, held: IntArray | None = None) -> "Seat":
-        """A variable that the template has as it is; components in `held` do not move."""
+        """A variable that the template has in the same form; components in `held` do not move."""
         moves = np.eye(dim)
         if held is not None:
             moves[held, held] = 0.0
@@ -53,11 +53,11 @@ class Seat:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GivenFactor:
-    """A factor of the caller's on keys of `GraphKeys`."""
+    """A factor of the caller on keys of `GraphKeys`."""
 
     factor: gtsam.NonlinearFactor
     name: str
-    """What an error calls it, with the variables that it is on."""
+    """Its name in errors, with its variables."""
 
     @property
     def keys(self) -> tuple[int, ...]:
@@ -91,7 +91,7 @@ class GivenFactor:
 
 
 def given_factors(factors: UserFactors | None, keys: GraphKeys) -> tuple[GivenFactor, ...]:
-    """The caller's factors with their names. Raises InputError for what is no factor on these keys."""
+    """The caller's factors with their names. Raises InputError for one that is no factor on these keys."""
     if factors is None:
         return ()
     if isinstance(factors, gtsam.NonlinearFactorGraph):
@@ -172,10 +172,10 @@ def seated(given: GivenFactor, seats: Mapping[int, Seat]) -> gtsam.CustomFactor 
     Its cost and its linearisation are those of the caller's factor, whatever noise model that has.
     """
     moving = [key for key in given.keys if seats[key].parts]
-    own = list(dict.fromkeys(k for key in moving for k, _ in seats[key].parts))
-    if not own:
+    template_keys = list(dict.fromkeys(k for key in moving for k, _ in seats[key].parts))
+    if not template_keys:
         return None
-    place = {key: i for i, key in enumerate(own)}
+    place = {key: i for i, key in enumerate(template_keys)}
 
     def evaluate(
         _this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
@@ -184,7 +184,7 @@ def seated(given: GivenFactor, seats: Mapping[int, Seat]) -> gtsam.CustomFactor 
         if jacobians is None:
             return np.array([np.sqrt(2 * given.cost(local))])
         keys, whole, residual = given.linear(local)
-        blocks: list[FloatArray | None] = [None] * len(own)
+        blocks: list[FloatArray | None] = [None] * len(template_keys)
         begin = 0
         for key in keys:
             width = _dim(local, key)
@@ -200,7 +200,7 @@ def seated(given: GivenFactor, seats: Mapping[int, Seat]) -> gtsam.CustomFactor 
 
     # No noise model: the rows are whitened already.
     no_noise: Any = None
-    return gtsam.CustomFactor(no_noise, own, evaluate)
+    return gtsam.CustomFactor(no_noise, template_keys, evaluate)
 
 
 def _own_values(one: GivenFactor, seats: Mapping[int, Seat], values: gtsam.Values) -> gtsam.Values:

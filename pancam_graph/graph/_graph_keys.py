@@ -28,8 +28,8 @@ class GraphKeys:
 
     Masts are gtsam.Pose3 (`world_T_mast`; tangent in the mast's frame, rotation first, radians and metres).
     Angles are vectors (2,): pan and tilt of one frame, radians. Variables of the rig are vectors of
-    corrections to what the rig says, 0 where nothing differs; of `radius` numbers, metres. What telemetry
-    holds (sigma 0) has a key too: a factor may name it, and it does not move.
+    corrections, 0 where a value is the rig's; those of `radius` are numbers, metres. A variable that
+    telemetry holds (sigma 0) has a key too: a factor may name it, but it stays constant.
     """
 
     def __init__(self, traverse: Traverse, rig: RigVariables) -> None:
@@ -53,7 +53,7 @@ class GraphKeys:
     def angles(self, frame: str) -> int:
         """Key of pan and tilt of a frame, by its id. Raises InputError for an unknown id.
 
-        In models other than `mast` these are the angles that the mast has, which the cameras follow loosely.
+        In models other than `mast` these are the angles of the mast, to which camera poses are tied loosely.
         """
         if frame not in self._frame:
             raise InputError(expected_one_of("frame", frame, list(self._frame)))
@@ -62,7 +62,7 @@ class GraphKeys:
     def calibration(
         self, camera: str | None = None, *, stop: str | None = None, image: str | None = None
     ) -> int:
-        """Key of the free entries of a calibration, by as much of its owner as tells it from others.
+        """Key of the free entries of a calibration, by those of camera, stop and image that identify it.
 
         Raises InputError where no calibration is free, and where several or none fit.
         """
@@ -97,7 +97,7 @@ class GraphKeys:
         return len(self._entries[key])
 
     def name(self, key: int, where: str = "key") -> str:
-        """What a key is, in words. Raises InputError, beginning with `where`, for a key of something else."""
+        """Name of a variable in words. Raises InputError, beginning with `where`, for an unknown key."""
         if key in self._name:
             return self._name[key]
         shown = gtsam.DefaultKeyFormatter(key)
@@ -133,29 +133,29 @@ class GraphKeys:
         if len(fitting) == 1:
             return variables[int(fitting[0])].key
         among = [self._name[variables[int(i)].key] for i in fitting] or [self._name[v.key] for v in variables]
-        found = ", ".join(
+        owner = ", ".join(
             f"{what} {name!r}"
             for what, name in (("camera", camera), ("stop", stop), ("image", image))
             if name is not None
         )
         raise InputError(
-            f"{called}: expected one of {some_of(among)}; found {found or 'nothing that says which'}"
+            f"{called}: expected one of {some_of(among)}; found {owner or 'nothing that says which'}"
         )
 
     def _sites(
         self, quantity: Quantity, camera: str | None, stop: str | None, image: str | None
     ) -> BoolArray:
-        """Which images (of pan_T_tilt: stops) are of a camera, of a stop, or one image."""
+        """Mask of the images (of pan_T_tilt: stops) of a camera, of a stop, or of one image."""
         t = self._traverse
         axis = quantity == "pan_T_tilt"
         sites = np.ones(len(t.stops if axis else t.images), dtype=bool)
-        for what, found, names, of_site in (
+        for what, wanted, names, of_site in (
             ("camera", camera, [eye.name for eye in t.rig.eyes], t.image_eye),
             ("stop", stop, list(self._stop), np.arange(len(t.stops)) if axis else t.image_stop),
             ("image", image, [one.id for one in t.images], np.arange(len(t.images))),
         ):
-            if found is not None:
-                if found not in names:
-                    raise InputError(expected_one_of(what, found, names))
-                sites &= of_site == names.index(found)
+            if wanted is not None:
+                if wanted not in names:
+                    raise InputError(expected_one_of(what, wanted, names))
+                sites &= of_site == names.index(wanted)
         return sites

@@ -1,4 +1,4 @@
-"""Choices that shape a graph."""
+"""Options of a graph: the model of cameras, and the flex of the mast."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -10,23 +10,25 @@ from pancam_graph.base.errors import InputError
 __all__ = ["DEFAULT_FLEX", "RIGID", "Flex", "Model", "Tie"]
 
 Tie = Literal["hard", "soft"]
-"""Whether camera poses are computed from the mast, or are variables that a sigma holds near it."""
+"""Tie of camera poses to the mast: "hard" computes them from it, "soft" makes them variables near it."""
 
 Model = Literal["mast", "circle", "free", "projective"]
-"""How camera poses hang together: `mast` on the pan-tilt chain, `circle` with their centres on the mast's
-circles and their rotations free (thesis eq. 4.6 to 4.9), `free` each on its own but for a loose telemetry
-tie, `projective` the same for the 12 entries of each camera's projection matrix (thesis eq. 4.2 to 4.4)."""
+"""Model of the camera poses: `mast` on the pan-tilt chain; `circle` with centres on the mast's circles and
+free rotations (thesis eq. 4.6 to 4.9); `free` each independent but for a loose tie to telemetry; `projective`
+the same for the 12 entries of each camera's projection matrix (thesis eq. 4.2 to 4.4)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Flex:
-    """How far a camera pose may be from where the mast puts it, one sigma: the flex of the mast."""
+    """Flex of the mast: sigma of a camera pose relative to the pose that the mast gives."""
 
     rotation_rad: float
+    """Sigma of each component of the rotation vector."""
     translation_m: float
+    """Sigma of each component of the translation."""
     calibration: float = 0.05
-    """How far each of the five numbers of K may be from the rig's, in focal lengths; of model `projective`
-    alone, since the others have the rig's K."""
+    """Sigma of the five entries of K relative to the rig's, in focal lengths; for the model `projective`
+    alone."""
 
     def __post_init__(self) -> None:
         """Check that all are above 0."""
@@ -37,14 +39,14 @@ class Flex:
 
 
 RIGID = Flex(rotation_rad=1e-8, translation_m=1e-7)
-"""Far below what images can tell: the optimum is that of a rigid mast to 1e-8 of its cost."""
+"""Far below the resolution of images: the cost at the optimum is that of a rigid mast to 1e-8."""
 
 DEFAULT_FLEX: dict[Model, Flex] = {
     # A tenth of a pixel of a rover's Navcam, and the millimetre to which mounts are known.
     "mast": Flex(rotation_rad=5e-5, translation_m=1e-3),
     # Centres on the circle to a tenth of a millimetre; rotations held no better than 20 mrad by telemetry.
     "circle": Flex(rotation_rad=0.02, translation_m=1e-4),
-    # Loose enough to say nothing that images say, tight enough to join what no image joins.
+    # Loose compared with images, tight enough to determine cameras that no image joins.
     "free": Flex(rotation_rad=0.02, translation_m=0.02),
     # The same, and calibrations as far off as a lens of another make: 5 %, where real ones repeat to 0.3 %.
     "projective": Flex(rotation_rad=0.02, translation_m=0.02, calibration=0.05),

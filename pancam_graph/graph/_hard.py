@@ -1,7 +1,7 @@
 """Camera poses computed from the mast: the rig as a factor template without flex.
 
-Variables: `M` mast pose per stop (Pose3), `A` pan and tilt of a stop's frames, stacked (vector), and those of
-the rig that are free (`_rig_variables`). What telemetry holds (sigma 0) is not a variable.
+Variables: `M` mast pose per stop (Pose3), `A` pan and tilt of a stop's frames, stacked (vector), and the free
+entries of the rig (`_rig_variables`). Quantities that telemetry holds (sigma 0) are not variables.
 """
 
 from dataclasses import dataclass, replace
@@ -40,7 +40,7 @@ class HardTemplate(FactorTemplate):
     """The rigid mast: world_T_camera = world_T_mast . Rz(pan) . pan_T_tilt . Ry(-tilt) . head_T_camera."""
 
     def __init__(self, traverse: Traverse, sharing: Sharing | None = None) -> None:
-        """`sharing`: of it calibration, mounts and pan_T_tilt; circles follow from mounts here."""
+        """Of `sharing`, calibration, mounts and pan_T_tilt count; circles follow from the mounts."""
         super().__init__(traverse, "mast", replace(sharing or Sharing(), radius=FIXED))
         sigmas = np.array([[f.sigma_pan_rad, f.sigma_tilt_rad] for f in traverse.frames])
         self._sigmas = sigmas
@@ -97,8 +97,8 @@ class HardTemplate(FactorTemplate):
         )
         for kind, quantity, site in sites:
             if variables := free.of[quantity]:
-                own_row = np.array([row[v.key] for v in variables])
-                variable[:, kind] = own_row[free.place(quantity)[site]]
+                row_of_variable = np.array([row[v.key] for v in variables])
+                variable[:, kind] = row_of_variable[free.place(quantity)[site]]
                 width[:, kind] = len(variables[0].entries)
         return Linkage(
             key=tuple(keys),
@@ -114,7 +114,7 @@ class HardTemplate(FactorTemplate):
 
     @property
     def _by_image(self) -> bool:
-        """Whether eyes of one frame move differently; else they are one unit, rigid to each other."""
+        """Whether a unit is an image, since mounts or calibrations are free; else it is a rigid frame."""
         return bool(self.rig_variables.of["mounts"] or self.rig_variables.of["calibration"])
 
     @cached_property
@@ -199,8 +199,8 @@ class HardTemplate(FactorTemplate):
         self, angles: FloatArray, axes: tuple[FloatArray, FloatArray] | None
     ) -> tuple[FloatArray, FloatArray]:
         t = self.traverse
-        own = None if axes is None else (axes[0][t.frame_stop], axes[1][t.frame_stop])
-        return t.rig.mast_T_head(angles[:, 0], angles[:, 1], own)
+        axis_of_frame = None if axes is None else (axes[0][t.frame_stop], axes[1][t.frame_stop])
+        return t.rig.mast_T_head(angles[:, 0], angles[:, 1], axis_of_frame)
 
     def _angles(self, values: gtsam.Values) -> FloatArray:
         angles: FloatArray = self.traverse.pan_tilt_rad.copy()
@@ -262,7 +262,7 @@ class HardTemplate(FactorTemplate):
         return False
 
     def angle_seat(self, frame: int) -> Seat:
-        """Two entries of the vector of its stop; held where both sigmas are 0."""
+        """Two entries of its stop's vector of angles; fixed where both sigmas are 0."""
         if not self._sigmas[frame].any():
             return Seat.fixed(self.traverse.pan_tilt_rad[frame])
         stop = int(self.traverse.frame_stop[frame])
@@ -295,17 +295,17 @@ class HardTemplate(FactorTemplate):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Segments:
-    """What each unit depends on; a unit is a frame, or an image where eyes of a frame move differently."""
+    """Variables that each unit depends on; a unit is a frame, or an image (see `_by_image`)."""
 
     present: BoolArray
-    """(units, 5) whether it depends on its angles, mast, tilt axis, mount and calibration"""
+    """(units, 5) whether it depends on angles, mast, tilt axis, mount and calibration"""
     frame: IntArray
-    """(units,)"""
+    """(units,) row of the frame of each unit"""
     image: IntArray
-    """(units,) where units are images, else empty"""
+    """(units,) row of the image of each unit; empty where units are frames"""
 
 
 def _tilt_axis(pan_R_tilt: FloatArray, pan_t_tilt: FloatArray) -> FloatArray:
-    """Twists (..., 2, 3, 1) of the pan stage, rotation and translation, of which tilt has so many radians."""
+    """Twist (..., 2, 3, 1) of the pan stage per radian of tilt: rotation, then translation."""
     twist = twists_in_parent(pan_R_tilt, pan_t_tilt, _TILT)
     return twist.reshape(*twist.shape[:-2], 2, 3, 1)

@@ -1,4 +1,4 @@
-"""What a variable of a graph is, told by its key: the only place where keys are made and read."""
+"""Keys of the variables of a graph; this module alone makes and reads them."""
 
 from enum import Enum
 from typing import Any

@@ -21,10 +21,10 @@ __all__ = ["ExplicitLandmarks"]
 class ExplicitLandmarks:
     """One Point3 variable `L` per landmark, one native factor per observation.
 
-    GTSAM's projections know no distortion: measurements are those of the pinhole of the same camera, and
-    the noise model turns residuals back to raw pixels. A landmark that moves behind a camera costs a large
-    constant there, so the optimiser rejects the step. Where calibrations are free GTSAM's factor does not do
-    so, and the caller must check it.
+    GTSAM's projections have no distortion: measurements are in pixels of the pinhole of the same camera, and
+    the noise model takes residuals back to raw pixels. A landmark behind a camera has a large constant cost,
+    so the optimiser rejects the step. GTSAM's factor of a free calibration lacks this, and the caller must
+    check for such landmarks.
     """
 
     def __init__(self, template: SoftTemplate, measurements: Measurements) -> None:
@@ -42,11 +42,11 @@ class ExplicitLandmarks:
         return key_of(Kind.LANDMARK, landmark)
 
     def beside_landmarks(self, given: Sequence[GivenFactor] = ()) -> gtsam.NonlinearFactorGraph:
-        """All other factors: the template's, and the caller's own."""
-        own = self.template.factors(apart=True)
+        """All factors except those of observations: the template's and the caller's."""
+        template_factors = self.template.factors(apart=True)
         seats = self.calibrations.seats(self.template.seats(given))
         placed = (seated(one, seats) for one in given)
-        graph = self.calibrations.in_place(own.graph)
+        graph = self.calibrations.in_place(template_factors.graph)
         for factor in placed:
             if factor is not None:
                 graph.push_back(factor)
@@ -70,8 +70,10 @@ class ExplicitLandmarks:
             image = int(m.image[i])
             camera, landmark = self.template.camera_key(image), self.key(int(m.landmark[i]))
             if self.calibrations.any:
-                own = self.calibrations.key(image)
-                graph.push_back(gtsam.GeneralSFMFactor2Cal3_S2(m.uv_px[i], noise, camera, landmark, own))
+                calibration = self.calibrations.key(image)
+                graph.push_back(
+                    gtsam.GeneralSFMFactor2Cal3_S2(m.uv_px[i], noise, camera, landmark, calibration)
+                )
                 continue
             graph.push_back(
                 gtsam.GenericProjectionFactorCal3_S2(
@@ -89,9 +91,9 @@ class ExplicitLandmarks:
     def proximal_factors(
         self, points_m: FloatArray, sigma_m: FloatArray, which: BoolArray
     ) -> gtsam.NonlinearFactorGraph:
-        """Priors of some landmarks, centred on where they are, with sigmas (landmarks,).
+        """Priors on the landmarks `which` at their places `points_m`, with sigmas (landmarks,), metres.
 
-        They are moved along from round to round, so that they keep the system regular and bias nothing.
+        The caller centres them anew in every round, so they regularise the system without bias.
         """
         graph = gtsam.NonlinearFactorGraph()
         for j in np.flatnonzero(which):
@@ -119,10 +121,10 @@ class ExplicitLandmarks:
 
     def retract(self, cameras: gtsam.Values, step: gtsam.VectorValues, share: float) -> gtsam.Values:
         """The template's variables moved by a share of a step that may move landmarks too."""
-        own, step = gtsam.VectorValues(), self.calibrations.step(step)
+        camera_step, step = gtsam.VectorValues(), self.calibrations.step(step)
         for key in cameras.keys():  # noqa: SIM118  gtsam.Values is not a dictionary
-            own.insert(key, share * step.at(key))
-        return cameras.retract(own)
+            camera_step.insert(key, share * step.at(key))
+        return cameras.retract(camera_step)
 
     def points_m(self, values: gtsam.Values, present: BoolArray) -> FloatArray:
         """Landmarks (landmarks, 3) from the values; NaN for those that do not take part."""

@@ -1,7 +1,7 @@
-"""Free calibrations as GTSAM's own variables, which its projection factors want: `C`, of type Cal3_S2.
+"""Free calibrations as variables of GTSAM's type Cal3_S2, letter `C`, for its projection factors.
 
-A variable `K` of free entries becomes one `C` for each eye that shares it, with a factor that holds what `K`
-does not move and has its prior.
+A variable `K` of free entries becomes one `C` for each eye that shares it. A factor carries the prior of `K`
+over and constrains the changes of `C` that `K` cannot make.
 """
 
 from collections.abc import Mapping
@@ -21,18 +21,20 @@ __all__ = ["NativeCalibrations"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Native:
-    """What stands for one variable `K` of n columns."""
+    """The variables `C` that replace one variable `K` of n entries."""
 
     variable: RigVariable
+    """`K`."""
     keys: tuple[int, ...]
+    """Of each `C`."""
     nominal: FloatArray
-    """(5 keys,) fx, fy, skew, cx and cy of each"""
+    """(5 keys,) nominal fx, fy, skew, cx and cy of each"""
     along: FloatArray
-    """(n, 5 keys) takes changes of these to K"""
+    """(n, 5 keys) takes changes of the numbers of `C` to `K`"""
     across: FloatArray
-    """(5 keys - n, 5 keys) what K does not move"""
+    """(5 keys - n, 5 keys) takes changes of the numbers of `C` to the part that `K` cannot make"""
     basis: FloatArray
-    """(5 keys, n) takes K to these changes"""
+    """(5 keys, n) takes `K` to changes of the numbers of `C`"""
 
 
 class NativeCalibrations:
@@ -45,10 +47,10 @@ class NativeCalibrations:
         self.any = bool(variables)
         number = 0
         for i, v in enumerate(variables):
-            own = rig.place("calibration") == i
+            of_variable = rig.place("calibration") == i
             keys, nominal, basis = [], [], []
-            for eye in np.unique(eyes[own]):
-                images = own & (eyes == eye)
+            for eye in np.unique(eyes[of_variable]):
+                images = of_variable & (eyes == eye)
                 keys.append(key_of(Kind.NATIVE_CALIBRATION, number))
                 number += 1
                 self._key_of_image[images] = keys[-1]
@@ -72,7 +74,7 @@ class NativeCalibrations:
         return int(self._key_of_image[image])
 
     def in_place(self, factors: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
-        """A template's factors, those of `K` replaced by those of `C`."""
+        """A template's factors, with those on `K` replaced by equivalent ones on `C`."""
         if not self.any:
             return gtsam.NonlinearFactorGraph(factors)
         known = {n.variable.key for n in self._native}
@@ -85,7 +87,7 @@ class NativeCalibrations:
         return graph
 
     def seats(self, seats: Mapping[int, Seat]) -> dict[int, Seat]:
-        """Where variables of given factors are: each `K` among its `C`."""
+        """Seats of the variables of given factors, with each `K` read from its `C`."""
         return {**seats, **{n.variable.key: _seat(n) for n in self._native if n.variable.key in seats}}
 
     def values_of(self, cameras: gtsam.Values) -> gtsam.Values:
@@ -97,29 +99,29 @@ class NativeCalibrations:
         return values
 
     def join(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
-        """Add each `C` to a graph and values that have `K`, held exactly to what `K` says."""
+        """Add each `C` to a graph and values that have `K`, constrained to the calibration that `K` gives."""
         for n in self._native:
             _insert(n, values)
             graph.push_back(_link(n))
 
     def free_entries(self, values: gtsam.Values) -> dict[int, FloatArray]:
-        """Each `K` (n,) by its key, from values that hold `C`."""
+        """Value (n,) of each `K` by its key, from values that have `C`."""
         return {n.variable.key: _entries(n, values) for n in self._native}
 
     def held(self, held: Mapping[int, IntArray]) -> dict[int, IntArray]:
-        """By key, tangent components that factors hold: those given, and those of `C` that `K` does not move.
+        """By key, tangent components that are held: those given, and those of `C` that no entry of `K` moves.
 
         A factor on both focal lengths moves two components along one line: neither counts as held.
         """
         out = dict(held)
         for n in self._native:
             still = ~np.any(n.basis != 0, axis=1)
-            for key, own in zip(n.keys, still.reshape(-1, 5), strict=True):
-                out[key] = np.flatnonzero(own)
+            for key, is_held in zip(n.keys, still.reshape(-1, 5), strict=True):
+                out[key] = np.flatnonzero(is_held)
         return out
 
     def step(self, step: gtsam.VectorValues) -> gtsam.VectorValues:
-        """A step of `C` and whatever else as one of `K` and the same."""
+        """A step that has `C`, with the corresponding step of each `K` added."""
         out = gtsam.VectorValues(step)
         for n in self._native:
             out.insert(n.variable.key, n.along @ np.concatenate([step.at(key) for key in n.keys]))
@@ -127,14 +129,14 @@ class NativeCalibrations:
 
 
 def _insert(native: _Native, values: gtsam.Values) -> None:
-    """Add the `C` that values of `K` make."""
+    """Add each `C` for the values of `K`."""
     numbers = native.nominal + native.basis @ values.atVector(native.variable.key)
-    for key, own in zip(native.keys, numbers.reshape(-1, 5), strict=True):
-        values.insert(key, gtsam.Cal3_S2(*own))
+    for key, entries in zip(native.keys, numbers.reshape(-1, 5), strict=True):
+        values.insert(key, gtsam.Cal3_S2(*entries))
 
 
 def _link(native: _Native) -> gtsam.CustomFactor:
-    """The constraint that `C` are what `K` says."""
+    """The constraint that each `C` is the nominal calibration corrected by `K`."""
     n = len(native.nominal)
     columns = [np.asfortranarray(part) for part in (-native.basis, *np.split(np.eye(n), len(native.keys), 1))]
 
@@ -152,7 +154,7 @@ def _link(native: _Native) -> gtsam.CustomFactor:
 
 
 def _entries(native: _Native, values: gtsam.Values) -> FloatArray:
-    """`K` (n,) from values that hold `C`."""
+    """Value (n,) of `K` from values that have `C`."""
     numbers = np.concatenate([values.atCal3_S2(key).vector() for key in native.keys])
     return np.asarray(native.along @ (numbers - native.nominal))
 
@@ -168,7 +170,7 @@ def _numbers(calibration: FloatArray) -> tuple[float, float, float, float, float
 
 
 def _hold(native: _Native) -> gtsam.CustomFactor:
-    """The prior of K on what moves along with it, and all else held exactly."""
+    """The prior of `K`, expressed on `C`, and a constraint on the changes that `K` cannot make."""
     rows = np.vstack([native.along, native.across])
     sigmas = np.concatenate([native.variable.sigma, np.zeros(len(native.across))])
     noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)

@@ -1,8 +1,9 @@
 """Projection matrices as variables: 12 numbers per image, tied to the mast (thesis eq. 4.2 to 4.4).
 
 Variables: `P` the entries of an image's conditioned projection matrix (vector of 12); `M` and `A` as in the
-models with camera poses. The landmark blocks take the matrices as poses and calibrations do: K, R and C and
-how they move with the entries are in closed form, and the factor of P that they leave out no image sees.
+models with camera poses. Landmark blocks take each matrix as a pose and a calibration: K, R, C and their
+derivatives by the entries have closed forms. Images do not depend on the remaining degree of freedom, the
+scale factor of P.
 """
 
 import gtsam
@@ -29,22 +30,22 @@ from pancam_graph.landmarks import CameraViews
 __all__ = ["ProjectiveTemplate"]
 
 _FACTOR_SIGMA = 0.01
-"""Sigma of the factor s of P, relative. Nothing else depends on s. The sigma is loose enough to let steps
-turn a camera, which changes s to second order, and firm enough to keep the system regular."""
+"""Relative sigma of the scale factor s of P, on which images do not depend. The sigma is loose enough to let
+steps turn a camera, which changes s to second order, and firm enough to keep the system regular."""
 _TYPICAL_RANGE_M = 10.0
 """Unit of the conditioned scene. A mast 1.5 m high sees its ground from 2 m on; from 1 to 100 m the number of
-iterations is the same, but for starts that are far off."""
+iterations is the same, except for poor initial values."""
 
 
 class ProjectiveTemplate(SoftTemplate):
-    """Projection matrices of their own, tied to the mast: by flex their poses, loosely their calibrations.
+    """Projection matrices as variables: flex ties their poses to the mast, a loose sigma their calibrations.
 
-    The tie is what holds the 15 directions in which a projective reconstruction is free, and the surplus
-    factor of each matrix. A projective transformation of the world changes no pixel, so nothing but the tie
-    keeps steps short, and landmarks must be refined after each (Hong et al., Projective bundle adjustment
-    from arbitrary initialization using the variable projection method, 2016). Without `normalise` the
-    variables are the entries of P in pixels and metres, about the world's origin: for comparison, the
-    optimum is the same.
+    The tie fixes the gauge of a projective reconstruction, 15 degrees of freedom, and the scale factor of
+    each matrix. A projective transformation of the world changes no pixel, so the tie alone limits the length
+    of steps, and landmarks must be refined after each (Hong et al., Projective bundle adjustment from
+    arbitrary initialization using the variable projection method, 2016). Without `normalise` the variables
+    are the entries of P in pixels and metres, about the world's origin, for comparison: the optimum is the
+    same.
     """
 
     _camera_kind = Kind.PROJECTION
@@ -56,7 +57,7 @@ class ProjectiveTemplate(SoftTemplate):
         self.conditioning = _conditioning(traverse) if normalise else Conditioning.none(n)
 
     def _split(self, values: gtsam.Values) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """K, camera_R_world, centre about `origin_m`, and the factor of all images."""
+        """K, camera_R_world, centre relative to `origin_m`, and scale factor of all images."""
         entries = [values.atVector(self.camera_key(i)) for i in range(len(self.traverse.images))]
         return split_projections(self.conditioning.undo(np.array(entries)))
 
@@ -102,20 +103,20 @@ class ProjectiveTemplate(SoftTemplate):
         ]
 
     def insert_cameras(self, values: gtsam.Values, state: State) -> None:
-        """The conditioned matrices of a state's cameras, of factor 1."""
+        """Add the conditioned matrices, of scale factor 1, of a state's cameras."""
         K, camera_R_world, centre = self._cameras(state)
         projections = projection_matrix(K, camera_R_world, centre)
         for i, entries in enumerate(self.conditioning.condition(projections)):
             values.insert(self.camera_key(i), entries)
 
     def camera_turn(self, image: int, state: State) -> FloatArray:
-        """How the entries of an image's matrix turn its camera (3, 12), in its own frame."""
+        """Jacobian (3, 12) of the rotation of a camera, in its own frame, by the entries of its matrix."""
         K, camera_R_world, centre = (part[image : image + 1] for part in self._cameras(state))
         tangents = projection_tangents(K, camera_R_world, centre, np.ones(1))[0]
         return np.asarray(tangents[:3] @ self.conditioning.d_undo[image])
 
     def _cameras(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """K, camera_R_world and centre about `origin_m` of a state's cameras."""
+        """K, camera_R_world and centre relative to `origin_m` of a state's cameras."""
         t, rig = self.traverse, state.rig
         return (
             t.calibration if rig is None else rig.calibration(t),
@@ -123,10 +124,10 @@ class ProjectiveTemplate(SoftTemplate):
             state.world_t_camera - self.conditioning.origin_m,
         )
 
-    # --- the calibrations that the matrices hold ---
+    # --- calibrations of the matrices ---
 
     def correction(self, values: gtsam.Values) -> RigCorrection:
-        """By how much the matrices' calibrations differ from the rig's."""
+        """Corrections of the rig that give the calibrations of the matrices."""
         return RigCorrection.to_calibrations(self.traverse, self._split(values)[0])
 
     def rig_sigmas(self, covariance: Covariance, values: gtsam.Values) -> list[FloatArray]:
@@ -134,13 +135,13 @@ class ProjectiveTemplate(SoftTemplate):
         t, link, numbers = self.traverse, self.linkage, self.posture(values).chain[:, 6:]
         out = []
         for i, jacobian in enumerate(numbers):
-            stop, own = int(t.image_stop[i]), link.columns_of(self.camera_key(i))
-            block = covariance.block(stop, stop)[own, own]
+            stop, columns = int(t.image_stop[i]), link.columns_of(self.camera_key(i))
+            block = covariance.block(stop, stop)[columns, columns]
             out.append(np.sqrt(np.einsum("ij,jk,ik->i", jacobian, block, jacobian)))
         return out
 
     def refined(self, values: gtsam.Values, sigmas: list[FloatArray] | None) -> tuple[Refined, ...]:
-        """The five numbers of K of every image; without sigmas these are NaN."""
+        """The five entries of K of every image; sigmas are NaN where None is given."""
         t, change = self.traverse, self.correction(values).calibration_px
         row, column = CALIBRATION_ENTRIES
         return tuple(
@@ -160,17 +161,17 @@ class ProjectiveTemplate(SoftTemplate):
         )
 
     def _calibration_sigma_px(self, image: int) -> FloatArray:
-        """(5,) of the tie of fx, fy, skew, cx and cy to the rig's: those along u by fx, along v by fy."""
+        """(5,) sigmas of the tie of fx, fy, skew, cx, cy: along u in units of fx, along v in units of fy."""
         along = self.traverse.calibration[image][[0, 1, 0, 0, 1], [0, 1, 0, 0, 1]]
         return np.asarray(self.flex.calibration * along)
 
 
 def _conditioning(traverse: Traverse) -> Conditioning:
-    """Pixels about the middle of their image, the scene about where telemetry has the mast.
+    """Conditioning of pixels about the middle of their image, of the scene about the mast by telemetry.
 
-    Hartley takes mean and spread of the points that an image sees; here it is those of an image that sees
-    points all over, which no outlier moves, and which is there for an image without points too. With them,
-    the mean distance of a pixel from the centre is about sqrt(2).
+    Hartley's conditioning takes mean and spread of the observed points. Here both are those of points spread
+    evenly over the image: outliers do not change them, and an image without points has them too. The mean
+    distance of a pixel from the centre is then about sqrt(2).
     """
     cameras = [eye.camera for eye in traverse.rig.eyes]
     size = np.array([[c.width_px, c.height_px] for c in cameras], dtype=float)[traverse.image_eye]

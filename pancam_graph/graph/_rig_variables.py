@@ -1,8 +1,7 @@
 """The free entries of a rig as variables: one vector for each owner (thesis 4.3, 5.4).
 
 Variables: `K` calibration, `E` mount (`head_T_camera`), `T` tilt axis (`pan_T_tilt`): vectors of corrections
-to the rig's own values, of their free entries only, so that what is held is no variable; `R` radius of a
-circle (double).
+to the values of the rig, with free entries alone; `R` radius of a circle (double).
 """
 
 from collections.abc import Mapping
@@ -48,26 +47,27 @@ _KIND: Mapping[Quantity, Kind] = {
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RigVariable:
-    """A variable: free entries of a correction, and who shares it. An owner that is None stands for all."""
+    """A variable: free entries of a correction, and their owner; eye, stop or image is None for all."""
 
     quantity: Quantity
     key: int
     entries: tuple[str, ...]
+    """Names of the free entries, with units."""
     sigma: FloatArray
-    """(entries,) of the prior; infinite: none"""
+    """(entries,) of the prior; infinite: no prior"""
     usual: FloatArray
-    """(entries,) the default of `sigma`: what real rigs differ by"""
+    """(entries,) default of `sigma`: the typical deviation of real rigs"""
     eye: int | None
     stop: int | None
     image: int | None
     first: int
-    """The first image (of pan_T_tilt: stop) that has it"""
+    """Row of the first image (of pan_T_tilt: stop) that has it"""
     nominal: tuple[float | None, ...]
-    """(entries,) what the rig says; None where it does not say the same of all who share it"""
+    """(entries,) values of the rig; None where these differ among the images that share the variable"""
 
 
 class RigVariables:
-    """The free entries of a traverse's rig, and what their values make of its cameras.
+    """The free entries of a traverse's rig as variables, and the cameras at their values.
 
     Corrections of calibration, mounts and radius are per image, those of pan_T_tilt per stop.
     """
@@ -87,7 +87,7 @@ class RigVariables:
             freedom: Freedom | None = getattr(sharing, quantity)
             self.of[quantity] = self._variables(quantity, freedom or Freedom())
 
-    # --- which there are ---
+    # --- structure ---
 
     def _variables(self, quantity: Quantity, freedom: Freedom) -> tuple[RigVariable, ...]:
         entries, scope, t = freedom.entries(quantity), freedom.scope, self.traverse
@@ -109,8 +109,8 @@ class RigVariables:
         nominal = self._nominal(quantity, entries, n_sites)
         out = []
         for i, (number, first) in enumerate(zip(numbers, firsts, strict=True)):
-            own = place == i
-            focal = 1.0 if axis else float(np.mean(self._K[own, 0, 0]))
+            of_owner = place == i
+            focal = 1.0 if axis else float(np.mean(self._K[of_owner, 0, 0]))
             out.append(
                 RigVariable(
                     quantity=quantity,
@@ -124,7 +124,7 @@ class RigVariables:
                     first=int(first),
                     nominal=tuple(
                         float(one) if np.all(of_entry == one) else None
-                        for of_entry, one in zip(nominal[own].T, nominal[first], strict=True)
+                        for of_entry, one in zip(nominal[of_owner].T, nominal[first], strict=True)
                     ),
                 )
             )
@@ -135,12 +135,12 @@ class RigVariables:
         one = np.array([[float(name == column) for column in free] for name in ENTRIES[quantity]])
         out: FloatArray = np.broadcast_to(one, (n_sites, *one.shape)).copy()
         if FOCAL in free:
-            # A factor 1 + f on both focal lengths changes each by f times what the rig says.
+            # A factor 1 + f on both focal lengths changes each by f times its value in the rig.
             out[:, :2, free.index(FOCAL)] = self._K[:, [0, 1], [0, 1]]
         return out
 
     def _nominal(self, quantity: Quantity, free: tuple[str, ...], n_sites: int) -> FloatArray:
-        """(sites, columns) what the rig says of the free entries; what is 0 without a correction is 0."""
+        """(sites, columns) values of the rig of the free entries; 0 for an entry that is a correction."""
         out: FloatArray = np.zeros((n_sites, len(free)))
         for j, entry in enumerate(free):
             if entry == FOCAL:
@@ -160,15 +160,15 @@ class RigVariables:
 
     @property
     def variables(self) -> tuple[RigVariable, ...]:
-        """All of them, by quantity."""
+        """All variables, by quantity."""
         return tuple(v for variables in self.of.values() for v in variables)
 
     def of_stop(self, stop: int | None) -> list[RigVariable]:
-        """Those that a stop has for itself; None: those that stops share."""
+        """Variables of one stop alone; None: variables that stops share."""
         return [v for v in self.variables if v.stop == stop]
 
     def group(self, variable: RigVariable) -> int:
-        """The group that a variable is eliminated with: its stop's, or the last."""
+        """Group in which a variable is eliminated: its stop's, or the last one."""
         return len(self.traverse.stops) if variable.stop is None else variable.stop
 
     def variable(self, quantity: Quantity, site: int) -> RigVariable | None:
@@ -184,12 +184,12 @@ class RigVariables:
         return self._basis[quantity]
 
     def owner(self, variable: RigVariable) -> str:
-        """Whose a variable is, in words: " of left at s1"; empty where all images share it."""
+        """Owner of a variable in words: " of left at s1"; empty where all images share it."""
         where = self._where(variable)
         return f" of {' '.join(where)}".replace(" of at ", " at ") if where else ""
 
     def name(self, variable: RigVariable, entry: str) -> str:
-        """An entry as a warning calls it."""
+        """Name of an entry for warnings."""
         return " ".join([variable.quantity, *self._where(variable), entry])
 
     def _where(self, variable: RigVariable) -> list[str]:
@@ -204,7 +204,7 @@ class RigVariables:
     # --- values ---
 
     def _read(self, quantity: Quantity, values: gtsam.Values) -> FloatArray:
-        """Corrections (images, entries), of pan_T_tilt (stops, entries); what is held is 0."""
+        """Corrections (images, entries), of pan_T_tilt (stops, entries); 0 for held entries."""
         variables = self.of[quantity]
         if not variables:
             axis = quantity == "pan_T_tilt"
@@ -212,10 +212,10 @@ class RigVariables:
                 (len(self.traverse.stops if axis else self.traverse.images), len(ENTRIES[quantity]))
             )
         if quantity == "radius":
-            found = np.array([[values.atDouble(v.key) - self.reference_radius_m(v)] for v in variables])
+            corrections = np.array([[values.atDouble(v.key) - self.reference_radius_m(v)] for v in variables])
         else:
-            found = np.array([values.atVector(v.key) for v in variables])
-        return np.asarray(np.einsum("nij,nj->ni", self._basis[quantity], found[self._place[quantity]]))
+            corrections = np.array([values.atVector(v.key) for v in variables])
+        return np.asarray(np.einsum("nij,nj->ni", self._basis[quantity], corrections[self._place[quantity]]))
 
     def correction(self, values: gtsam.Values) -> RigCorrection | None:
         """All corrections; None where nothing is free."""
@@ -231,13 +231,13 @@ class RigVariables:
     def insert(self, values: gtsam.Values, given: RigCorrection | None) -> None:
         """Add the variables to `values`, as near to a correction as their free entries allow."""
         for v in self.variables:
-            found = np.zeros(len(v.entries))
+            entries = np.zeros(len(v.entries))
             if given is not None:
-                found = np.linalg.pinv(self._basis[v.quantity][v.first]) @ _of(given, v.quantity)[v.first]
+                entries = np.linalg.pinv(self._basis[v.quantity][v.first]) @ _of(given, v.quantity)[v.first]
             if v.quantity == "radius":
-                values.insert(v.key, self.reference_radius_m(v) + float(found[0]))
+                values.insert(v.key, self.reference_radius_m(v) + float(entries[0]))
             else:
-                values.insert(v.key, found)
+                values.insert(v.key, entries)
 
     def prior_factors(self, stop: int | None) -> list[gtsam.NonlinearFactor]:
         """Priors of `of_stop`."""
@@ -252,7 +252,7 @@ class RigVariables:
                 out.append(gtsam.PriorFactorVector(v.key, np.zeros(len(v.sigma)), noise))
         return out
 
-    # --- what they make of the cameras ---
+    # --- cameras at values of the variables ---
 
     def calibration(self, values: gtsam.Values) -> FloatArray:
         """K (images, 3, 3)."""
@@ -264,12 +264,15 @@ class RigVariables:
         return out
 
     def cameras(self, values: gtsam.Values) -> list[tuple[Camera, BoolArray]]:
-        """The rig's cameras, distortion included, and which images (images,) each took."""
+        """The rig's cameras, distortion included, each with the mask (images,) of the images that it took."""
         t, out = self.traverse, []
-        K, own = self.calibration(values), self._place.get("calibration", np.zeros(len(t.images), dtype=int))
+        K, calibration_of = (
+            self.calibration(values),
+            self._place.get("calibration", np.zeros(len(t.images), dtype=int)),
+        )
         for i, eye in enumerate(t.rig.eyes):
-            for place in np.unique(own[t.image_eye == i]):
-                images = (t.image_eye == i) & (own == place)
+            for place in np.unique(calibration_of[t.image_eye == i]):
+                images = (t.image_eye == i) & (calibration_of == place)
                 free = bool(self.of["calibration"])
                 camera = eye.camera.with_calibration(K[np.argmax(images)]) if free else eye.camera
                 out.append((camera, images))
@@ -277,12 +280,12 @@ class RigVariables:
 
     @property
     def pupil_moves(self) -> bool:
-        """Whether a camera's pixels are those of a pinhole only for points at one range."""
+        """Whether the pinhole equivalent of a camera's pixels depends on the range of the point."""
         return any(eye.camera.pupil_moves for eye in self.traverse.rig.eyes)
 
     @property
     def distortion_moves(self) -> bool:
-        """Whether a distorted camera has a free calibration: its pixels of a pinhole move with it."""
+        """Whether a distorted camera has a free calibration: its pinhole pixels then change with it."""
         distorted = (eye.camera != eye.camera.pinhole for eye in self.traverse.rig.eyes)
         return bool(self.of["calibration"]) and any(distorted)
 
@@ -320,35 +323,35 @@ class RigVariables:
         return _pose_slot(self.variable("pan_T_tilt", stop), self.traverse.rig.pan_T_tilt)
 
     def radius_slot(self, image: int) -> tuple[Slot, float]:
-        """Slot of the radius of an image's circle, and what the rig says in its place, metres."""
+        """Slot of the radius of an image's circle, and the rig's value of that radius, metres."""
         if (v := self.variable("radius", image)) is not None:
             return Key(v.key), self.reference_radius_m(v)
         reference = float(self._radius_m[self.traverse.image_eye[image]])
         return Fixed(reference), reference
 
     def reference_radius_m(self, variable: RigVariable) -> float:
-        """The rig's radius of a variable's circle, of those that share it the first one's."""
+        """The rig's radius of a variable's circle, metres; of several images, that of the first."""
         return float(self._radius_m[self.traverse.image_eye[variable.first]])
 
-    # --- what is known of them ---
+    # --- uncertainties ---
 
     def sigmas(self, covariance: Covariance, linkage: Linkage) -> list[FloatArray]:
         """Standard deviations (entries,) of each variable."""
         out = []
         for v in self.variables:
-            own, g = linkage.columns_of(v.key), self.group(v)
-            out.append(np.sqrt(np.diag(covariance.block(g, g)[own, own])))
+            columns, g = linkage.columns_of(v.key), self.group(v)
+            out.append(np.sqrt(np.diag(covariance.block(g, g)[columns, columns])))
         return out
 
     def refined(self, values: gtsam.Values, sigmas: list[FloatArray] | None) -> tuple[Refined, ...]:
-        """What the values say of every free entry; sigmas as `sigmas` gives them, None: unknown."""
+        """Estimates of every free entry at the values; sigmas as `sigmas` gives them, None: unknown."""
         t = self.traverse
         out = []
         for i, v in enumerate(self.variables):
             if v.quantity == "radius":
-                found = np.array([values.atDouble(v.key) - self.reference_radius_m(v)])
+                change_of_entry = np.array([values.atDouble(v.key) - self.reference_radius_m(v)])
             else:
-                found = values.atVector(v.key)
+                change_of_entry = values.atVector(v.key)
             for j, entry in enumerate(v.entries):
                 out.append(
                     Refined(
@@ -358,7 +361,7 @@ class RigVariables:
                         stop=None if v.stop is None else t.stops[v.stop].id,
                         image=None if v.image is None else t.images[v.image].id,
                         nominal=v.nominal[j],
-                        change=float(found[j]),
+                        change=float(change_of_entry[j]),
                         sigma=np.nan if sigmas is None else float(sigmas[i][j]),
                         prior_sigma=float(v.sigma[j]),
                     )
@@ -366,27 +369,27 @@ class RigVariables:
         return tuple(out)
 
     def start_error(self) -> tuple[FloatArray, FloatArray]:
-        """Error of the camera of each image at the start, one sigma: pixels (images,), metres (images,).
+        """Initial error of each image's camera, one sigma: pixels (images,), metres (images,).
 
-        By the priors of calibration, mounts and pan_T_tilt; an entry without one counts as if it had the
-        default one.
+        It follows from the priors of calibration, mounts and pan_T_tilt; an entry without a prior counts with
+        the default sigma.
         """
         t, focal = self.traverse, self._K[:, 0, 0]
         half = np.array([max(e.camera.width_px, e.camera.height_px) / 2 for e in t.rig.eyes])[t.image_eye]
         one = np.ones(len(focal))
-        # What a unit of an entry moves pixels by; of a calibration, those at the edge of the image.
+        # Motion of pixels by a unit of an entry; by one of a calibration, at the edge of the image.
         weight = {"cx_px": one, "cy_px": one, FOCAL: half} | dict.fromkeys(ENTRIES["mounts"][:3], focal)
         square_px, square_m = np.zeros(len(t.images)), np.zeros(len(t.images))
         for v in self.variables:
-            if v.quantity == "radius":  # which is no more than its prior says, and by default free
+            if v.quantity == "radius":  # calibration, mounts and pan_T_tilt alone count
                 continue
             place = self._place[v.quantity][t.image_stop if v.quantity == "pan_T_tilt" else slice(None)]
-            own = np.array([other is v for other in self.of[v.quantity]])[place]
+            of_variable = np.array([other is v for other in self.of[v.quantity]])[place]
             for entry, known in zip(v.entries, np.where(np.isfinite(v.sigma), v.sigma, v.usual), strict=True):
                 if entry.endswith("_m"):
-                    square_m[own] += known**2
+                    square_m[of_variable] += known**2
                 else:
-                    square_px[own] += (known * weight.get(entry, half / focal)[own]) ** 2
+                    square_px[of_variable] += (known * weight.get(entry, half / focal)[of_variable]) ** 2
         return np.sqrt(square_px), np.sqrt(square_m)
 
 

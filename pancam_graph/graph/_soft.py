@@ -1,8 +1,8 @@
 """Camera poses as variables, tied to the mast: the rig as a factor template with flex.
 
-Variables: `M` mast pose per stop (Pose3), `A` pan and tilt per frame (vector of 2), `X` camera pose per
-image (Pose3), and those of the rig that are free (`_rig_variables`). What telemetry holds (sigma 0) is not a
-variable.
+Variables: `M` mast pose per stop (Pose3), `A` pan and tilt per frame (vector of 2), `X` camera pose per image
+(Pose3), and the free entries of the rig (`_rig_variables`). Quantities that telemetry holds (sigma 0) are not
+variables.
 """
 
 from functools import cached_property
@@ -32,13 +32,13 @@ __all__ = ["SoftTemplate"]
 
 
 class SoftTemplate(FactorTemplate):
-    """Factors and variables for camera poses that a tie holds; its sigma stands for the mast's flex."""
+    """Factors and variables with camera poses tied to the mast; the sigma of the tie is the mast's flex."""
 
     _camera_kind = Kind.CAMERA
     _camera_dim = 6
     """Dimension of a camera's variable"""
     refines_landmarks = True
-    """Cameras of their own may move far in directions that images hardly determine, and the linear step of a
+    """Independent cameras may move far in directions that images hardly determine; the linear step of a
     landmark is then wrong by more than noise. Three clusters of one eye took up to 81 steps without this
     refinement, and 7 with it."""
 
@@ -60,7 +60,7 @@ class SoftTemplate(FactorTemplate):
 
     @cached_property
     def linkage(self) -> Linkage:
-        """One unit per image, which depends on its own camera and calibration; ties join it to all else."""
+        """One unit per image, which depends on its camera and calibration; ties link other variables."""
         t, free = self.traverse, self.rig_variables
         dim: dict[int, int] = {}
         group: list[int] = []
@@ -123,7 +123,7 @@ class SoftTemplate(FactorTemplate):
     def tie_factors(self, images: IntArray) -> FactorList:
         """The ties of some images' camera poses to the mast, and to their circles where the model says so.
 
-        One factor for all of them: evaluated one by one they would take most of a solve.
+        All images share one factor: single factors would take most of the time of a solve.
         """
         t, free, flex = self.traverse, self.rig_variables, self.flex
         cameras = [Key(self.camera_key(int(i))) for i in images]
@@ -135,7 +135,7 @@ class SoftTemplate(FactorTemplate):
             sigmas = np.repeat([flex.rotation_rad, flex.translation_m], 3)
             return [mast_factor(diagonal_noise(np.tile(sigmas, len(images))), *chain, axis)]
 
-        # The chain ties the rotation, loosely; the circle alone ties the centre.
+        # The chain ties the rotation loosely; the centre is tied by the circle alone.
         tilts = [t.frames[int(f)].tilt_rad for f in t.image_frame[images]]
         circles = np.array(
             [t.rig.circle(int(e), tilt) for e, tilt in zip(t.image_eye[images], tilts, strict=True)]
@@ -172,11 +172,11 @@ class SoftTemplate(FactorTemplate):
 
     @property
     def has_cameras(self) -> bool:
-        """Yes."""
+        """True: each image has a variable for its camera."""
         return True
 
     def angle_seat(self, frame: int) -> Seat:
-        """A variable of its own; held where both sigmas are 0."""
+        """The variable of the frame; fixed where both sigmas are 0."""
         slot = self.pan_tilt(frame)
         if not isinstance(slot, Key):
             return Seat.fixed(slot.value)
@@ -204,8 +204,8 @@ class SoftTemplate(FactorTemplate):
     def state(self, values: gtsam.Values, landmarks_m: FloatArray, views: CameraViews | None = None) -> State:
         """The state at values of the variables; inverse of `values`.
 
-        In the model `mast` pan and tilt are the variables themselves. In the other models they are those of
-        the camera poses as seen from their mast, since there the poses have what images say of the pointing.
+        In the model `mast` pan and tilt are the variables themselves. In the other models they follow from
+        the camera poses relative to the mast, which contain the pointing by the images.
         """
         t, masts, views = self.traverse, self.masts(values), views or self.views(values)
         angles = np.array(
@@ -239,10 +239,10 @@ class SoftTemplate(FactorTemplate):
         return np.flatnonzero(np.array([entry.sigma_pan_rad, entry.sigma_tilt_rad]) == 0)
 
     def angle_rows(self, frame: int, state: State) -> tuple[IntArray, FloatArray]:
-        """How pan and tilt of a frame move with the variables.
+        """Jacobian of a frame's pan and tilt by the variables of its stop.
 
-        As in `state`: in models other than `mast` they are those of the camera poses, the mean over the eyes
-        of the frame.
+        As in `state`, pan and tilt in models other than `mast` are those of the camera poses: the mean over
+        the eyes of the frame.
         """
         t, link = self.traverse, self.linkage
         stop = int(t.frame_stop[frame])
@@ -269,9 +269,9 @@ class SoftTemplate(FactorTemplate):
         return np.concatenate(columns), np.hstack(rows)
 
     def _d_nominal(self, pan_tilt_rad: FloatArray) -> FloatArray:
-        """How `image_pointing_offset`'s nominal pan and tilt move with the angles (2, 2).
+        """Jacobian (2, 2) of the nominal pan and tilt of `image_pointing_offset` by the angles.
 
-        The identity, unless the tilt axis stands askew.
+        It is the identity where the tilt axis is perpendicular to the pan axis.
         """
         pan, tilt = pan_tilt_rad[:1], pan_tilt_rad[1:]
         tilt_axis = rz(float(pan[0])) @ self.traverse.rig.pan_T_tilt.rotation().matrix()[:, 1]
@@ -279,13 +279,13 @@ class SoftTemplate(FactorTemplate):
         return np.asarray(_d_pan_tilt(self.traverse.rig.mast_T_head(pan, tilt)[0][0]) @ turns)
 
     def camera_turn(self, image: int, state: State) -> FloatArray:
-        """How the first k columns of an image's camera turn it (3, k), in its own frame."""
+        """Jacobian (3, k) of a camera's rotation, in its own frame, by the first columns of its variable."""
         return np.eye(3)
 
     def image_pointing_offset(
         self, masts: tuple[gtsam.Pose3, ...], pan_tilt_rad: FloatArray, world_R_camera: FloatArray
     ) -> FloatArray:
-        """(images, 2) pan and tilt of each camera pose as seen from its mast, minus those of its frame."""
+        """(images, 2) pan and tilt of each camera pose relative to its mast, minus those of its frame."""
         t = self.traverse
         masts_R, _ = pose_arrays(masts)
         mounts_R, _ = pose_arrays([e.head_T_camera for e in t.rig.eyes])
@@ -301,7 +301,7 @@ class SoftTemplate(FactorTemplate):
 
 
 def _d_pan_tilt(mast_R_head: FloatArray) -> FloatArray:
-    """How pan and tilt of the head's x axis move with a small turn of the head in the mast frame, (2, 3)."""
+    """Jacobian (2, 3) of pan and tilt of the head's x axis by a small rotation in the mast frame."""
     pan, tilt = pan_tilt_from_rotation(mast_R_head)
     return np.array(
         [[-np.cos(pan) * np.tan(tilt), -np.sin(pan) * np.tan(tilt), 1.0], [np.sin(pan), -np.cos(pan), 0.0]]

@@ -1,4 +1,4 @@
-"""A rig as a factor template: the recipe that turns stops, frames and images into variables and factors."""
+"""Factor templates: variables and factors of a rig, made from the stops, frames and images of a traverse."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -23,13 +23,13 @@ __all__ = ["FactorTemplate", "diagonal_noise"]
 
 
 class FactorTemplate(ABC):
-    """Factors and variables of a traverse's rig for one model; landmarks are added by others."""
+    """Factors and variables of a traverse's rig for one model; landmarks are separate."""
 
     refines_landmarks = False
-    """Whether landmarks go to where they fit best after every step, not only to where it leads."""
+    """Whether landmarks are optimised with cameras held after every step, besides back substitution."""
 
     def __init__(self, traverse: Traverse, model: Model, sharing: Sharing | None = None) -> None:
-        """`sharing` as `Sharing.for_model` returns it; None: what the model itself says."""
+        """`sharing` as `Sharing.for_model` returns it; None: the default of the model."""
         self.traverse = traverse
         self.model: Model = model
         self.rig_variables = RigVariables(traverse, sharing or Sharing().for_model(model))
@@ -37,11 +37,11 @@ class FactorTemplate(ABC):
     @property
     @abstractmethod
     def linkage(self) -> Linkage:
-        """Variables, and how images hang on them; one group per stop, then one of what all stops share."""
+        """Variables and how images depend on them; one group per stop, then one that all stops share."""
 
     @property
     def cliques(self) -> tuple[tuple[int, ...], ...]:
-        """Groups of variables that factors of this template join."""
+        """Sets of groups that factors of this template join."""
         shared = range(len(self.traverse.stops), self.linkage.n_groups)
         return tuple((stop, *shared) for stop in range(len(self.traverse.stops))) if shared else ()
 
@@ -58,7 +58,7 @@ class FactorTemplate(ABC):
         """Priors of masts and angles."""
 
     def ties(self, *, apart: bool = False) -> FactorList:
-        """What joins cameras to the mast, stop by stop, or image by image if `apart`; here nothing."""
+        """Factors that tie cameras to the mast, one per stop, or one per image if `apart`; none here."""
         return []
 
     def factors(
@@ -70,9 +70,8 @@ class FactorTemplate(ABC):
     ) -> Factors:
         """All factors but those of landmarks, with the caller's own.
 
-        `present` are values of another template, at which variables are held that given factors name and this
-        template does not have. `apart` as for `ties`: the graph stays sparse, for those who have GTSAM
-        eliminate all of it.
+        `present` are values of another template, from which variables of given factors are fixed that this
+        template lacks. `apart` as for `ties`: it keeps the graph sparse for elimination by GTSAM.
         """
         seats = self.seats(given, present)
         owners = (*range(len(self.traverse.stops)), None)
@@ -91,7 +90,7 @@ class FactorTemplate(ABC):
         return GraphKeys(self.traverse, self.rig_variables)
 
     def seats(self, given: Sequence[GivenFactor], present: gtsam.Values | None = None) -> dict[int, Seat]:
-        """Where the variables of given factors are among this template's; see `factors`."""
+        """Seats of the variables of given factors among this template's variables; see `factors`."""
         held = self.held_columns() if given else {}
         return {key: self._seat(key, held.get(key), present) for one in given for key in one.keys}
 
@@ -108,12 +107,12 @@ class FactorTemplate(ABC):
 
     @abstractmethod
     def angle_seat(self, frame: int) -> Seat:
-        """Where pan and tilt of a frame are among the variables."""
+        """Seat of a frame's pan and tilt among the variables."""
 
     @property
     @abstractmethod
     def has_cameras(self) -> bool:
-        """Whether each image's camera is a variable of its own, which a tie holds to the mast."""
+        """Whether each image has a variable for its camera, tied to the mast."""
 
     @abstractmethod
     def values(self, state: State) -> gtsam.Values:
@@ -129,9 +128,9 @@ class FactorTemplate(ABC):
 
     @abstractmethod
     def angle_rows(self, frame: int, state: State) -> tuple[IntArray, FloatArray]:
-        """How a frame's pan and tilt move with its stop's variables: columns (k,) of the group, rows (2, k).
+        """Jacobian of a frame's pan and tilt by its stop: columns (k,) of the group, rows (2, k).
 
-        No columns where nothing moves them.
+        No columns where both are held.
         """
 
     def angle_sigma_rad(self, covariance: Covariance, state: State) -> FloatArray:
@@ -163,15 +162,15 @@ class FactorTemplate(ABC):
         return tuple(values.atPose3(slot.key) if isinstance(slot, Key) else slot.value for slot in slots)
 
     def correction(self, values: gtsam.Values) -> RigCorrection | None:
-        """By how much the rig differs from the traverse's at the values; None where it cannot."""
+        """Corrections of the traverse's rig at the values; None where nothing of it is free."""
         return self.rig_variables.correction(values)
 
     def rig_sigmas(self, covariance: Covariance, values: gtsam.Values) -> list[FloatArray]:
-        """Standard deviations of what is free of the rig, as `refined` takes them."""
+        """Standard deviations of the free entries of the rig, as `refined` takes them."""
         return self.rig_variables.sigmas(covariance, self.linkage)
 
     def refined(self, values: gtsam.Values, sigmas: list[FloatArray] | None) -> tuple[Refined, ...]:
-        """What the values say of every free entry of the rig; without sigmas these are NaN."""
+        """Estimates of every free entry of the rig; sigmas are NaN where None is given."""
         return self.rig_variables.refined(values, sigmas)
 
     def stop_factors(self, stop: int) -> FactorList:
@@ -221,7 +220,7 @@ class FactorTemplate(ABC):
 def _sigmas(
     covariance: Covariance, stop: IntArray, rows: Sequence[tuple[IntArray, FloatArray]]
 ) -> FloatArray:
-    """Standard deviations (n, 2) of what rows (2, k) make of columns (k,) of the groups of stops (n,)."""
+    """Standard deviations (n, 2) propagated by rows (2, k) from columns (k,) of the groups of stops (n,)."""
     sigma = np.zeros((len(rows), 2))
     for i, (columns, jacobian) in enumerate(rows):
         if len(columns):

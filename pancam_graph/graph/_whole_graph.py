@@ -1,4 +1,4 @@
-"""The whole graph of a traverse for GTSAM's own optimisers, terrain points and all that is held included."""
+"""The whole graph of a traverse for GTSAM's own optimisers, with terrain points and held variables."""
 
 import gtsam
 import numpy as np
@@ -26,9 +26,10 @@ def whole_graph(
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     """Factors and values: landmarks (landmarks, 3) at `points_m`, all else at the template's values.
 
-    `kept` (n,) are the measurements that take part. `is_rigid`: cameras are no variables, and points are seen
-    from masts and angles directly. What telemetry holds is a variable with a constraint; where a tie is not
-    rigid, free calibrations are in the graph twice, as callers know them and as GTSAM's factors want them.
+    `kept` (n,) are the measurements that take part. `is_rigid`: cameras are not variables, and observations
+    are factors on masts and angles. A quantity that telemetry holds is a variable with a constraint. Where a
+    tie is not rigid, a free calibration has two linked variables: `K` as callers know it, and `C` for GTSAM's
+    projection factors.
     """
     template, values = explicit.template, gtsam.Values(problem_values)
     if is_rigid:
@@ -59,10 +60,10 @@ def _rigid_graph(
 ) -> gtsam.NonlinearFactorGraph:
     """Priors and projections of accepted measurements (n,), without camera poses and ties.
 
-    The variables are the template's but for its cameras, and a Point3 `L` for each landmark.
+    The variables are the template's without its cameras, and a Point3 `L` for each landmark.
     """
-    own = template.factors()
-    graph, m, t, rig = graph_of(own.priors), measurements, template.traverse, template.rig_variables
+    factors = template.factors()
+    graph, m, t, rig = graph_of(factors.priors), measurements, template.traverse, template.rig_variables
     free = bool(rig.of["calibration"])
     for i in np.flatnonzero(accepted).tolist():
         image = int(m.image[i])

@@ -1,4 +1,4 @@
-"""Fit a circle in space to camera centres: where a mast stands if only camera matrices are known."""
+"""A circle in space fitted to camera centres: the pan axis of a mast when only camera matrices are known."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,8 @@ __all__ = ["CircleFit", "fit_circle"]
 
 _SHORT_ARC_RAD = np.pi / 2
 _LINE = 1e5
-"""A radius so many times the spread of the centres is a line: they bend by less than a millionth of it."""
+"""Radius over spread of the centres above which a circle counts as a line: its arc bends by less than a
+millionth of the spread."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -19,14 +20,15 @@ class CircleFit:
     """A circle in space, thesis eq. 4.8: points R [rho cos(phi), rho sin(phi), 0] + C."""
 
     centre_m: FloatArray
-    """(3,)"""
+    """(3,) in the frame of the points."""
     rotation: FloatArray
     """(3, 3) R; its z axis is the circle's normal, its x axis points to the first centre."""
     radius_m: float
+    """rho."""
     angle_rad: FloatArray
     """(n,) phi of each point; the first is 0."""
     residual_m: FloatArray
-    """(n, 2) radially outwards, and along the normal."""
+    """(n, 2) from the circle to each point: radially outwards, and along the normal."""
     arc_rad: float
     """Extent of the points along the circle."""
     centre_sigma_m: float
@@ -34,7 +36,7 @@ class CircleFit:
 
     @property
     def short_arc(self) -> bool:
-        """Whether the points cover less than a quarter: centre and radius then trade off."""
+        """Whether the arc is less than a quarter circle: centre and radius are then hardly separable."""
         return self.arc_rad < _SHORT_ARC_RAD
 
 
@@ -66,7 +68,7 @@ def fit_circle(centres_m: FloatArray, up: FloatArray | None = None) -> CircleFit
     normal = axes[2] if len(axes) == 3 else np.cross(axes[0], axes[1])
     flat = (points - mean) @ axes[:2].T
 
-    # Algebraic: |p|^2 = 2 p.c + (rho^2 - |c|^2); then the true distances.
+    # Algebraic fit, |p|^2 = 2 p.c + (rho^2 - |c|^2); Gauss-Newton on the geometric distances follows.
     design = np.column_stack([2 * flat, np.ones(n)])
     solution, *_ = np.linalg.lstsq(design, np.sum(flat**2, axis=1), rcond=None)
     centre, radius = solution[:2], float(np.sqrt(max(solution[2] + solution[:2] @ solution[:2], 1e-300)))

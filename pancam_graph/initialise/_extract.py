@@ -1,7 +1,8 @@
 """Parameters of each model from camera matrices, and camera matrices from them (thesis 5.1, 4.2 to 4.9).
 
-A matrix is defined up to a factor; what comes back has a third row whose first three entries have length 1
-and, as all cameras here, is no mirror. The model `projective` has the entries of such a matrix itself.
+A projection matrix is defined up to a factor. Matrices returned here have a third row whose first three
+entries have norm 1, and the camera is not mirrored. The parameters of the model `projective` are the entries
+of such a matrix.
 """
 
 from collections.abc import Sequence
@@ -30,8 +31,9 @@ __all__ = [
 ]
 
 _ONE_PAN = 1e-4
-"""Radians of pan below which the pan axis is lost in rounding."""
+"""Spread of pan, radians, below which rounding hides the pan axis."""
 _AXIS_STEPS = 20
+"""Largest number of Gauss-Newton steps for the pan axis."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -60,7 +62,8 @@ class CircleCameras:
     world_R_camera: FloatArray
     """(n, 3, 3)"""
     circle: CircleFit
-    """Pose, radius, the angle of each camera, and how far off the circle the given centres were."""
+    """Pose and radius of the circle, the angle of each camera on it, and the residuals of the given
+    centres."""
 
     @property
     def centre_m(self) -> FloatArray:
@@ -77,7 +80,7 @@ class CircleCameras:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MastCameras:
-    """Parameters of the model `mast` for cameras of one stop: where the mast stands, how each one points."""
+    """Parameters of the model `mast` for cameras of one stop: mast pose, and pan and tilt of each camera."""
 
     rig: Rig
     eye: IntArray
@@ -86,11 +89,11 @@ class MastCameras:
     """(n, 3, 3) K"""
     world_T_mast: gtsam.Pose3
     pan_tilt_rad: FloatArray
-    """(n, 2) of each camera, eyes of one frame apart"""
+    """(n, 2) of each camera; the eyes of one frame may differ"""
     residual_rad: FloatArray
-    """(n, 3) what is left of the given orientations, rotation vectors in the camera's frame"""
+    """(n, 3) rotation from the chain's camera to the given one, rotation vectors in the camera's frame"""
     residual_m: FloatArray
-    """(n, 3) what is left of the given centres, in the camera's frame"""
+    """(n, 3) shift from the chain's centre to the given one, in the camera's frame"""
 
     @cached_property
     def _poses(self) -> tuple[FloatArray, FloatArray]:
@@ -98,12 +101,12 @@ class MastCameras:
 
     @property
     def world_R_camera(self) -> FloatArray:
-        """(n, 3, 3) as the chain has them."""
+        """(n, 3, 3) of the pan-tilt chain."""
         return self._poses[0]
 
     @property
     def centre_m(self) -> FloatArray:
-        """(n, 3) as the chain has them, in the world."""
+        """(n, 3) of the pan-tilt chain, in the world."""
         return self._poses[1]
 
     @property
@@ -115,8 +118,8 @@ class MastCameras:
 def extract_free(projections: ArrayLike, names: Sequence[str] | None = None) -> FreeCameras:
     """K, orientation and centre of cameras from their matrices (n, 3, 4), each up to a factor of either sign.
 
-    `names` are what an error calls them. Raises CameraError for a matrix that is no camera: not finite, a
-    zero third row, a left block of rank below 3; InputError for another shape.
+    Errors call the cameras by `names`. Raises CameraError for a matrix that is no camera: not finite, a zero
+    third row, a left block of rank below 3; InputError for another shape.
     """
     try:
         matrices = np.asarray(projections, dtype=float)
@@ -140,11 +143,11 @@ def _decomposed(projection: FloatArray, name: str) -> tuple[FloatArray, FloatArr
 
 
 def extract_circle(projections: ArrayLike, up: FloatArray | None = None) -> CircleCameras:
-    """The circle that the centres of cameras (n, 3, 4) are on, and where on it: one eye, one tilt.
+    """Fit the circle on which the centres of cameras (n, 3, 4) of one eye at one tilt lie.
 
-    `up` (3,) chooses the sense of the circle's normal; default: where the images have their upper edge, in
-    the mean. Angles count from the first camera. Raises as `extract_free` does, and GeometryError for centres
-    that determine no circle: fewer than three, coincident or collinear ones.
+    `up` (3,) chooses the sense of the circle's normal; default: the mean upward direction of the images.
+    Angles count from the first camera. Raises as `extract_free` does, and GeometryError for centres that
+    determine no circle: fewer than three, coincident or collinear ones.
     """
     cameras = extract_free(projections)
     above = -cameras.world_R_camera[:, :, 1].sum(axis=0) if up is None else np.asarray(up, dtype=float)
@@ -160,12 +163,12 @@ def extract_mast(
 ) -> MastCameras:
     """Mast pose, pan and tilt of cameras (n, 3, 4) of one stop on a known rig, their eyes by name.
 
-    The tilt axis is at a fixed angle to the pan axis, which gives the latter from two pans or more, whatever
-    the tilts; orientations give the angles, and centres the place. A turn of the mast about its axis is a
-    shift of all pans: the first is taken to be `first_pan_rad`.
+    Tilt axis and pan axis enclose a fixed angle, so cameras at two or more pans determine the pan axis at any
+    tilts. Orientations then determine pan and tilt, and centres the position. A rotation of the mast about
+    its z axis is equivalent to an offset of all pans: `first_pan_rad` fixes it.
 
-    Raises as `extract_free` does; InputError for an eye that the rig does not have or a wrong number of
-    eyes; GeometryError where all cameras have one pan.
+    Raises as `extract_free` does; InputError for an eye that the rig does not have or a wrong number of eyes;
+    GeometryError where all cameras have one pan.
     """
     cameras = extract_free(projections)
     if len(eyes) != len(cameras.centre_m):
@@ -176,7 +179,7 @@ def extract_mast(
 
     z = _pan_axis(rig, world_R_head)
     x = world_R_head[0, :, 0] - (world_R_head[0, :, 0] @ z) * z
-    if np.linalg.norm(x) < 1e-6:  # looks along the axis: its y axis does as well
+    if np.linalg.norm(x) < 1e-6:  # the camera looks along the pan axis: its y axis serves instead
         x = np.cross(world_R_head[0, :, 1], z)
     x /= np.linalg.norm(x)
     world_R_mast = np.column_stack([x, np.cross(z, x), z])
@@ -192,9 +195,9 @@ def extract_mast(
     _, mast_t_camera = rig.mast_T_camera(angles, eye)
     at = (cameras.centre_m - mast_t_camera @ world_R_mast.T).mean(axis=0)
     world_T_mast = gtsam.Pose3(gtsam.Rot3(world_R_mast), at)
-    found_R, found_t = _on_mast(rig, eye, world_T_mast, angles)
-    left = found_R.transpose(0, 2, 1) @ cameras.world_R_camera
-    shift = np.einsum("nji,nj->ni", found_R, cameras.centre_m - found_t)
+    chain_R, chain_t = _on_mast(rig, eye, world_T_mast, angles)
+    left = chain_R.transpose(0, 2, 1) @ cameras.world_R_camera
+    shift = np.einsum("nji,nj->ni", chain_R, cameras.centre_m - chain_t)
     return MastCameras(
         rig=rig,
         eye=eye,
@@ -216,8 +219,8 @@ def _on_mast(
 def _pan_axis(rig: Rig, world_R_head: FloatArray) -> FloatArray:
     """The mast's z axis (3,) in the world from head orientations (n, 3, 3).
 
-    Tilt does not turn the head's y axis, and pan keeps its angle to z: z y_i is the same for all i, and the
-    rig says how much. Of the two senses, that which most heads have above.
+    Tilt leaves the head's y axis y_i unchanged, and pan preserves its angle to z: the product z . y_i is the
+    same for all i, and the rig gives its value. The sense of z is that of the heads' mean z axis.
     """
     y, height = world_R_head[:, :, 1], float(rig.pan_T_tilt.rotation().matrix()[2, 1])
     _, spread, axes = np.linalg.svd(y, full_matrices=True)

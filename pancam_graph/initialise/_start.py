@@ -1,4 +1,4 @@
-"""Starts: where the stops stand and where the frames point before the first iteration."""
+"""Initial mast poses, angles and cameras of a solve."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,11 +25,12 @@ class Start:
     world_T_mast: tuple[gtsam.Pose3, ...]
     """Mast pose of each stop."""
     pan_tilt_rad: FloatArray
-    """(frames, 2)"""
+    """(frames, 2) pan and tilt."""
     cameras: FreeCameras | None = None
-    """Of all images: where the models `free` and `projective` start, `free` with the rig's calibration. None,
-    and for the other models: where masts and angles put them."""
+    """Initial cameras of all images for the models `free`, which takes their poses with the rig's
+    calibration, and `projective`. None, and in the other models: cameras follow from masts and angles."""
     warnings: tuple[str, ...] = ()
+    """Sentences for the user."""
 
 
 def start_from_telemetry(traverse: Traverse) -> Start:
@@ -58,11 +59,11 @@ def start_from_odometry(traverse: Traverse, mast_T_next: Sequence[gtsam.Pose3]) 
 def start_from_cameras(traverse: Traverse, projections: FloatArray) -> Start:
     """Masts, angles and cameras from the projection matrices (images, 3, 4) of all images.
 
-    Each stop's centres, eye by eye and tilt by tilt, give a circle (thesis 4.6): its normal is the pan
-    axis, its centre lies on it. The rig says how high above the mast's origin; telemetry says which frames
-    share a tilt, and where the pan counts from. A stop whose centres determine no circle (fewer than three,
-    collinear), or cover less than a quarter of it, gets its pose from the cameras' rotations and
-    telemetry's angles; a warning says so.
+    Each stop's centres, eye by eye and tilt by tilt, give a circle (thesis 4.6): its normal is the pan axis,
+    its centre lies on it. The rig gives the height of the circle above the mast's origin; telemetry gives the
+    frames that share a tilt, and the zero of pan. A stop whose centres determine no circle (fewer than three,
+    collinear), or cover less than a quarter of it, gets its pose from the cameras' rotations and telemetry's
+    angles, with a warning.
 
     Raises CameraError for a matrix that is no camera, InputError for a wrong number of matrices.
     """
@@ -93,10 +94,10 @@ def start_from_cameras(traverse: Traverse, projections: FloatArray) -> Start:
             first = int(rows[0])
             eye = int(traverse.image_eye[first])
             mast_R_head = masts_R[traverse.frame_stop[f]].T @ world_R_camera[first] @ mounts_R[eye].T
-            found = np.array(
+            pan_tilt = np.array(
                 [mast_pan_rad(traverse.rig, mast_R_head[:, 1]), head_tilt_rad(traverse.rig, mast_R_head[2])]
             )
-            angles[f] = angles[f] + wrap_angle(found - angles[f])
+            angles[f] = angles[f] + wrap_angle(pan_tilt - angles[f])
     return Start(world_T_mast=tuple(masts), pan_tilt_rad=angles, cameras=cameras, warnings=tuple(warnings))
 
 
@@ -117,31 +118,34 @@ def _mast_by_chain(
 def _mast_by_circles(
     traverse: Traverse, rows: np.ndarray, world_R_camera: FloatArray, centres: FloatArray, near: gtsam.Pose3
 ) -> gtsam.Pose3:
-    """Mast pose whose z axis is the normal of the eyes' circles, and whose origin the rig places on it."""
+    """Mast pose by circles: their mean normal is its z axis, on which the rig places the origin."""
     rig, up = traverse.rig, near.rotation().matrix()[:, 2]
     mounts_R, _ = pose_arrays([e.head_T_camera for e in rig.eyes])
     normals, origins, weights = [], [], []
     reasons: list[tuple[int, str]] = []
     for eye in np.unique(traverse.image_eye[rows]):
         of_eye = rows[traverse.image_eye[rows] == eye]
-        for own in _same_tilt(of_eye, traverse.pan_tilt_rad[traverse.image_frame[of_eye], 1]):
+        for same_tilt in _same_tilt(of_eye, traverse.pan_tilt_rad[traverse.image_frame[of_eye], 1]):
             try:
-                fit = fit_circle(centres[own], up)
+                fit = fit_circle(centres[same_tilt], up)
             except GeometryError as error:
-                reasons.append((len(own), str(error)))
+                reasons.append((len(same_tilt), str(error)))
                 continue
             if fit.short_arc:
                 degrees = np.rad2deg(fit.arc_rad)
                 reasons.append(
-                    (len(own), f"circle: the centres cover {degrees:.0f} degrees only; 90 or more are needed")
+                    (
+                        len(same_tilt),
+                        f"circle: the centres cover {degrees:.0f} degrees only; 90 or more are needed",
+                    )
                 )
                 continue
             z = fit.rotation[:, 2]
-            tilts = [head_tilt_rad(rig, mounts_R[eye] @ world_R_camera[i].T @ z) for i in own]
+            tilts = [head_tilt_rad(rig, mounts_R[eye] @ world_R_camera[i].T @ z) for i in same_tilt]
             _, _, height = rig.circle(int(eye), float(np.mean(tilts)))
             normals.append(z)
             origins.append(fit.centre_m - height * z)
-            weights.append(len(own))
+            weights.append(len(same_tilt))
     if not normals:
         raise GeometryError(max(reasons, key=lambda reason: reason[0])[1])
     z = np.average(normals, axis=0, weights=weights)
