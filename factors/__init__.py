@@ -1,8 +1,8 @@
 """Custom GTSAM factors: pure residuals with analytic Jacobians, and thin makers.
 
 One module a factor: `mast` (pan-tilt chain, 6 rows), `mast_projection` (a point seen from a rigid mast, 2
-rows), `circle` (thesis eq. 4.8, 3 rows), `projective` (projection matrix, 12 rows). Whatever GTSAM has itself
-(priors, projections of a camera pose) is taken from there.
+rows), `circle` (thesis eq. 4.8, 3 rows), `projective` (projection matrix, 12 rows). Factors that GTSAM has
+(priors, projections of a camera pose) are taken from GTSAM.
 """
 
 from pancam_graph.factors._slots import Corrected as Corrected

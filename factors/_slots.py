@@ -1,7 +1,7 @@
 """Slots of a custom factor: a variable of the graph, a fixed value, or a known pose with a correction.
 
-A held stop, a calibrated mount or a known radius is then simply not a variable: it stays bit for
-bit what it was, and costs the solver nothing.
+A held stop, a calibrated mount or a known radius is a fixed value, not a variable: it stays the same to the
+last bit.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,14 +18,14 @@ __all__ = ["Corrected", "Fixed", "Key", "PoseSlot", "Slot", "custom_factor"]
 
 @dataclass(frozen=True)
 class Key:
-    """A slot that the graph estimates."""
+    """A slot with a variable of the graph."""
 
     key: int
 
 
 @dataclass(frozen=True)
 class Fixed:
-    """A slot with a value that nothing changes."""
+    """A slot with a constant value."""
 
     value: Any
 
@@ -37,7 +37,7 @@ class Corrected:
     key: int
     nominal: gtsam.Pose3
     free: tuple[int, ...]
-    """Entries of the correction (6) that the variable has; the others are 0."""
+    """Indices of the entries of the correction (6) that the variable has; the others are 0."""
 
     def pose(self, values: gtsam.Values) -> tuple[gtsam.Pose3, FloatArray]:
         """The pose at the values, and its body-frame twist by the variable (6, n)."""
@@ -102,7 +102,7 @@ def custom_factor(
 
 
 class _Reader:
-    """The values of one slot at all sites; what several sites share is read once."""
+    """Reads the values of one slot at all sites; a variable that several sites share is read once."""
 
     def __init__(self, slots: Sequence[PoseSlot], kind: Kind) -> None:
         index: dict[tuple[int, int], int] = {}

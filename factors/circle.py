@@ -3,7 +3,7 @@
     C = R [rho cos(phi), rho sin(phi), h]^T + Cc
 
 R and Cc are the orientation and the centre of the circle; h is 0 in the thesis. Here the pose of the circle
-is that of the mast, whose z axis is the pan axis. So one pose serves every eye at every tilt: the circle of
+is that of the mast, whose z axis is the pan axis. So one pose is enough for all eyes and tilts: the circle of
 an eye lies h above the origin of the mast, and phi is the pan plus the phase of the eye. The rotation of the
 camera is free.
 """
@@ -26,7 +26,7 @@ class CircleOffset:
     """Known constants of images' circles, from the rig and the measured tilt: numbers, or arrays (n,)."""
 
     height_m: ArrayLike = 0.0
-    """h: of the circle's plane above the mast's origin."""
+    """Height h of the circle's plane above the mast's origin."""
     phase_rad: ArrayLike = 0.0
     """Added to the pan to give phi."""
     radius_m: ArrayLike = 0.0

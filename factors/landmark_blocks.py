@@ -4,11 +4,11 @@ Linearised, with A, B the whitened Jacobians of all observations by cameras and 
 
     S = A'A - sum E V^-1 E'        s = A'r - sum E V^-1 g        g = B'r
 
-There is one factor for each group of variables (a stop). It has those rows of a square root R'R = S that
-begin with its group, as many as the rank of S has there, and R'e = s; the rows of all factors together are S
-exactly. At other values, a step dx of the variables away, landmarks follow by dp = -V^-1 (g + E' dx), and the
-error of a factor is the true cost of its block there. So GTSAM's Levenberg-Marquardt takes the exact joint
-step of cameras and landmarks, as sparse bundle adjustment does (thesis section 3.8).
+Each group of variables (a stop) has one factor. With a square root R'R = S and R'e = s, the factor holds the
+rows of R and e that belong to its group; these are fewer than the group's columns where S is singular. All
+factors together represent S exactly. After a step dx of the variables, landmarks move by dp = -V^-1 (g + E'
+dx), and the error of a factor is the true cost of its block. So GTSAM's Levenberg-Marquardt takes the exact
+joint step of cameras and landmarks, as sparse bundle adjustment does (thesis section 3.8).
 """
 
 from collections.abc import Callable, Sequence
@@ -30,14 +30,14 @@ Reader = Callable[[gtsam.Values, int], Any]
 class LandmarkBlocks:
     """All landmark blocks of a problem; they are linearised together and share the result.
 
-    The landmarks are no variables of the graph: they are state of this object, and move when GTSAM linearises
-    where a step led. So a graph with these factors is for one optimiser at a time.
+    The landmarks are not variables of the graph but state of this object, which changes when GTSAM linearises
+    at new values. A graph with these factors therefore serves one optimiser at a time.
     """
 
     def __init__(
         self, system: LandmarkSystem, read: Reader, posture: Callable[[gtsam.Values], Posture]
     ) -> None:
-        """`read` takes values and a key to what the variable is; `posture` gives the cameras at values."""
+        """Take a system, a reader of variables by values and key, and a function that gives the cameras."""
         self.system, self._posture = system, posture
         link, structure = system.linkage, system.structure
         self._touched = np.flatnonzero(link.touched).tolist()
@@ -56,9 +56,9 @@ class LandmarkBlocks:
         self._groups = [g for g in structure.order if self._members[g]]
         self._owner = np.array([b.groups[0] if b.groups else self._groups[0] for b in system.blocks])
         self._linearised: _Place | None = None
-        """Where the landmarks are, and the system is linearised"""
+        """Linearisation point of the system and its landmarks"""
         self._evaluated: _Place | None = None
-        """Where the costs are; the same place, or one that a step leads to"""
+        """Values evaluated last: the linearisation point, or the end of a step from it"""
         self._cost = np.zeros(0)
         self._panels: Panels | None = None
         self._root: Root | None = None
@@ -68,7 +68,7 @@ class LandmarkBlocks:
         return [self._factor(g) for g in self._groups]
 
     def ordering(self) -> list[int]:
-        """Keys in an order of elimination that fills in no more than the factors hold already."""
+        """Keys in an order of elimination without fill-in beyond the factors."""
         link = self.system.linkage
         return [
             link.key[v]
@@ -77,7 +77,7 @@ class LandmarkBlocks:
         ]
 
     def settle(self, values: gtsam.Values) -> bool:
-        """Move the landmarks to where a step to these values leads them; whether they were elsewhere."""
+        """Move the landmarks along with a step to these values; return whether they moved."""
         self._evaluate(values, self._touched)
         moved = self._linearised is not self._evaluated
         if moved:
@@ -87,7 +87,7 @@ class LandmarkBlocks:
         return moved
 
     def panels(self, values: gtsam.Values) -> Panels:
-        """The system (S, s) that is left of all landmarks at these values; theirs are moved there."""
+        """The Schur complement (S, s) of all landmarks at these values, to which the landmarks move."""
         self._evaluate(values, self._touched)
         self._adopt()
         if self._panels is None:
@@ -104,7 +104,7 @@ class LandmarkBlocks:
         ]
         variables = [v for v, _ in members]
         columns = [slice(c, c + int(link.dim[v])) for v, c in members]
-        own = self._owner == group
+        of_group = self._owner == group
         first = group == self._groups[0]
 
         def evaluate(
@@ -112,7 +112,7 @@ class LandmarkBlocks:
         ) -> FloatArray:
             self._evaluate(values, variables)
             if jacobians is None:
-                return np.array([np.sqrt(2 * self._cost[own].sum())])
+                return np.array([np.sqrt(2 * self._cost[of_group].sum())])
             root = self._square_root()
             rows = root.rows[group]
             error = np.empty(len(rows) + first)
@@ -125,12 +125,12 @@ class LandmarkBlocks:
                 jacobians[i] = jacobian
             return error
 
-        # No noise model: everything is whitened, and the number of rows is the rank found.
+        # No noise model: rows are whitened, and their number depends on the rank.
         no_noise: Any = None
         return gtsam.CustomFactor(no_noise, [link.key[v] for v in variables], evaluate)
 
     def _evaluate(self, values: gtsam.Values, variables: Sequence[int]) -> None:
-        """Bring costs to these values, unless the given variables are as they were."""
+        """Evaluate costs at these values, unless the given variables are unchanged."""
         known = self._evaluated
         if known is not None and all(_same(known.value[v], self._value(values, v)) for v in variables):
             return
@@ -158,7 +158,7 @@ class LandmarkBlocks:
         return self._root
 
     def _adopt(self) -> None:
-        """Take the landmarks to where costs were evaluated last, and linearise there."""
+        """Move the landmarks to the values evaluated last, and linearise there."""
         if self._linearised is not self._evaluated:
             self.system.adopt()
             self._linearise()
@@ -170,7 +170,7 @@ class LandmarkBlocks:
         self._linearised = self._evaluated
 
     def _remainder(self, root: Root) -> float:
-        """What the cost has beyond the squares of all e, as one more row."""
+        """Residual of one more row: its square makes the sum of squares twice the true cost."""
         return float(np.sqrt(max(2 * (float(self._cost.sum()) - root.gain()), 0.0)))
 
 
@@ -179,7 +179,7 @@ class _Place:
     """Values of the variables, and the cameras there."""
 
     value: dict[int, Any]
-    """By variable, of those that cameras hang on"""
+    """Value of each variable that cameras depend on, by its index"""
     posture: Posture
 
 

@@ -1,9 +1,9 @@
-"""Mast factor: an image's camera pose hangs on the mast by pan, tilt and its mount (6 rows).
+"""Mast factor: a camera pose is tied to the mast through pan, tilt and its mount (6 rows).
 
     world_T_camera = world_T_mast . Rz(pan) . pan_T_tilt . Ry(-tilt) . head_T_camera
 
-The residual is the pose of the camera as seen from where the chain puts it: the rotation vector, radians,
-then the shift, metres. Its sigma stands for the flex of the mast.
+The residual is the camera pose relative to the pose of the chain: the rotation vector, radians, then the
+translation, metres. Its sigma is the flex of the mast.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ def _transposed(matrices: FloatArray) -> FloatArray:
 
 
 def _adjoint_of_inverse(rotation: FloatArray, translation: FloatArray) -> FloatArray:
-    """Takes a body twist of `a_T_b` to that of `a_T_b * b_T_c`, given `b_T_c`, (..., 6, 6)."""
+    """Adjoint (..., 6, 6) of the inverse of b_T_c: takes a body twist of a_T_b to one of a_T_c."""
     back = _transposed(rotation)
     out = np.zeros((*rotation.shape[:-2], 6, 6))
     out[..., :3, :3] = out[..., 3:, 3:] = back
@@ -43,10 +43,10 @@ def _adjoint_of_inverse(rotation: FloatArray, translation: FloatArray) -> FloatA
 def mast_chain(
     world_T_mast: Pose, pan_tilt_rad: FloatArray, head_T_camera: Pose, pan_T_tilt: Pose
 ) -> tuple[Pose, tuple[FloatArray, FloatArray, FloatArray, FloatArray]]:
-    """The camera pose on the mast, and its body-frame twist by mast, by pan, by tilting down, by tilt axis.
+    """The camera pose by the chain, and its body-frame twists by mast, pan, tilting down and tilt axis.
 
     Poses are pairs of rotations (..., 3, 3) and translations (..., 3); twists (..., 6, 6), of pan and tilt
-    (..., 6, 1), rotation first. By the mount the twist is that of the mount itself.
+    (..., 6, 1), rotation first. The twist of the camera by the mount is that of the mount itself.
     """
     pan, tilt = pan_tilt_rad[..., 0], pan_tilt_rad[..., 1]
     none = np.zeros(3)

@@ -1,9 +1,9 @@
-"""Mast projection factor: a terrain point seen by a camera on a rigid mast (2 rows).
+"""Mast projection factor: an observation of a terrain point by a camera on a rigid mast (2 rows).
 
     world_T_camera = world_T_mast . Rz(pan) . pan_T_tilt . Ry(-tilt) . head_T_camera
 
 The residual is the point's projection less the measured pixel, in pixels of the pinhole; the noise model
-whitens it. The same chain as in `mast`, with no flex.
+whitens it. The chain is that of `mast`, without flex.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from pancam_graph.factors.mast import Pose, mast_chain
 __all__ = ["mast_projection_factor", "mast_projection_residual"]
 
 _BEHIND_PX = 1e6
-"""Each row of a point that is not in front of its camera: no step of an optimiser ends there."""
+"""Residual in each row for a point that is not in front of its camera, so that an optimiser rejects it."""
 
 
 def mast_projection_residual(
@@ -35,8 +35,8 @@ def mast_projection_residual(
 
     Points (n, 3) are in the world; poses are pairs of rotations (n, 3, 3) and translations (n, 3);
     `calibration` (n, 3, 3) is K, its Jacobian (n, 2, 5) by fx, fy, skew, cx, cy; those by poses are by
-    body-frame tangents, rotation first. A point that is not in front of its camera has a large residual that
-    moves nowhere.
+    body-frame tangents, rotation first. A point that is not in front of its camera has a large constant
+    residual, with Jacobians of 0.
     """
     (chain_R, chain_t), (by_mast, by_pan, by_down, by_axis) = mast_chain(
         world_T_mast, pan_tilt_rad, head_T_camera, pan_T_tilt
@@ -52,7 +52,7 @@ def mast_projection_residual(
     d_seen = np.zeros((len(x), 2, 3))
     d_seen[:, :, :2] = K[:, :2, :2] / depth[:, None, None]
     d_seen[:, :, 2] = -(d_seen[:, :, 0] * x[:, None] + d_seen[:, :, 1] * y[:, None])
-    # A turn and a shift of the camera in its own frame move the point the other way.
+    # A rotation and a translation of the camera in its own frame move the point the other way.
     d_camera = d_seen @ np.concatenate([skew(seen), np.broadcast_to(-np.eye(3), (len(x), 3, 3))], axis=-1)
     d_calibration = np.zeros((len(x), 2, 5))
     for column, (row, entry) in enumerate(zip(*CALIBRATION_ENTRIES, strict=True)):

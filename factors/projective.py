@@ -1,8 +1,8 @@
-"""Projective factor: a projection matrix hangs on the mast as a camera of the rig does (12 rows).
+"""Projective factor: a projection matrix is tied to the mast as a camera of the rig (12 rows).
 
-The matrix is split, P = s K R [I | -C]. The rows compare R and C with the chain (`mast_residual`, 6 rows,
-radians and metres), K with that of the rig (fx, fy, skew, cx, cy, pixels), and s with 1 (its logarithm).
-Images do not depend on s: the last row alone determines it.
+The matrix is decomposed, P = s K R [I | -C]. The rows compare R and C with the chain (`mast_residual`, 6
+rows, radians and metres), K with that of the rig (fx, fy, skew, cx, cy, pixels), and s with 1 (its
+logarithm). Images do not depend on s: the last row alone determines it.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from pancam_graph.factors.mast import Pose, mast_residual
 __all__ = ["projective_factor", "projective_residual"]
 
 _NO_CAMERA = 1e6
-"""Residual in each row of a matrix that is no camera: no step of an optimiser ends there."""
+"""Residual in each row for a matrix that is no camera, so that an optimiser rejects it."""
 
 
 def projective_residual(
@@ -33,8 +33,8 @@ def projective_residual(
 
     P (n, 3, 4) take homogeneous points of the world to pixels; poses are pairs of rotations (n, 3, 3) and
     translations (n, 3), `calibration` (n, 3, 3) is the rig's K. P's entries count row by row, other Jacobians
-    are by body-frame tangents. A matrix that is no camera (left block of rank below 3) has a large residual
-    that moves nowhere.
+    are by body-frame tangents. A matrix that is no camera (left block of rank below 3) has a large constant
+    residual, with Jacobians of 0.
     """
     K, R, C, s = split_projections(projections)
     with np.errstate(all="ignore"):  # as `split_projections`

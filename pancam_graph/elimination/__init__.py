@@ -1,4 +1,4 @@
-"""Elimination of landmarks: the system that is left for the cameras, its square root, and its inverse."""
+"""Elimination of landmarks: the Schur complement on the variables of cameras, its square root and inverse."""
 
 from pancam_graph.elimination._joint_covariance import JointCovariance as JointCovariance
 from pancam_graph.elimination._joint_covariance import PosePlace as PosePlace

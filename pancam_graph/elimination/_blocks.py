@@ -17,12 +17,12 @@ __all__ = ["Block", "Layout", "blocks_of"]
 class Block:
     """Landmarks first seen from one stop, and the groups that these touch.
 
-    Its columns are those that some segment touches, group by group. Each segment has an even number of
+    Its columns are those on which some segment depends, group by group. Each segment has an even number of
     columns, since the kernel takes them in pairs: an odd segment gets one more, which belongs to no variable.
     """
 
     groups: tuple[int, ...]
-    """In the order of elimination."""
+    """Groups in the order of elimination."""
     begin: IntArray
     """(groups + 1,) first column of each in the block"""
     segment_column: IntArray
@@ -96,7 +96,7 @@ class Layout:
 def blocks_of(linkage: Linkage, m: Measurements) -> tuple[IntArray, dict[int, tuple[int, ...]]]:
     """Block of each landmark, named by the first group that sees it, and the groups each block touches."""
     groups = [linkage.unit_groups[u] for u in linkage.image_unit]
-    # Landmarks whose cameras no variable moves make a block of their own, which touches no group.
+    # Landmarks of constant cameras form a block that depends on no group.
     nobody = linkage.n_groups
     image_first = np.array([g[0] if g else nobody for g in groups])
     first = np.minimum.reduceat(image_first[m.image], m.starts)

@@ -13,9 +13,10 @@ __all__ = ["JointCovariance", "PosePlace", "relative_pose_covariance"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PosePlace:
-    """Where a pose is among the columns of a system."""
+    """Columns of a pose in a system."""
 
     group: int
+    """Group of its variable."""
     columns: slice
     """Its six columns among those of the group."""
     held: IntArray
@@ -24,10 +25,10 @@ class PosePlace:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class JointCovariance:
-    """Covariances of pairs of poses, worked out when they are asked for."""
+    """Joint marginal covariances of pairs of poses, computed on request."""
 
     root: Root
-    """Square root of the whole system, all of its directions determined."""
+    """Square root of the whole system, which must have full rank."""
     places: tuple[PosePlace | None, ...]
     """Of each pose; None where it is held."""
 
@@ -57,8 +58,8 @@ class JointCovariance:
 def relative_pose_covariance(world_T_a: gtsam.Pose3, world_T_b: gtsam.Pose3, joint: FloatArray) -> FloatArray:
     """Covariance (6, 6) of a_T_b, from the joint one (12, 12) of a and b as `JointCovariance.of` gives it.
 
-    In the body-frame tangent of b, rotation first: to first order a_T_b moves by b's tangent less a's, the
-    latter taken to b's frame.
+    In the body-frame tangent of b, rotation first: to first order the tangent of a_T_b is b's less a's, the
+    latter transformed to b's frame.
     """
     by_a = -world_T_b.between(world_T_a).AdjointMap()
     jacobian = np.hstack([by_a, np.eye(6)])

@@ -1,4 +1,4 @@
-"""How camera poses depend on the variables of a graph: what a template tells the landmark system."""
+"""Dependence of camera poses on the variables of a graph, as a factor template states it."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -27,13 +27,13 @@ class Linkage:
     dim: IntArray
     """(variables,) tangent dimensions"""
     group: IntArray
-    """(variables,) ascending"""
+    """(variables,) group of each, ascending"""
     image_unit: IntArray
-    """(images,)"""
+    """(images,) unit of each"""
     segment_begin: IntArray
     """(units + 1,) first segment of each unit"""
     segment_variable: IntArray
-    """(segments,)"""
+    """(segments,) variable of each"""
     segment_column: IntArray
     """(segments,) first column of the variable"""
     segment_width: IntArray
@@ -70,7 +70,7 @@ class Linkage:
 
     @cached_property
     def row(self) -> dict[int, int]:
-        """Variable of each key."""
+        """Index of the variable of each key."""
         return {key: i for i, key in enumerate(self.key)}
 
     def columns_of(self, key: int) -> slice:
@@ -82,10 +82,10 @@ class Linkage:
     def by_group(self, components: Iterable[tuple[int, IntArray]]) -> dict[int, IntArray]:
         """By group, the columns of components (n,) of variables, by key; only groups with any."""
         out: dict[int, IntArray] = {}
-        for key, own in components:
-            if len(own):
+        for key, indices in components:
+            if len(indices):
                 g = int(self.group[self.row[key]])
-                columns = self.columns_of(key).start + own
+                columns = self.columns_of(key).start + indices
                 out[g] = np.concatenate([out.get(g, np.zeros(0, dtype=np.int64)), columns])
         return out
 
@@ -98,7 +98,7 @@ class Linkage:
 
     @cached_property
     def unit_groups(self) -> tuple[tuple[int, ...], ...]:
-        """Groups that each unit's variables are of."""
+        """Groups of the variables of each unit."""
         group = self.group[self.segment_variable]
         begin = self.segment_begin
         return tuple(
@@ -108,13 +108,13 @@ class Linkage:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Posture:
-    """Cameras at some values of the variables, and how they move with them."""
+    """Cameras at some values of the variables, and their derivatives by these."""
 
     views: CameraViews
     unit_R: FloatArray
     """(units, 3, 3) world_R_base of the body whose twist (its frame, rotation first) moves a unit's images"""
     unit_t: FloatArray
-    """(units, 3) where that body is, metres"""
+    """(units, 3) world_t_base of that body, metres"""
     chain: FloatArray
     """(segments, 6 or 11, widest) takes a segment's columns to that twist, and to changes of fx, fy, skew, cx
     and cy where calibrations are free; columns beyond a segment's width are 0"""

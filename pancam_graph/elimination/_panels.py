@@ -13,27 +13,28 @@ from pancam_graph.base.geometry import FloatArray, IntArray
 __all__ = ["Covariance", "FreeDirectionError", "Panels", "Pattern", "Root", "pattern"]
 
 _RANK_TOLERANCE = 1e-12
-"""A pivot counts as zero where it is no more than this share of the diagonal entry that was summed up."""
+"""A pivot counts as zero up to this share of its diagonal entry before elimination."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Pattern:
-    """Which blocks of the square root are filled, in an order of elimination that keeps them few."""
+    """Fill-in of the square root by blocks, in an order of elimination that keeps it small."""
 
     dim: IntArray
-    """(groups,)"""
+    """(groups,) columns of each"""
     order: tuple[int, ...]
     """Groups in the order of elimination."""
     after: tuple[tuple[int, ...], ...]
-    """For each group those that its rows reach, itself first, then in the order of elimination."""
+    """For each group, the groups of the filled blocks in its rows: itself, then others in the order of
+    elimination."""
     begin: tuple[IntArray, ...]
     """For each group the first column of each of these in its panel, and the number of columns."""
 
 
 def pattern(dim: IntArray, cliques: Iterable[Iterable[int]]) -> Pattern:
-    """Order of elimination by least fill-in of the next step (minimum degree, in columns).
+    """Order of elimination by minimum degree, counted in columns, and its fill-in.
 
-    `cliques` are sets of groups that some factor joins. On a drive without loops it follows the road.
+    `cliques` are sets of groups that some factor joins.
     """
     n = len(dim)
     near: list[set[int]] = [set() for _ in range(n)]
@@ -60,7 +61,7 @@ def pattern(dim: IntArray, cliques: Iterable[Iterable[int]]) -> Pattern:
 
 
 class FreeDirectionError(SolveError):
-    """No factor determines some direction; most of it lies in column `column` of group `group`."""
+    """A direction is undetermined; its largest component is in column `column` of group `group`."""
 
     def __init__(self, group: int, column: int) -> None:
         super().__init__("nothing holds a direction of the solution")
@@ -91,13 +92,13 @@ class Panels:
         return sorted(groups, key=self._position.__getitem__)
 
     def first_columns(self, g: int) -> IntArray:
-        """First column (groups,) of each group in the panel of g; -1 where that does not reach."""
+        """First column (groups,) of each group in the panel of g; -1 for a group without a block there."""
         out = np.full(len(self.structure.dim), -1)
         out[list(self.structure.after[g])] = self.structure.begin[g][:-1]
         return out
 
     def add(self, groups: Sequence[int], S: FloatArray, s: FloatArray) -> None:
-        """Add a dense system over groups in the order of elimination; of S the upper triangle counts."""
+        """Add a dense system over groups in order of elimination; of S only the upper triangle is read."""
         begin = np.concatenate([[0], np.cumsum(self.structure.dim[list(groups)])])
         for i in range(len(groups)):
             self.add_rows(i, groups, begin, S, s)
@@ -107,7 +108,7 @@ class Panels:
         panel, place = self.panel[groups[i]], self._place[groups[i]]
         rows = slice(begin[i], begin[i + 1])
         panel[:, -1] += s[rows]
-        # Runs of groups that are neighbours in the panel too are added at once.
+        # Runs of groups that are adjacent in the panel too are added at once.
         j = i
         while j < len(groups):
             k, first = j + 1, place[groups[j]]
@@ -137,7 +138,7 @@ class Panels:
         return twin
 
     def hold(self, held: dict[int, IntArray]) -> None:
-        """Make some columns of groups independent of all others, with an information of 1."""
+        """Decouple some columns of groups from all others, with information 1."""
         for g, columns in held.items():
             self.panel[g][columns] = 0.0
             for panel, place in zip(self.panel, self._place, strict=True):
@@ -154,19 +155,19 @@ class Panels:
         return np.concatenate([np.zeros(0), *(panel[:, -1] for panel in self.panel)])
 
     def damp(self, share: float) -> None:
-        """Add a share of the diagonal to it."""
+        """Add a share of the diagonal to the diagonal (Marquardt's damping)."""
         for panel in self.panel:
-            own = np.arange(len(panel))
-            panel[own, own] *= 1 + share
+            diagonal = np.arange(len(panel))
+            panel[diagonal, diagonal] *= 1 + share
 
     def trace_with(self, covariance: "Covariance") -> float:
         """Trace of S times a covariance that has its blocks."""
         total = 0.0
         for g, panel in enumerate(self.panel):
             n, begin = int(self.structure.dim[g]), self.structure.begin[g]
-            own = np.triu(panel[:, :n])
-            total += 2 * float(np.sum(np.triu(own, 1) * covariance.block(g, g)))
-            total += float(np.diag(own) @ np.diag(covariance.block(g, g)))
+            upper = np.triu(panel[:, :n])
+            total += 2 * float(np.sum(np.triu(upper, 1) * covariance.block(g, g)))
+            total += float(np.diag(upper) @ np.diag(covariance.block(g, g)))
             for h, first, last in zip(self.structure.after[g][1:], begin[1:-1], begin[2:], strict=True):
                 total += 2 * float(np.sum(panel[:, first:last] * covariance.block(g, h)))
         return total
@@ -174,12 +175,12 @@ class Panels:
     def root(self) -> "Root":
         """Square root R'R = S with R'e = s, rows by group; destroys the panels.
 
-        Rank-revealing: where S leaves directions free, as images alone leave the place and orientation of the
-        world, a group's rows are fewer than its columns.
+        Rank-revealing: where S is singular, as the free gauge of position and orientation makes it with
+        images alone, a group has fewer rows than columns.
         """
         st = self.structure
         rows: list[FloatArray] = [np.zeros((0, 0))] * len(st.dim)
-        # A pivot is judged by the diagonal entry that was summed up: what is tiny beside it is rounding.
+        # Pivots are compared with the diagonal before elimination: one tiny beside it is rounding.
         summed = [np.diag(panel).copy() for panel in self.panel]
         for g in st.order:
             rows[g] = _root_of_panel(self.panel[g], summed[g])
@@ -203,23 +204,23 @@ def _root_of_panel(panel: FloatArray, summed: FloatArray) -> FloatArray:
     """Rows (rank, columns) of the square root of a panel whose own block comes first.
 
     Pivoted Cholesky P'S P = U'U of the block, scaled by the diagonal (n,) as it was before other groups were
-    eliminated: radians and metres differ by much, and a pivot tiny beside what was summed is rounding.
+    eliminated: this balances radians and metres, and a pivot tiny beside that diagonal is rounding.
     """
     n, unit = len(summed), np.sqrt(np.maximum(summed, 0.0))
     scale = np.where(unit > 0, 1 / np.maximum(unit, 1e-150), 0.0)
     if not np.all(np.isfinite(panel)):
         raise SolveError("the linearised system is not finite: a camera or a landmark has left the domain")
-    own = panel[:, :n] * scale[:, None] * scale
-    upper, pivot, rank, _ = scipy.linalg.lapack.dpstrf(own, tol=_RANK_TOLERANCE)
+    scaled = panel[:, :n] * scale[:, None] * scale
+    upper, pivot, rank, _ = scipy.linalg.lapack.dpstrf(scaled, tol=_RANK_TOLERANCE)
     pivot -= 1  # LAPACK counts from 1, and takes the first pivot whatever it is
-    if np.max(np.diag(own), initial=0.0) <= _RANK_TOLERANCE:
+    if np.max(np.diag(scaled), initial=0.0) <= _RANK_TOLERANCE:
         rank = 0
     rows = np.zeros((rank, panel.shape[1]))
     if rank > 0:
         upper = np.triu(upper)[:rank]
         rows[:, pivot] = upper * unit[pivot]
         right = panel[pivot[:rank], n:] * scale[pivot[:rank], None]
-        # U'^-1 right, transposed: so that BLAS finds its own order of entries and nothing large is copied.
+        # U'^-1 right, transposed: BLAS gets columns in its own order, and no large copy is made.
         rows[:, n:] = scipy.linalg.blas.dtrsm(1.0, upper[:, :rank], right.T, side=1, overwrite_b=1).T
     return rows
 
@@ -233,14 +234,14 @@ class Root:
     """For each group (rank, columns of its panel + 1): R, and e as the last column."""
 
     def gain(self) -> float:
-        """By how much the step that solves the system lowers the cost, as far as it is linear: |e|^2 / 2."""
+        """Decrease of the linearised cost by the step that solves the system: |e|^2 / 2."""
         return 0.5 * sum(float(rows[:, -1] @ rows[:, -1]) for rows in self.rows)
 
     def step(self, known: Mapping[int, FloatArray] | None = None) -> FloatArray:
         """The x (columns,) that solves S x = -s, by back substitution in R x = -e; group by group.
 
-        Groups whose x is `known` keep it, and groups that were eliminated before them follow. Where the rows
-        of a group leave directions free, its x is the shortest that fits those of the later groups.
+        Groups whose x is `known` keep it, and groups that were eliminated before them follow. Where a group
+        has fewer rows than columns, its x is the minimum-norm solution given the later groups.
         """
         st = self.structure
         begin = np.concatenate([[0], np.cumsum(st.dim)])
@@ -252,19 +253,21 @@ class Root:
             n, rows = int(st.dim[g]), self.rows[g]
             rest = np.concatenate([np.zeros(0), *(x[begin[h] : begin[h + 1]] for h in st.after[g][1:])])
             right = -rows[:, -1] - rows[:, n:-1] @ rest
-            own = rows[:, :n]
-            # Rows come in the order of their pivots, which is not that of the columns.
-            is_square = len(own) == n
+            diagonal_rows = rows[:, :n]
+            # Rows are in the order of their pivots, not of the columns.
+            is_square = len(diagonal_rows) == n
             x[begin[g] : begin[g + 1]] = (
-                np.linalg.solve(own, right) if is_square else np.linalg.lstsq(own, right)[0]
+                np.linalg.solve(diagonal_rows, right)
+                if is_square
+                else np.linalg.lstsq(diagonal_rows, right)[0]
             )
         return x
 
     def inverse_columns(self, g: int, columns: slice) -> FloatArray:
         """Columns (all columns, n) of the inverse of R'R that belong to some columns of group g.
 
-        By forward and back substitution, so blocks of any two groups are at hand. Raises FreeDirectionError
-        where R leaves a direction free.
+        By forward and back substitution, so that blocks of any two groups are available. Raises
+        FreeDirectionError where R leaves a direction free.
         """
         st = self.structure
         begin = np.concatenate([[0], np.cumsum(st.dim)])
@@ -274,16 +277,16 @@ class Root:
             n, rows = int(st.dim[h]), self.rows[h]
             if len(rows) < n:
                 raise FreeDirectionError(h, _loosest(rows[:, :n]))
-            own = slice(begin[h], begin[h + 1])
-            if x[own].any():
-                x[own] = np.linalg.solve(rows[:, :n].T, x[own])
+            of_group = slice(begin[h], begin[h + 1])
+            if x[of_group].any():
+                x[of_group] = np.linalg.solve(rows[:, :n].T, x[of_group])
                 for k, a, b in zip(st.after[h][1:], st.begin[h][1:-1], st.begin[h][2:], strict=True):
-                    x[begin[k] : begin[k + 1]] -= rows[:, a:b].T @ x[own]
+                    x[begin[k] : begin[k + 1]] -= rows[:, a:b].T @ x[of_group]
         for h in reversed(st.order):
             n, rows = int(st.dim[h]), self.rows[h]
-            own = slice(begin[h], begin[h + 1])
+            of_group = slice(begin[h], begin[h + 1])
             rest = np.concatenate([x[:0], *(x[begin[k] : begin[k + 1]] for k in st.after[h][1:])])
-            x[own] = np.linalg.solve(rows[:, :n], x[own] - rows[:, n:-1] @ rest)
+            x[of_group] = np.linalg.solve(rows[:, :n], x[of_group] - rows[:, n:-1] @ rest)
         return x
 
     def covariance(self) -> "Covariance":
@@ -312,7 +315,7 @@ class Root:
 
 
 def _loosest(rows: FloatArray) -> int:
-    """The column that has most of the directions which rows (rank, n), rank below n, leave free."""
+    """The column with the largest component in the null space of rows (rank, n), rank below n."""
     unit = np.sqrt(np.sum(rows**2, axis=0))
     scaled = rows / np.where(unit > 0, unit, 1.0)
     _, _, turn = np.linalg.svd(scaled, full_matrices=True)
@@ -325,7 +328,7 @@ def _block(blocks: dict[tuple[int, int], FloatArray], g: int, h: int) -> FloatAr
 
 
 class Covariance:
-    """Blocks of the inverse of a system, of those groups that a clique joins."""
+    """Blocks of the inverse of a system, for pairs of groups that a clique joins."""
 
     def __init__(self, blocks: dict[tuple[int, int], FloatArray]) -> None:
         self._blocks = blocks

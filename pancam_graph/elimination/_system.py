@@ -1,4 +1,4 @@
-"""All landmarks of a problem, cut into blocks, and the system that is left for the variables of cameras."""
+"""All landmarks of a problem, in blocks, and their Schur complement on the variables of cameras."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -33,25 +33,27 @@ __all__ = ["LandmarkSystem", "Room"]
 _T = TypeVar("_T", bound=np.generic)
 
 _PARTS = 8
-"""A chunk has at most this share of all observations, so that two cores, or eight, have even work."""
+"""Parts of equal size, of all observations, that a chunk does not exceed: two or eight cores then have even
+work."""
 _ROOM = 6_000_000
 """Numbers in the dense systems of a wave of chunks: 48 MB."""
 _STRAY = 1.0
-"""A landmark with this cost per observation, twice what noise gives or more, is refined after a step."""
+"""Cost per observation beyond which a landmark is a stray and is refined: at least twice the cost by
+noise."""
 _LOST = 0.5 * 5.0**2
-"""A stray that has this cost after its refinement, as if all rays were 5 sigma off, is placed anew."""
+"""Cost per observation after refinement, as of residuals of 5 sigma, beyond which a stray is triangulated."""
 _TOUCHED = 1e-2
-"""A landmark is a stray only if the step changed its cost by more than this share."""
+"""Relative change of its cost by a step below which a landmark is no stray."""
 _REFINED = 0.1
-"""A stray is refined until that promises no more than this share of its cost."""
+"""Refinement of a stray ends when its expected decrease is at most this share of its cost."""
 _STRAY_GRAIN = 256
 """Strays that one thread takes at once."""
 _SMALLEST_SUM = 200_000
-"""Entries of systems whose sum is worth waking another thread."""
+"""Entries of dense systems from which on several threads sum them up."""
 _SMALLEST_CHUNK = 4000
-"""Observations of a chunk that is worth its overhead."""
+"""Least observations of a chunk, below which its overhead dominates."""
 _ENTRIES_PER_OBSERVATION = 25
-"""To fill and sum up as many entries of a chunk's dense system takes about as long as an observation."""
+"""Entries of a dense system whose filling and summing takes about as long as one observation."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +68,7 @@ class _Chunk:
 class Room(local):
     """Memory that systems share if they are linearised one after the other.
 
-    To get new memory takes as long as to fill it. Each thread has memory of its own, so systems may also
+    Allocating memory would take as long as filling it. Each thread has memory of its own, so systems may also
     be linearised in parallel.
     """
 
@@ -74,7 +76,7 @@ class Room(local):
         self._numbers = np.empty(0)
 
     def numbers(self, n: int) -> FloatArray:
-        """(n,) numbers, whatever they were before."""
+        """(n,) numbers with arbitrary values."""
         if len(self._numbers) < n:
             # At least twice as much as before, so that growth in small steps rarely needs new memory.
             self._numbers = np.empty(max(n, 2 * len(self._numbers)))
@@ -87,11 +89,11 @@ _Systems = list[tuple[FloatArray, FloatArray]]
 
 
 class LandmarkSystem:
-    """Landmarks as 4-vectors on S^3 that follow the cameras, eliminated from every linearisation.
+    """Landmarks, unit 4-vectors on S^3, that are eliminated from every linearisation.
 
-    `linearise` gives the system that is left in the variables of cameras; `try_step` moves the landmarks
-    along with a step of these variables and returns the true cost; `adopt` makes that place the next point of
-    linearisation.
+    `linearise` gives the Schur complement on the variables of cameras; `try_step` moves the landmarks along
+    with a step of these variables and returns the true cost; `adopt` makes the moved landmarks the next
+    linearisation point.
     """
 
     def __init__(
@@ -107,7 +109,7 @@ class LandmarkSystem:
     ) -> None:
         """Arrange observations and landmarks; `cliques` are groups that other factors join.
 
-        `refined`: after a step all landmarks go to where they fit best, not only strays.
+        `refined`: after a step all landmarks are refined, not only strays.
         """
         self.linkage, self.loss, self._refined = linkage, loss, refined
         self._measurements = measurements
@@ -131,7 +133,7 @@ class LandmarkSystem:
             undetermined=np.zeros(n, dtype=bool),
         )
         self.regained = 0.0
-        """By how much placing strays anew lowered the cost where the last step led."""
+        """Decrease of the cost by placing strays anew after the last step tried."""
         self._memory = room or Room()
         self._moved, self._moved_cost = np.empty_like(self.vector), np.zeros(n)
         self._has_moved = False
@@ -222,9 +224,10 @@ class LandmarkSystem:
         )
 
     def linearise(self, posture: Posture) -> Panels:
-        """The system (S, s) in the cameras' variables at the landmarks' present places.
+        """The reduced normal equations (S, s) of the cameras' variables.
 
-        The normal equations of cameras and landmarks (thesis eq. 3.40), landmarks eliminated (eq. 3.42).
+        These are the normal equations of cameras and landmarks (thesis eq. 3.40) with landmarks eliminated
+        (eq. 3.42), linearised at the given posture and at the landmarks' linearisation point.
 
         The panels are this object's own and are filled anew by the next call.
         """
@@ -274,8 +277,8 @@ class LandmarkSystem:
     def put_back(self, panels: Panels, g: int) -> tuple[FloatArray, FloatArray]:
         """The system (n, n), (n,) in the columns of one group, landmarks and other variables held.
 
-        `panels` are those of the last linearisation, whatever else was added to them. Of each landmark they
-        have lost W'W and W'gamma, W = L^-1 E' and gamma = L^-1 g with L L' = V; both are put back.
+        `panels` are those of the last linearisation, with any other factors added. Elimination subtracted W'W
+        and W'gamma of each landmark, W = L^-1 E' and gamma = L^-1 g with L L' = V; both are added again.
         """
         n = int(self.linkage.group_dim[g])
         upper = np.triu(panels.panel[g][:, :n])
@@ -289,11 +292,13 @@ class LandmarkSystem:
             first, last = self.sights.pair_begin[chunk.begin], self.sights.pair_begin[chunk.end]
             counts = np.diff(self.sights.pair_begin[chunk.begin : chunk.end + 1])
             landmark, pair = np.repeat(np.arange(len(counts)), counts), self.sights.pair[first:last]
-            own = (2 * pair >= block.begin[i]) & (2 * pair < block.begin[i + 1])
-            # One column more, of nothing: what fills up a pair goes there.
+            of_group = (2 * pair >= block.begin[i]) & (2 * pair < block.begin[i + 1])
+            # One more column takes the padding of pairs, and is dropped.
             W = np.zeros((len(counts), 3, n + 1))
             for half in range(2):
-                W[landmark[own], :, block.row[2 * pair[own] + half]] = arms[first:last][own, :, half]
+                W[landmark[of_group], :, block.row[2 * pair[of_group] + half]] = arms[first:last][
+                    of_group, :, half
+                ]
             W = W.reshape(-1, n + 1)[:, :n]
             S += W.T @ W
             s += W.T @ self.reduced.gamma[chunk.begin : chunk.end].ravel()
@@ -324,11 +329,11 @@ class LandmarkSystem:
         return out
 
     def try_step(self, posture: Posture, step: FloatArray) -> FloatArray:
-        """Costs (blocks,) where a step of all variables (columns,) leads, landmarks moved along.
+        """True costs (blocks,) after a step of all variables (columns,), with landmarks moved along.
 
-        Landmarks follow by back substitution (thesis eq. 3.43), and are refined where that leaves them off.
-        `posture` is that after the step. A landmark that cannot be brought in front of its cameras costs
-        kernel.BEHIND_COST.
+        Landmarks follow by back substitution (thesis eq. 3.43), and strays among them are refined or
+        triangulated. `posture` is that after the step. A landmark that cannot be brought in front of its
+        cameras costs kernel.BEHIND_COST.
         """
         bearings = self.bearings(posture)
         steps = [np.append(step, 0.0)[block.source] for block in self.blocks]
@@ -356,7 +361,7 @@ class LandmarkSystem:
         return self._by_block(self._moved_cost)
 
     def cost_at(self, posture: Posture) -> float:
-        """True cost where landmarks stay at the point of linearisation and cameras are elsewhere."""
+        """True cost with landmarks at the linearisation point and cameras in another posture."""
         bearings, cost, loss = self.bearings(posture), np.empty(len(self.vector)), self.loss
 
         def work(begin: int, end: int) -> None:
@@ -376,13 +381,14 @@ class LandmarkSystem:
         return float(cost.sum())
 
     def _replace_strays(self, views: CameraViews, bearings: kernel.Bearings) -> None:
-        """Place those landmarks anew that a step leaves behind a camera or far off.
+        """Place landmarks anew that a step left behind a camera or with a large cost.
 
-        A stray is refined from where the step led; if it is still far off, it is triangulated from its rays.
+        A stray is refined from its place after the step; if its cost remains large, it is triangulated from
+        its rays.
         """
         counts, seen = np.diff(self._seen.begin), self._seen
         before, after = self.reduced.cost, self._moved_cost
-        # A landmark whose cost a step hardly changes is placed as well as before, however large the cost is.
+        # A landmark whose cost hardly changes is placed as well as before, however large its cost.
         touched = np.abs(after - before) > _TOUCHED * before
         astray = (after > _LOST * counts) | touched & (after > _STRAY * counts)
         strays = np.flatnonzero(astray | self._refined)
@@ -420,7 +426,7 @@ class LandmarkSystem:
 
     @cached_property
     def _seen(self) -> kernel.Seen:
-        """Observations as loops over landmarks take them, in the order of elimination; no cameras yet."""
+        """Observations for loops over landmarks, in the order of elimination; cameras are filled in later."""
         sights = self.sights
         return kernel.Seen(
             begin=sights.occurrence_begin[sights.landmark_begin],
@@ -441,7 +447,7 @@ class LandmarkSystem:
         self._moved[strays[better]], self._moved_cost[strays[better]] = vector[better], cost[better]
 
     def _given(self, array: NDArray[_T]) -> NDArray[_T]:
-        """Rows in the order that landmarks were given in."""
+        """Rows in the order in which landmarks were given."""
         out = np.empty_like(array)
         out[self.landmark_row] = array
         return out
@@ -452,18 +458,18 @@ class LandmarkSystem:
 
     @property
     def any_behind(self) -> bool:
-        """Whether a landmark was behind a camera of its own where the last step led, or at its first."""
+        """Whether a landmark is behind one of its cameras after the last step; before any, as linearised."""
         cost = self._moved_cost if self._has_moved else self.reduced.cost
         return bool(cost.max() >= kernel.BEHIND_COST)
 
     @property
     def moved_cost(self) -> float:
-        """Cost of all where the last step led."""
+        """Total cost of landmarks after the last step tried."""
         return float(self._moved_cost.sum())
 
     @property
     def gain_alone(self) -> float:
-        """By how much landmarks would lower the cost if no camera moved, as linearised last."""
+        """Decrease of the linearised cost by moving landmarks alone, with cameras held."""
         return 0.5 * float(np.sum(self.reduced.gamma**2))
 
     def block_costs(self) -> FloatArray:
@@ -483,16 +489,16 @@ class LandmarkSystem:
     def landmark_covariance_m2(self, covariance: Covariance) -> FloatArray:
         """Covariance (landmarks, 3, 3) of world points X / w, cameras marginalised, in the order given.
 
-        V^-1 + V^-1 E' C E V^-1 with C the covariance of the variables that a landmark's cameras hang on; at
-        the last linearisation. Infinite for landmarks at infinity.
+        It is V^-1 + V^-1 E' C E V^-1 at the last linearisation, with C the covariance of the variables of a
+        landmark's cameras. Infinite for landmarks at infinity.
         """
         out = np.empty((len(self.landmark_row), 3, 3))
         for chunk in self.chunks:
             block = self.blocks[chunk.block]
             joint = np.zeros((len(block.row), len(block.row)))
-            own = [np.flatnonzero(block.row[a:b] >= 0) for a, b in pairwise(block.begin)]
-            for g, a, rows in zip(block.groups, block.begin, own, strict=False):
-                for h, b, columns in zip(block.groups, block.begin, own, strict=False):
+            filled = [np.flatnonzero(block.row[a:b] >= 0) for a, b in pairwise(block.begin)]
+            for g, a, rows in zip(block.groups, block.begin, filled, strict=False):
+                for h, b, columns in zip(block.groups, block.begin, filled, strict=False):
                     wanted = np.ix_(block.row[a + rows], block.row[b + columns])
                     joint[np.ix_(a + rows, b + columns)] = covariance.block(g, h)[wanted]
             kernel.point_covariances(
@@ -502,5 +508,5 @@ class LandmarkSystem:
 
     @property
     def undetermined(self) -> BoolArray:
-        """(landmarks,) which the weak prior alone held at the last linearisation, in the order given."""
+        """(landmarks,) whether only the weak prior held it at the last linearisation, in the order given."""
         return self._given(self.reduced.undetermined)

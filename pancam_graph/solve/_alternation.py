@@ -1,9 +1,9 @@
 """Regular and shared parameters in turn, as in the thesis, for comparison with the joint step.
 
-Regular are landmarks and what belongs to a stop, a frame or an image; shared is what all stops have in
-common (the last group of a Linkage). A regular step holds what is shared and eliminates landmarks (Schur
-complement, thesis eq. 3.42, 3.43); a shared step holds everything else and is small and dense (eq. 4.10 to
-4.13). Each is a Levenberg-Marquardt step with a damping of its own.
+Regular parameters are landmarks and the variables of a stop, a frame or an image; shared parameters are
+common to all stops (the last group of a Linkage). A regular step holds the shared parameters and eliminates
+landmarks (Schur complement, thesis eq. 3.42, 3.43); a shared step holds all others and solves a small dense
+system (eq. 4.10 to 4.13). Each is a Levenberg-Marquardt step with a damping of its own.
 """
 
 import logging
@@ -30,23 +30,24 @@ __all__ = ["AlternatingSolver"]
 
 _LOG = logging.getLogger(__name__)
 _FIRST = 1e-5
-"""First damping, as a share of the diagonal of the normal equations."""
+"""Initial damping, as a share of the diagonal of the normal equations."""
 _LEAST, _MOST = 1e-12, 1e10
-"""Damping within which a step is sought; GTSAM's joint search ends at the same."""
+"""Range of the damping; GTSAM's joint search has the same upper limit."""
 _ROUNDING = 1e-14
-"""A step that promises no more than this share of the cost promises nothing."""
+"""Expected decrease, as a share of the cost, below which it is rounding."""
 _SLOWEST = 0.999
-"""Gains are expected to shrink at least as much from round to round."""
+"""Largest ratio of successive gains assumed in extrapolation."""
 
 
 class AlternatingSolver(EliminatedSolver):
-    """Outliers are sought, and a rigid mast is fitted first, as in the joint solve; the end is alternation.
+    """The joint solver with alternation as its last stage.
 
-    So both end over the same observations.
+    Screening and the fit of a rigid mast are those of the joint solver, so both end with the same
+    observations.
     """
 
     def require(self, template: FactorTemplate) -> None:
-        """Raise InputError where all stops share nothing that is free."""
+        """Raise InputError where no free variable is shared by all stops."""
         if template.linkage.n_groups <= len(template.traverse.stops):
             raise InputError(
                 f"method: expected joint with the model {template.model} as it is, found alternation: "
@@ -54,7 +55,7 @@ class AlternatingSolver(EliminatedSolver):
             )
 
     def _from_near(self, problem: Problem, rule: StopRule, loss: Loss, stage: str) -> tuple[Problem, Outcome]:
-        """Alternation, but for the search for outliers."""
+        """Minimise by alternation; in screening, by the joint solver."""
         if stage != "solve":
             return super()._from_near(problem, rule, loss, stage)
         point = _Point(problem, loss)
@@ -63,7 +64,7 @@ class AlternatingSolver(EliminatedSolver):
 
 
 class _Point:
-    """Values of a problem on the way to its optimum, and the system there."""
+    """The current values of a problem, and its system there."""
 
     def __init__(self, problem: Problem, loss: Loss) -> None:
         self.template, self.factors, self.values = problem.template, problem.factors, problem.values
@@ -71,45 +72,47 @@ class _Point:
         self.n_observations = int(problem.kept.sum())
         self.held = held_columns(self.template)
         self.held_columns = all_columns(self.template.linkage, self.held)
-        """The same among all columns"""
+        """The held columns among all columns"""
         self.cost = self.system.cost_at(self.posture(self.values)) + self.factors.error(self.values)
         self.n_steps = 0
-        """How many were taken to come here"""
+        """Number of steps taken so far"""
 
     def posture(self, values: gtsam.Values) -> Posture:
         """Cameras at some values."""
         return self.template.posture(values)
 
     def panels(self) -> Panels:
-        """The system here, landmarks eliminated, priors and ties included; the landmark system's own."""
+        """The system at the current values, landmarks eliminated, all factors included; not a copy."""
         panels = self.system.linearise(self.posture(self.values))
         add_factors(panels, self.template.linkage, self.factors.linearize(self.values))
         return panels
 
     def moved(self, step: FloatArray) -> gtsam.Values:
-        """Values after a step of all columns; what telemetry holds stays as it is, bit for bit."""
+        """Values after a step of all columns; held components stay exactly the same."""
         step[self.held_columns] = 0.0
         return retracted(self.template.linkage, self.values, step)
 
 
 @dataclass(kw_only=True)
 class _Damping:
-    """Nielsen's rule: the next damping follows from how well the last step kept its promise.
+    """Nielsen's rule: the next damping follows from the gain ratio of the last step.
 
-    Source: Nielsen, Damping parameter in Marquardt's method, 1999, as in SBA (thesis chapter 3); here it is a
-    share of the diagonal, since radians, metres and pixels have no unit in common.
+    Source: Nielsen, Damping parameter in Marquardt's method, 1999, as in SBA (thesis chapter 3); here the
+    damping scales the diagonal, since radians, metres and pixels have no common unit.
     """
 
     share: float = _FIRST
+    """Damping, as a share of the diagonal."""
     growth: float = 2.0
+    """Factor on the damping after the next step that fails."""
 
     def relax(self, gain_ratio: float) -> None:
-        """After a step that lowered the cost by so many times what it promised."""
+        """Reduce the damping after a step; `gain_ratio` is its actual over its expected decrease of cost."""
         self.share = max(self.share * max(1 / 3, 1 - (2 * gain_ratio - 1) ** 3), _LEAST)
         self.growth = 2.0
 
     def tighten(self) -> None:
-        """After one that did not lower it."""
+        """Increase the damping after a step that did not lower the cost."""
         self.share *= self.growth
         self.growth *= 2
 
@@ -121,25 +124,25 @@ class _Set(ABC):
         self.point = point
         self.damping = _Damping()
         self.rests = False
-        """Whether it is not tried, since it stalled"""
+        """Whether it is skipped, since it stalled"""
         self.stalled_at = -1
-        """The point's number of steps where it stalled last"""
+        """Number of steps of the point when it stalled last"""
 
     @abstractmethod
     def linearise(self, panels: Panels | None) -> None:
-        """Prepare for steps from here; `panels` are the system here, if it is at hand. Destroys them."""
+        """Prepare steps from the current values; `panels` are the system there, if known. Destroys them."""
 
     @abstractmethod
     def propose(self, damping: float) -> tuple[FloatArray, float]:
-        """A step of all columns, and by how much it would lower the cost if that were quadratic."""
+        """A step of all columns, and its expected decrease of the quadratic model."""
 
     @abstractmethod
     def cost_at(self, posture: Posture, step: FloatArray) -> float:
-        """Cost of the landmarks where a step leads."""
+        """Cost of the observations after a step."""
 
     @abstractmethod
     def take(self) -> None:
-        """Go where the last step led, with the landmarks."""
+        """Take the last step for the landmarks."""
 
     def advance(self, panels: Panels | None = None) -> None:
         """Take one step that lowers the cost, or stall."""
@@ -161,10 +164,10 @@ class _Set(ABC):
 
 
 class _Regular(_Set):
-    """Landmarks, eliminated, and the variables of single stops."""
+    """The regular set: landmarks, eliminated, and the variables of single stops."""
 
     def linearise(self, panels: Panels | None) -> None:
-        """Hold what is shared."""
+        """Linearise with the shared variables held."""
         link = self.point.template.linkage
         shared = link.n_groups - 1
         self._panels = panels or self.point.panels()
@@ -172,7 +175,7 @@ class _Regular(_Set):
         self._diagonal, self._right = self._panels.diagonal(), self._panels.right()
 
     def propose(self, damping: float) -> tuple[FloatArray, float]:
-        """By the square root of the damped system; landmarks are not damped."""
+        """A step by the square root of the damped system; landmarks are not damped."""
         panels = self._panels.copy()
         panels.damp(damping)
         step = panels.root().step()
@@ -180,30 +183,30 @@ class _Regular(_Set):
         return step, promised + self.point.system.gain_alone
 
     def cost_at(self, posture: Posture, step: FloatArray) -> float:
-        """Landmarks follow."""
+        """Cost with landmarks moved by back substitution."""
         return float(self.point.system.try_step(posture, step).sum())
 
     def take(self) -> None:
-        """Landmarks go where they were led."""
+        """Adopt the moved landmarks."""
         self.point.system.adopt()
 
 
 class _Shared(_Set):
-    """What all stops have in common."""
+    """The shared set: variables that all stops have in common."""
 
     def __init__(self, point: _Point) -> None:
         super().__init__(point)
         link = point.template.linkage
         self._group = link.n_groups - 1
         self._columns = slice(*link.group_column[self._group : self._group + 2].tolist())
-        own = {key for key, group in zip(link.key, link.group, strict=True) if group == self._group}
-        self._factors = graph_of(f for f in point.factors.all if not own.isdisjoint(f.keys()))
-        """Factors on any of these variables"""
+        shared_keys = {key for key, group in zip(link.key, link.group, strict=True) if group == self._group}
+        self._factors = graph_of(f for f in point.factors.all if not shared_keys.isdisjoint(f.keys()))
+        """Factors on any of the shared variables"""
         self._is_seen = bool(link.touched[link.group == self._group].any())
-        """Whether cameras hang on it; else ties alone do"""
+        """Whether cameras depend on the shared variables; else only ties do"""
 
     def linearise(self, panels: Panels | None) -> None:
-        """Landmarks and all other variables are held."""
+        """Linearise with landmarks and all other variables held."""
         point = self.point
         system, link = point.system, point.template.linkage
         if panels is None:
@@ -212,24 +215,24 @@ class _Shared(_Set):
             )
             add_factors(panels, link, self._factors.linearize(point.values))
         S, s = system.put_back(panels, self._group)
-        # In units of each column's own information: pixels, radians and metres differ by much.
+        # Columns are scaled by their information, since pixels, radians and metres differ by much.
         unit = np.sqrt(np.diag(S))
         self._unit = np.where(unit > 0, unit, 1.0)
         self._S, self._s = S / np.outer(self._unit, self._unit), s / self._unit
 
     def propose(self, damping: float) -> tuple[FloatArray, float]:
-        """By dense normal equations."""
+        """A step by dense normal equations."""
         x = -np.linalg.solve(self._S + damping * np.eye(len(self._s)), self._s)
         step = np.zeros(int(self.point.template.linkage.group_column[-1]))
         step[self._columns] = x / self._unit
         return step, 0.5 * float(damping * x @ x - x @ self._s)
 
     def cost_at(self, posture: Posture, step: FloatArray) -> float:
-        """Landmarks stay."""
+        """Cost with landmarks held."""
         return self.point.system.cost_at(posture)
 
     def take(self) -> None:
-        """Landmarks stay."""
+        """Nothing to do: landmarks are held."""
 
 
 def _alternate(
@@ -237,8 +240,8 @@ def _alternate(
 ) -> tuple[Outcome, Root]:
     """Both sets in turn until neither lowers the cost or the rule ends it; one round is one iteration.
 
-    A set that stalls rests while the other goes on; it is tried again where that settles or stalls, too. The
-    second result is the square root of the whole system where it ended.
+    A set that stalls is skipped while the other continues; it is tried again when the other converges or
+    stalls too. The second result is the square root of the whole system at the end.
     """
     regular, shared = sets = (_Regular(point), _Shared(point))
     costs = [point.cost]
@@ -298,14 +301,14 @@ def _alternate(
 
 
 def _whole(panels: Panels, point: _Point) -> Root:
-    """Square root of the whole system, both sets together."""
+    """Square root of the whole system of both sets."""
     panels = panels.copy()
     panels.hold(point.held)
     return panels.root()
 
 
 def _still_to_gain(costs: list[float]) -> float:
-    """By how much further rounds would lower the cost if their gains shrink as the last one did.
+    """Expected decrease of cost by further rounds, with gains that shrink as the last one did.
 
     Alternation converges linearly, and slowly where the sets depend on each other.
     """

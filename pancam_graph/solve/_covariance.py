@@ -1,4 +1,4 @@
-"""Uncertainties at a solution: one elimination of the landmarks, then those entries of the inverse needed."""
+"""Formal uncertainties of a solution, from the inverse of its reduced normal equations."""
 
 from dataclasses import dataclass
 
@@ -16,38 +16,37 @@ from pancam_graph.solve._reduced import ReducedSystem, held_columns, loosened_ro
 __all__ = ["Uncertainty", "covariance_of", "uncertainty"]
 
 _LOOSER = 10.0
-"""Factor on the sigmas of priors that shows which directions depend on them."""
+"""Factor on the sigmas of priors that reveals the directions which depend on them."""
 _HELD = 10.0
-"""A direction whose variance grows by more than this then is held by priors, not by images."""
+"""Growth of variance by that factor beyond which a direction depends on priors more than on images."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Uncertainty:
-    """Formal: from the linearised system at the solution, taking noise models at their word."""
+    """Formal uncertainties: from the system linearised at the solution, with noise models as given."""
 
     stop_covariance: FloatArray
-    """(stops, 6, 6) rotation first, body frame; 0 where held"""
+    """(stops, 6, 6) of each mast pose, rotation first, radians and metres, body frame; 0 where held"""
     angle_sigma_rad: FloatArray
-    """(frames, 2); 0 where held"""
+    """(frames, 2) of pan and tilt; 0 where held"""
     landmark_covariance_m2: FloatArray | None
-    """(landmarks, 3, 3), if asked for; NaN for those that take no part"""
+    """(landmarks, 3, 3) of world points; NaN for landmarks that take no part; None: not computed"""
     undetermined: BoolArray
-    """(landmarks,) whether rays leave a direction free that the weak prior alone holds"""
+    """(landmarks,) whether its rays leave a direction undetermined that only the weak prior holds"""
     rig_sigmas: list[FloatArray] | None
-    """(entries,) of each variable of the rig; None where unknown"""
+    """(entries,) standard deviations of each variable of the rig; None where unknown"""
     unseen: tuple[str, ...] = ()
-    """Directions of the rig that images do not tell, by the entries that they consist of"""
+    """Names of directions of the rig that images do not determine, by the entries of which they consist"""
     masts: JointCovariance | None = None
-    """Of pairs of mast poses; None where unknown"""
+    """Joint covariances of pairs of mast poses; None where unknown"""
 
 
 def uncertainty(
     problem: Problem, state: State, reduced: ReducedSystem, *, landmarks: bool, unseen: bool
 ) -> Uncertainty:
-    """Covariances, everything else marginalised, from what is left of the landmarks at the problem's values.
+    """Marginal covariances at a problem's values, from its reduced system.
 
-    `landmarks` and `unseen` say whether these are wanted. Raises SolveError where a direction is held by
-    nothing.
+    `landmarks` and `unseen`: whether these are computed. Raises SolveError where a direction is undetermined.
     """
     template, m, system, rows = problem.template, problem.measurements, reduced.system, reduced.rows
     covariance = covariance_of(template, reduced)
@@ -69,24 +68,27 @@ def uncertainty(
 
 
 def _unseen(problem: Problem, reduced: ReducedSystem, covariance: Covariance) -> tuple[str, ...]:
-    """Directions of the rig of which images tell less than priors, of the rig or of telemetry.
+    """Directions of the rig that priors, of the rig or of telemetry, determine better than images.
 
-    These are the ones that become looser where all priors do. A turn of all mounts about the tilt axis, for
-    one, is to images a turn of all tilts. And those that have no prior and are all but free.
+    Their variance grows with the sigmas of all priors. An example is a common rotation of all mounts about
+    the tilt axis, which images cannot tell from a change of all tilts. Entries without a prior whose sigma is
+    far above the usual one are listed too.
     """
     template, link, free = problem.template, problem.template.linkage, problem.template.rig_variables
     loose = _inverse(template, loosened_root(problem, reduced.system, _LOOSER))
     out = []
     for g in sorted({free.group(v) for v in free.variables}):
-        own = [v for v in free.variables if free.group(v) == g]
-        columns = np.concatenate([np.arange(c.start, c.stop) for v in own for c in [link.columns_of(v.key)]])
-        names = [free.name(v, entry) for v in own for entry in v.entries]
+        of_group = [v for v in free.variables if free.group(v) == g]
+        columns = np.concatenate(
+            [np.arange(c.start, c.stop) for v in of_group for c in [link.columns_of(v.key)]]
+        )
+        names = [free.name(v, entry) for v in of_group for entry in v.entries]
         firm, wide = (c.block(g, g)[np.ix_(columns, columns)] for c in (covariance, loose))
         size = np.sqrt(np.diag(firm))
-        usual, prior = (np.concatenate([getattr(v, what) for v in own]) for what in ("usual", "sigma"))
+        usual, prior = (np.concatenate([getattr(v, what) for v in of_group]) for what in ("usual", "sigma"))
         out += [names[i] for i in np.flatnonzero(np.isinf(prior) & (size > _LOOSER * usual))]
         firm, wide = firm / np.outer(size, size), wide / np.outer(size, size)
-        # A correlation of 1 but for rounding is no reason to fail.
+        # The small diagonal keeps the matrix regular where a correlation is 1.
         ratio, functional = scipy.linalg.eigh(wide, firm + 1e-12 * np.eye(len(size)))
         for k in np.flatnonzero(ratio > _HELD)[::-1]:
             direction = np.abs(firm @ functional[:, k])
@@ -96,9 +98,9 @@ def _unseen(problem: Problem, reduced: ReducedSystem, covariance: Covariance) ->
 
 
 def covariance_of(template: FactorTemplate, reduced: ReducedSystem) -> Covariance:
-    """Covariance of a template's variables where the system was linearised; 0 where held.
+    """Marginal covariance of a template's variables at the linearisation point; 0 where held.
 
-    Raises SolveError where a direction is held by nothing.
+    Raises SolveError where a direction is undetermined.
     """
     return _inverse(template, reduced.root)
 
@@ -113,7 +115,7 @@ def _inverse(template: FactorTemplate, root: Root) -> Covariance:
 
 
 def _name(template: FactorTemplate, free: FreeDirectionError) -> str:
-    """What a column of a group is, for a user."""
+    """Name of a column of a group, for errors."""
     t, link = template.traverse, template.linkage
     for key in link.key:
         columns = link.columns_of(key)

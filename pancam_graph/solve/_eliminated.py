@@ -1,4 +1,4 @@
-"""Landmarks eliminated: Levenberg-Marquardt on the cameras' variables, landmarks follow."""
+"""The solver with landmarks eliminated: Levenberg-Marquardt on the variables of cameras."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -20,24 +20,24 @@ __all__ = ["EliminatedSolver", "Ended"]
 
 
 _FOLLOWING = 1e-4
-"""Landmarks follow the cameras where placing strays anew lowers the cost by no more than this share."""
+"""Landmarks count as settled where placing strays anew lowers the cost by at most this share."""
 
 
 class EliminatedSolver(Solver):
-    """Landmark blocks (factors/landmark_blocks.py): landmarks follow the variables of the graph."""
+    """Levenberg-Marquardt with landmark blocks (factors/landmark_blocks.py)."""
 
     def __init__(self, on_iteration: Callable[[Iteration], None] | None, *, is_near: bool = False) -> None:
-        """`is_near`: cameras start where they were given, and no rigid mast is fitted first."""
+        """`is_near`: initial cameras are good, so that no rigid mast is fitted first."""
         super().__init__(on_iteration)
         self._is_near = is_near
         self._last: Ended | None = None
 
     def approach(self, problem: Problem, rule: StopRule, loss: Loss, stage: str) -> Problem:
-        """The same as `adjust`, but for the loss: unit 4-vectors do not go astray from afar."""
+        """As `adjust`, with a robust loss: unit 4-vectors converge from poor initial values too."""
         return self._fit(problem, rule, loss, stage)[0]
 
     def adjust(self, problem: Problem, rule: StopRule) -> tuple[Problem, Outcome]:
-        """Levenberg-Marquardt; observations of landmarks behind their camera are no longer accepted."""
+        """Levenberg-Marquardt; observations of landmarks behind their camera are then rejected."""
         problem, outcome = self._fit(problem, rule, SQUARED, "solve")
         if self._last is None or not self._last.system.any_behind:
             return problem, outcome
@@ -57,20 +57,20 @@ class EliminatedSolver(Solver):
         return problem, replace(outcome, costs=costs + outcome.costs)
 
     def _from_near(self, problem: Problem, rule: StopRule, loss: Loss, stage: str) -> tuple[Problem, Outcome]:
-        """Least cost where a rigid mast is no better place to start from."""
+        """Minimise from good initial cameras, without a fit of a rigid mast."""
         return self._minimise(problem, rule, loss, stage)
 
     def _fit_rigid(self, problem: Problem, loss: Loss, stage: str) -> tuple[Problem, Outcome]:
-        """The problem with its cameras where a rigid mast fits best.
+        """The problem with its cameras at the optimum of a rigid mast.
 
-        From afar a straight step of camera poses leaves the circle on which a mast turns them, by more than
-        the sigma of a firm tie. The rigid mast has no such poses.
+        From poor initial values a linear step of camera poses leaves the circle of the mast's rotation by
+        more than the sigma of a firm tie. The rigid mast has no such poses.
         """
         rule = StopRule(max_iterations=20, relative_decrease=1e-4)
         template = problem.template
         rigid = HardTemplate(template.traverse, template.rig_variables.sharing)
-        found, outcome = self._minimise(problem.on(rigid), rule, loss, stage)
-        return found.on(problem.template), outcome
+        rigid_problem, outcome = self._minimise(problem.on(rigid), rule, loss, stage)
+        return rigid_problem.on(problem.template), outcome
 
     def _minimise(self, problem: Problem, rule: StopRule, loss: Loss, stage: str) -> tuple[Problem, Outcome]:
         template = problem.template
@@ -84,7 +84,7 @@ class EliminatedSolver(Solver):
     def _by_groups(
         self, problem: Problem, system: LandmarkSystem, rule: StopRule, stage: str
     ) -> tuple[Outcome, Root | None]:
-        """Least cost on the last group, all others eliminated: where each image has a variable of its own."""
+        """Minimise on the last group, others eliminated: for models with a variable per image."""
         joint = JointSystem(problem, system)
 
         outcome = optimise(
@@ -100,7 +100,7 @@ class EliminatedSolver(Solver):
     def _by_blocks(
         self, problem: Problem, system: LandmarkSystem, rule: StopRule, stage: str
     ) -> tuple[Outcome, Root | None]:
-        """Least cost by GTSAM on landmark blocks: where few variables move many images."""
+        """Minimise by GTSAM on landmark blocks: for models whose variables each move many images."""
         template = problem.template
         blocks = LandmarkBlocks(system, read_variable, template.posture)
         graph = gtsam.NonlinearFactorGraph(problem.factors.graph)
@@ -123,7 +123,7 @@ class EliminatedSolver(Solver):
             gain_ahead=lambda values: _gain_ahead(system, lambda: root(values)),
         )
         if blocks.settle(outcome.values):
-            joint = None  # it was that of another point
+            joint = None  # the landmarks have moved since
         return outcome, joint
 
     def _ended(
@@ -134,35 +134,37 @@ class EliminatedSolver(Solver):
         rows: IntArray,
         joint: Root | None = None,
     ) -> Problem:
-        """The problem where a fit ended; where it ended is kept as `last`."""
+        """The problem at the end of a fit, which is kept as `last`."""
         vector = problem.landmarks.vector.copy()
         vector[rows] = system.landmarks().vector
-        found = problem.at(outcome.values, replace(problem.landmarks, vector=vector))
-        self._last = Ended(problem=found, system=system, rows=rows, joint=joint)
-        return found
+        fitted = problem.at(outcome.values, replace(problem.landmarks, vector=vector))
+        self._last = Ended(problem=fitted, system=system, rows=rows, joint=joint)
+        return fitted
 
     @property
     def last(self) -> "Ended | None":
-        """Where the last fit ended; None before the first."""
+        """End of the last fit; None before the first."""
         return self._last
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Ended:
-    """Where a fit ended."""
+    """End of a fit."""
 
     problem: Problem
+    """At the optimum."""
     system: LandmarkSystem
+    """Of the observations that take part."""
     rows: IntArray
-    """The system's landmarks among all."""
+    """(n,) rows of the system's landmarks among all."""
     joint: Root | None
-    """Of the whole system at the problem's values, where the iterations ended by it; the system is
-    linearised there then."""
+    """Square root of the whole system at the problem's values, where the iterations computed it; the landmark
+    system is then linearised there."""
 
     def reduced(self) -> ReducedSystem:
-        """The problem with landmarks eliminated, linearised where the fit ended.
+        """The reduced system, linearised at the end of the fit.
 
-        Raises SolveError where a direction is held by nothing.
+        Raises SolveError where a direction is undetermined.
         """
         if self.joint is None:
             return ReducedSystem.of(self.problem, (self.system, self.rows))
@@ -170,16 +172,16 @@ class Ended:
 
 
 def _gain_ahead(system: LandmarkSystem, root: Callable[[], Root]) -> float | None:
-    """As the linearised system has it; told once landmarks follow without being placed anew."""
+    """Decrease of the linearised cost by the next step; None while strays are still placed anew."""
     if system.regained > _FOLLOWING * system.moved_cost:
         return None
     return root().gain() + system.gain_alone
 
 
 def _only_landmarks(problem: Problem, loss: Loss) -> tuple[Problem, Outcome]:
-    """Where telemetry holds every camera there are only landmarks to place."""
-    found = problem.placed(loss)
-    costs = (problem.cost(loss), found.cost(loss))
-    return found, Outcome(
+    """Optimum of the landmarks alone, where telemetry holds every camera."""
+    placed = problem.placed(loss)
+    costs = (problem.cost(loss), placed.cost(loss))
+    return placed, Outcome(
         values=problem.values, converged=True, reason="nothing but landmarks to place", costs=costs
     )

@@ -17,44 +17,45 @@ from pancam_graph.solve._stopping import StopRule
 __all__ = ["ExplicitSolver"]
 
 _WEAK_RANGE_SIGMA = 0.3
-"""A landmark whose range is known to no better than this share of it gets the weak prior."""
+"""Relative sigma of its range above which a landmark gets the weak prior."""
 _STRETCHED = 500.0
-"""A landmark this many times less certain in range than sideways is too much for GTSAM's Cholesky."""
+"""Ratio of the sigmas of a landmark in range and sideways that GTSAM's Cholesky does not bear."""
 _ROUNDS = 6
+"""Largest number of optimisations, each with the weak priors centred anew."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Weak:
-    """Landmarks whose range is all but free."""
+    """Landmarks whose range is hardly determined."""
 
     needs_prior: BoolArray
-    """(landmarks,) whether the weak prior keeps the system regular"""
+    """(landmarks,) whether it needs the weak prior for a regular system"""
     prior_m: FloatArray
-    """(landmarks,) its sigma: ten times the distance, so that it says nothing"""
+    """(landmarks,) sigma of that prior: ten times the distance, far above the information of images"""
     stretched: BoolArray
-    """(landmarks,) which are too long in range for GTSAM's Cholesky"""
+    """(landmarks,) whether its sigma in range is too large for GTSAM's Cholesky"""
     bearable_m: FloatArray
-    """(landmarks,) sigma of a prior that it bears, for steps whose landmarks are placed anew anyway"""
+    """(landmarks,) sigma of a prior that Cholesky bears, for steps after which landmarks are placed anew"""
 
 
 class ExplicitSolver(Solver):
-    """One variable `L` for each landmark: simple, slow, and independent of the eliminated solver."""
+    """Each landmark is a variable `L`: simple, slow, and independent of the eliminated solver."""
 
     def __init__(self, on_iteration: Callable[[Iteration], None] | None) -> None:
         super().__init__(on_iteration)
         self._is_near = False
 
     def approach(self, problem: Problem, rule: StopRule, loss: Loss, stage: str) -> Problem:
-        """Gauss-Newton on everything; see `_approach`."""
+        """Gauss-Newton on all variables; see `_approach`."""
         return self._approach(problem, rule, loss, stage)[0]
 
     def _approach(
         self, problem: Problem, rule: StopRule, loss: Loss, stage: str
     ) -> tuple[Problem, list[float]]:
-        """Gauss-Newton on everything, landmarks placed anew after every step.
+        """Gauss-Newton on all variables, with landmarks placed anew after every step.
 
-        Far from the optimum a landmark's linear prediction goes astray (behind a camera, beyond infinity)
-        and would hold back all others; its best place for the cameras found is what counts.
+        Far from the optimum the linear step of a landmark may lead behind a camera or beyond infinity, and
+        would shorten the steps of all others. So a step is judged with landmarks optimised for its cameras.
         """
         problem = _placed(problem, loss)
         template = _soft(problem)
@@ -91,9 +92,9 @@ class ExplicitSolver(Solver):
         return problem, costs
 
     def adjust(self, problem: Problem, rule: StopRule) -> tuple[Problem, Outcome]:
-        """Levenberg-Marquardt on everything, again while landmarks that a weak prior held have further to go.
+        """Levenberg-Marquardt on all variables, repeated while landmarks under a weak prior still move.
 
-        The first time it is approached from afar. What is behind its camera then is no longer accepted.
+        The first call begins with `approach`, and then rejects observations of landmarks behind their camera.
         """
         costs: list[float] = []
         if not self._is_near:
@@ -135,13 +136,13 @@ class ExplicitSolver(Solver):
             on_iteration=self.on_iteration,
         )
         points = np.where(present[:, None], explicit.points_m(outcome.values, present), points)
-        found = problem.at(explicit.only_cameras(outcome.values), problem.landmarks.moved_to(points))
-        if explicit.calibrations.any and not found.residuals()[1][problem.kept].all():
+        adjusted = problem.at(explicit.only_cameras(outcome.values), problem.landmarks.moved_to(points))
+        if explicit.calibrations.any and not adjusted.residuals()[1][problem.kept].all():
             raise SolveError(
                 "explicit landmarks: expected all in front of their cameras, found some behind, which "
                 "GTSAM's factor of a free calibration does not count; eliminated landmarks bear it"
             )
-        return found, outcome
+        return adjusted, outcome
 
 
 def _soft(problem: Problem) -> SoftTemplate:
@@ -150,7 +151,7 @@ def _soft(problem: Problem) -> SoftTemplate:
 
 
 def _placed(problem: Problem, loss: Loss) -> Problem:
-    """Landmarks where they fit best with the cameras as they are."""
+    """The problem with landmarks optimised for the present cameras."""
     if not problem.kept.any():
         raise SolveError("observations: expected tracks that agree in two or more images, found none")
     m, weight = problem.measurements, problem.accepted.astype(float)
@@ -158,7 +159,7 @@ def _placed(problem: Problem, loss: Loss) -> Problem:
 
 
 def _weak(problem: Problem) -> _Weak:
-    """Which landmarks are hard to hold in range, and for which the weak prior must help."""
+    """Landmarks with a poorly determined range, and those that need the weak prior."""
     m, views, points, present = problem.measurements, problem.views, problem.points_m(), problem.present
     distance = np.linalg.norm(points - problem.landmarks.origin_m, axis=1)
     sigma = point_sigma_m(points, m, views, problem.accepted)

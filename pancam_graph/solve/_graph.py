@@ -20,8 +20,8 @@ __all__ = ["build_graph", "graph_keys"]
 def graph_keys(traverse: Traverse, options: SolveOptions | None = None) -> GraphKeys:
     """Keys of masts, angles and free entries of the rig, for factors that `solve` is given and `build_graph`.
 
-    Which entries of the rig are free is what the options say, or else the traverse. Raises InputError for a
-    sharing that the model does not take.
+    The options determine the free entries of the rig, or else the traverse. Raises InputError for a sharing
+    that the model does not take.
     """
     options = options or SolveOptions()
     sharing = (options.sharing or traverse.sharing or Sharing()).for_model(options.model)
@@ -38,15 +38,16 @@ def build_graph(
     """All factors of a traverse and values to start from, for GTSAM's own optimisers.
 
     Terrain points are variables `L` (Point3), numbered as the tracks in `Solution.landmark_track`. Where
-    cameras are variables of their own (`X`, Pose3, numbered as images), the factors of observations are
-    GTSAM's projection factors; on a rigid mast they are on mast, angles and point directly
-    (`mast_projection_factor`). All other variables have the keys of `graph_keys`. What telemetry holds is a
-    variable with a constraint. Pixels are those of pinholes, carried there once: where lenses are distorted
-    and calibrations free, or pupils move, `solve` carries them again and the graph does not.
+    cameras are variables (`X`, Pose3, numbered as images), observations are GTSAM's projection factors; on a
+    rigid mast they are factors on mast, angles and point (`mast_projection_factor`). All other variables have
+    the keys of `graph_keys`. A quantity that telemetry holds is a variable with a constraint. Pixels are
+    those of pinholes, carried there once: where lenses are distorted and calibrations free, or pupils move,
+    `solve` carries them again and the graph does not.
 
-    `used` (observations,) are those to take, by least squares, as `Solution.used` has them. Default: all of
-    tracks that are seen twice or more, by the robust loss of the options, since nothing is screened; the loss
-    "none" makes it least squares. `start` gives the first stops and angles; default: telemetry's.
+    `used` (observations,) is the mask of the observations to take, by least squares, as in `Solution.used`.
+    Default: all observations of tracks with two or more, unscreened and therefore under the robust loss of
+    the options; the loss "none" gives least squares. `start` has initial mast poses and angles; default:
+    telemetry's.
 
     Raises InputError for the model `projective`, for which GTSAM has no projection factor, and as `solve`.
     """
@@ -65,7 +66,9 @@ def build_graph(
                 f"found {len(used)}"
             )
         problem, loss = screened_elsewhere(prepared, problem.values, used).problem, SQUARED
-    assert isinstance(problem.template, SoftTemplate)  # explicit landmarks have no other
+    assert isinstance(
+        problem.template, SoftTemplate
+    )  # the method with explicit landmarks has no other template
     return whole_graph(
         problem.values,
         ExplicitLandmarks(problem.template, problem.measurements),

@@ -1,11 +1,11 @@
 """A problem for GTSAM's Levenberg-Marquardt with all groups of variables but the last one eliminated.
 
-Where each image has variables of its own, GTSAM's elimination takes ten times as long as all else together.
-So groups (stops) are eliminated here, as landmarks are, with the damping that GTSAM is about to use. GTSAM
-gets the square root of the system that is left, in the columns of the last group, and decides on the damping
-and on whether to take a step. The other groups follow by back substitution. The result is the step of the
-whole system with the same damping of all variables. After each step the problem moves there, and GTSAM's
-vector begins at 0 again.
+In models with variables per image, GTSAM's elimination takes ten times as long as all other work. So groups
+(stops) are eliminated here, as landmarks are, with the damping that GTSAM is about to use. GTSAM gets the
+square root of the Schur complement, in the columns of the last group, and decides on the damping and on
+whether to take a step. The other groups follow by back substitution. The result is the step of the whole
+system with the same damping of all variables. After each step the problem moves there, and GTSAM's vector
+begins at 0 again.
 """
 
 from typing import Any
@@ -34,21 +34,23 @@ def retracted(linkage: Linkage, values: gtsam.Values, step: FloatArray) -> gtsam
     """Values after a step (columns,) of all variables, group by group."""
     vector = gtsam.VectorValues()
     for key, group in zip(linkage.key, linkage.group, strict=True):
-        own, begin = linkage.columns_of(key), int(linkage.group_column[group])
-        vector.insert(key, step[begin + own.start : begin + own.stop])
+        columns, begin = linkage.columns_of(key), int(linkage.group_column[group])
+        vector.insert(key, step[begin + columns.start : begin + columns.stop])
     return values.retract(vector)
 
 
 def all_columns(linkage: Linkage, columns: dict[int, IntArray]) -> IntArray:
-    """Columns of groups as columns of all."""
+    """Columns by group as columns (n,) among all."""
     begin = linkage.group_column
-    return np.concatenate([np.zeros(0, dtype=np.int64), *(begin[g] + own for g, own in columns.items())])
+    return np.concatenate(
+        [np.zeros(0, dtype=np.int64), *(begin[g] + in_group for g, in_group in columns.items())]
+    )
 
 
 class JointSystem:
-    """Where a problem stands, its linearisation there, and the cost elsewhere.
+    """The values of a problem, its linearisation there, and its cost at other values.
 
-    The landmarks are state of this object, as in LandmarkBlocks: it is for one optimiser at a time.
+    The landmarks are state of this object, as in LandmarkBlocks, so it serves one optimiser at a time.
     """
 
     def __init__(self, problem: Problem, system: LandmarkSystem) -> None:
@@ -57,7 +59,7 @@ class JointSystem:
         """Values of the variables at which it is linearised"""
         link = self.template.linkage
         self.last = next(g for g in reversed(system.structure.order) if link.group_dim[g])
-        """The group that is not eliminated"""
+        """Index of the group that is not eliminated"""
         self._held = all_columns(link, held_columns(self.template))
         posture = self.template.posture(self.values)
         self.cost = system.cost_at(posture) + self.factors.error(self.values)
@@ -71,51 +73,51 @@ class JointSystem:
         self._tried: tuple[FloatArray, gtsam.Values, float] | None = None
 
     def panels(self) -> Panels:
-        """The system (S, s) there, landmarks eliminated, priors and ties included."""
+        """The system (S, s) at these values, landmarks eliminated, all other factors included."""
         if self._panels is None:
             panels = self.system.linearise(self.template.posture(self.values))
             self._panels = joint_panels(self.template, self.factors, self.values, panels)
         return self._panels
 
     def root(self) -> Root:
-        """Its square root."""
+        """Square root of that system."""
         if self._root is None:
             self._root = self.panels().copy().root()
         return self._root
 
     @property
     def known_root(self) -> Root | None:
-        """`root`, where that is known already."""
+        """The value of `root` if it was computed already, else None."""
         return self._root
 
     def damped_root(self, damping: float) -> Root:
-        """The same with a damping on the diagonal of all groups but the last."""
+        """Square root with damping added to the diagonal of all groups except the last."""
         if self._damped is None or self._damped[0] != damping:
             panels = self.panels().copy()
             for g, panel in enumerate(panels.panel):
                 if g != self.last:
-                    own = np.arange(len(panel))
-                    panel[own, own] += damping
+                    diagonal = np.arange(len(panel))
+                    panel[diagonal, diagonal] += damping
             self._damped = damping, panels.root()
         return self._damped[1]
 
     def gradient(self) -> float:
-        """Largest component of the gradient there; 0 of what telemetry holds."""
+        """Largest component of the gradient at these values; held components are 0."""
         return float(np.abs(self.panels().right()).max(initial=0.0))
 
-    def cost_after(self, own: FloatArray, damping: float) -> float:
-        """The true cost after a step of the last group (columns,), the other groups and landmarks along."""
-        step = self.damped_root(damping).step(known={self.last: own})
-        step[self._held] = 0.0  # bit for bit
+    def cost_after(self, last_step: FloatArray, damping: float) -> float:
+        """True cost after a step of the last group (columns,); other groups and landmarks follow it."""
+        step = self.damped_root(damping).step(known={self.last: last_step})
+        step[self._held] = 0.0  # held values stay exactly the same
         if self._tried is None or not np.array_equal(self._tried[0], step):
             values = retracted(self.template.linkage, self.values, step)
             costs = self.system.try_step(self.template.posture(values), step)
             self._tried = step, values, float(costs.sum()) + self.factors.error(values)
         return self._tried[2]
 
-    def move(self, own: FloatArray, damping: float) -> None:
-        """Take that step."""
-        self.cost = self.cost_after(own, damping)
+    def move(self, last_step: FloatArray, damping: float) -> None:
+        """Take the step of `cost_after`."""
+        self.cost = self.cost_after(last_step, damping)
         assert self._tried is not None
         self.values = self._tried[1]
         self.system.adopt()
@@ -123,7 +125,7 @@ class JointSystem:
 
 
 class OnLastGroup:
-    """GTSAM's Levenberg-Marquardt on what is left of a joint system: an Optimiser."""
+    """GTSAM's Levenberg-Marquardt on the last group of a joint system: an Optimiser."""
 
     def __init__(self, joint: JointSystem, rule: StopRule) -> None:
         self._joint = joint
@@ -131,7 +133,7 @@ class OnLastGroup:
         self._damping = float(self._parameters.getlambdaInitial())
         self._start = gtsam.Values()
         self._start.insert(_KEY, np.zeros(int(joint.template.linkage.group_dim[joint.last]) + 1))
-        # No noise model: everything is whitened, and the number of rows is the rank found.
+        # No noise model: rows are whitened, and their number depends on the rank.
         no_noise: Any = None
         self._graph = gtsam.NonlinearFactorGraph()
         self._graph.push_back(gtsam.CustomFactor(no_noise, [_KEY], self._evaluate))
@@ -146,11 +148,11 @@ class OnLastGroup:
             return np.array([np.sqrt(2 * cost)])
         root = joint.damped_root(self._damping)
         rows = root.rows[joint.last]
-        n, own2 = len(rows), float(np.sum(rows[:, -1] ** 2))
-        others2 = 2 * root.gain() - own2
+        n, last2 = len(rows), float(np.sum(rows[:, -1] ** 2))
+        others2 = 2 * root.gain() - last2
         error, jacobian = np.zeros(n + 2), np.zeros((n + 2, rows.shape[1]), order="F")
         jacobian[:n, :-1], error[:n] = rows[:, :-1], rows[:, -1]
-        # What the others gain, and what the cost has beyond the squares of all e.
+        # Decrease by the other groups, and the part of the cost beyond the squares of all e.
         error[n] = np.sqrt(max(others2, 0.0))
         jacobian[n, -1] = error[n] / _UNIT
         error[n + 1] = np.sqrt(max(2 * (joint.cost - root.gain()), 0.0))
@@ -160,7 +162,7 @@ class OnLastGroup:
     def iterate(self) -> None:
         """Take the next step that lowers the cost.
 
-        One try of GTSAM's at a time, since what is eliminated depends on the damping.
+        GTSAM makes one trial at a time, since the elimination of the other groups depends on the damping.
         """
         while True:
             tried, parameters = self._damping, self._parameters
@@ -176,17 +178,17 @@ class OnLastGroup:
                 return
 
     def error(self) -> float:
-        """The cost where it stands."""
+        """Cost at the current values."""
         return self._joint.cost
 
     def damping(self) -> float:
-        """Lambda of the next step."""
+        """Damping (lambda) of the next step."""
         return self._damping
 
     def values(self) -> gtsam.Values:
-        """Where it stands."""
+        """Current values."""
         return self._joint.values
 
     def gradient(self) -> float:
-        """Largest component of the gradient there, but for what telemetry holds."""
+        """Largest component of the gradient at the current values, except held ones."""
         return self._joint.gradient()

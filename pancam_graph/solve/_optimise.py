@@ -28,32 +28,37 @@ __all__ = [
 
 _LOG = logging.getLogger(__name__)
 MOST_DAMPING = 1e10
-"""No step is sought with more."""
+"""Largest damping (lambda) tried for a step."""
 _INDETERMINATE = "ndeterminate"
 """Part of GTSAM's message for a system without a unique solution."""
 _FAR = 100.0
-"""While gains shrink and will end this many times above the limit, the next gain need not be worked out."""
+"""While the expected remaining gain exceeds the limit this many times, the next gain is not computed."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Iteration:
-    """What a progress display may show."""
+    """State of an iteration, for progress displays."""
 
     stage: str
     """"screening" while outliers are sought, "approach" from afar, "solve" for the final least squares."""
     number: int
+    """From 1 on."""
     cost: float
+    """After the iteration."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Outcome:
-    """Where the iterations ended."""
+    """Result of the iterations."""
 
     values: gtsam.Values
+    """At the end."""
     converged: bool
+    """Whether a rule of convergence ended the iterations."""
     reason: str
+    """Why they ended, in words."""
     costs: tuple[float, ...]
-    """After each iteration, the start first."""
+    """Cost after each iteration, preceded by the initial cost."""
 
 
 class Optimiser(Protocol):
@@ -63,16 +68,16 @@ class Optimiser(Protocol):
         """Take the next step that lowers the cost."""
 
     def error(self) -> float:
-        """The cost where it stands."""
+        """Cost at the current values."""
 
     def damping(self) -> float:
-        """Lambda of the next step."""
+        """Damping (lambda) of the next step."""
 
     def values(self) -> gtsam.Values:
-        """Where it stands; gone once it has moved on."""
+        """Current values, valid until the next iteration."""
 
     def gradient(self) -> float:
-        """Largest component of the gradient there, but for what telemetry holds."""
+        """Largest component of the gradient at the current values, except held ones."""
 
 
 class OnGraph:
@@ -85,7 +90,7 @@ class OnGraph:
         parameters: gtsam.LevenbergMarquardtParams,
         held: Mapping[int, IntArray],
     ) -> None:
-        """`held` are, by key, tangent components that the graph's factors hold."""
+        """`held` are tangent components, by key, that constraints of the graph hold."""
         self._graph, self._held = graph, held
         self._optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
 
@@ -94,21 +99,21 @@ class OnGraph:
         self._optimizer.iterate()
 
     def error(self) -> float:
-        """The cost where it stands."""
+        """Cost at the current values."""
         return float(self._optimizer.error())
 
     def damping(self) -> float:
-        """Lambda of the next step."""
+        """Damping (lambda) of the next step."""
         return float(self._optimizer.lambda_())
 
     def values(self) -> gtsam.Values:
-        """Where it stands; gone once it has moved on."""
+        """Current values, valid until the next iteration."""
         return self._optimizer.values()
 
     def gradient(self) -> float:
-        """Landmark blocks linearise here as they would in the next step, and not again then.
+        """Largest component of the gradient at the current values, except held ones.
 
-        What this costs is handing their rows over a second time.
+        Landmark blocks linearise for it, and the next step uses that linearisation again.
         """
         values = self.values()
         gradient = self._graph.linearize(values).gradientAtZero()
@@ -138,10 +143,10 @@ def optimise(
     on_iteration: Callable[[Iteration], None] | None = None,
     gain_ahead: Callable[[gtsam.Values], float | None] | None = None,
 ) -> Outcome:
-    """Iterate until a rule says so. `start` makes the optimiser, with `parameters_of` the rule.
+    """Iterate until the rule ends it. `start` makes the optimiser, with `parameters_of` the rule.
 
-    `gain_ahead` may tell by how much the next step from some values would lower the cost; None: not known,
-    and judged by the gains so far.
+    `gain_ahead` gives the decrease of cost that the next step from some values promises; None: unknown, and
+    extrapolated from the gains so far.
 
     Raises SolveError where the linear system cannot be factorised however much it is damped; an exception
     from inside a custom factor reaches the caller as it is.
@@ -160,7 +165,7 @@ def optimise(
 
         reason = vanished()
         while reason is None and len(costs) <= rule.max_iterations:
-            # A copy: what the optimiser shows is gone once it has moved on.
+            # A copy, since the optimiser's values are valid until the next iteration only.
             before = gtsam.Values(optimiser.values()) if rule.relative_step else None
             optimiser.iterate()
             costs.append(optimiser.error())
@@ -187,7 +192,7 @@ def optimise(
 
 
 def is_short(before: gtsam.Values | None, after: gtsam.Values, share: float) -> bool:
-    """Whether a step is no longer than a share of the parameters before it, if given; see StopRule."""
+    """Whether a step is at most a share of the norm of the parameters `before`, if given; see StopRule."""
     if before is None:
         return False
     length2 = 0.0
@@ -205,10 +210,10 @@ def _is_settled(
     gain_ahead: Callable[[gtsam.Values], float | None] | None,
     optimiser: Optimiser,
 ) -> bool:
-    """Whether the iterations to come would lower the cost by no more than a share of it.
+    """Whether all further iterations would lower the cost by at most a share of it.
 
-    Gains that shrink may do so because a landmark is stuck, which a later step sets free. So where the gain
-    of the next step can be told, it must be small too. It is no work lost: covariances want that system.
+    Gains may shrink because a landmark is stuck, which a later step frees. So the gain of the next step,
+    where it can be computed, must be small too; covariances need the same linearised system.
     """
     least = share * costs[-1]
     gain, shrinking = _still_to_gain(costs)
@@ -221,10 +226,10 @@ def _is_settled(
 
 
 def _still_to_gain(costs: list[float]) -> tuple[float, bool]:
-    """By how much further iterations would lower the cost, if their gains shrink as the last one did.
+    """Expected decrease of cost by further iterations, with gains that shrink as the last one did.
 
-    Gauss-Newton converges linearly where residuals are not zero, so gains shrink geometrically. Where the
-    last gain did not shrink (the second value), or there is but one, it stands for all to come.
+    Gauss-Newton converges linearly where residuals are not zero, so gains shrink geometrically. A last gain
+    that did not shrink (the second value is False), or the only one, is returned itself.
     """
     gain = costs[-2] - costs[-1]
     if len(costs) < 3 or gain <= 0:
@@ -234,7 +239,7 @@ def _still_to_gain(costs: list[float]) -> tuple[float, bool]:
 
 
 class InOrder:
-    """Cholesky in a given order of elimination."""
+    """Cholesky factorisation in a given order of elimination."""
 
     def __init__(self, keys: Sequence[int]) -> None:
         self.ordering = gtsam.Ordering()
@@ -242,7 +247,7 @@ class InOrder:
             self.ordering.push_back(key)
 
     def set_up(self, parameters: gtsam.NonlinearOptimizerParams) -> None:
-        """Make an optimiser use it."""
+        """Set the parameters of an optimiser to use it."""
         parameters.setLinearSolverType("MULTIFRONTAL_CHOLESKY")
         parameters.setOrdering(self.ordering)
 
@@ -250,9 +255,9 @@ class InOrder:
 class Elimination:
     """Factorisation and order of elimination for graphs of one structure.
 
-    GTSAM's Cholesky refuses a variable of which one direction is known 4096 times better than another: the
-    range of a far landmark, or a camera pose that a tight tie holds once its angles are eliminated. So all
-    variables but cameras and landmarks come last. QR bears more, and is three times slower.
+    GTSAM's Cholesky fails on a variable of which one direction is known 4096 times better than another: a far
+    landmark with its range, or a camera pose under a tight tie once its angles are eliminated. So all
+    variables except cameras and landmarks are eliminated last. QR is more robust, but three times slower.
     """
 
     def __init__(
@@ -264,12 +269,12 @@ class Elimination:
         self.by_qr = by_qr
 
     def set_up(self, parameters: gtsam.NonlinearOptimizerParams) -> None:
-        """Make an optimiser use it."""
+        """Set the parameters of an optimiser to use it."""
         parameters.setLinearSolverType("MULTIFRONTAL_QR" if self.by_qr else "MULTIFRONTAL_CHOLESKY")
         parameters.setOrdering(self.ordering)
 
     def step(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.VectorValues:
-        """The Gauss-Newton step of the graph at the values; by QR from where Cholesky first fails.
+        """The Gauss-Newton step of the graph at the values; by QR once Cholesky has failed.
 
         Raises SolveError where the step is not determined.
         """
@@ -287,7 +292,7 @@ class Elimination:
 
 
 def _explained(error: RuntimeError) -> Exception:
-    """GTSAM's word that a system is indeterminate, as our own; any other exception as it is."""
+    """A SolveError for GTSAM's message of an indeterminate system; any other exception itself."""
     text = str(error).strip().replace("\n", " ")
     if _INDETERMINATE not in text:
         return error

@@ -1,4 +1,4 @@
-"""The problem that every solver is given and returns, and what a solver is."""
+"""The problem of an adjustment, and the interface of its solvers."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
@@ -19,23 +19,23 @@ from pancam_graph.solve._stopping import StopRule
 __all__ = ["Problem", "Solver", "reach_m", "system_of"]
 
 _FURTHEST_PARALLAX_SIGMAS = 0.01
-"""Points are placed no further out than where their parallax is this many sigmas of a pixel."""
+"""World points are no farther than the distance where their parallax is this many sigmas of a pixel."""
 _LEAST_BASELINE_M = 2e-3
-"""Cameras that are nearer to each other count as if they were so far apart."""
+"""Least baseline of two cameras in limits of distance."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Problem:
-    """Cameras, landmarks and observations at one moment of a solve."""
+    """Variables, landmarks and observations of an adjustment at one iterate."""
 
     template: FactorTemplate
     factors: Factors
-    """On the template's variables: priors, ties, and the caller's own."""
+    """Priors, ties and the caller's factors, on the template's variables."""
     measurements: Measurements
     accepted: BoolArray
-    """(n,) measurements that are no outliers; those of landmarks with two or more of them take part"""
+    """(n,) whether a measurement is no outlier; it takes part if its landmark has two or more such"""
     values: gtsam.Values
-    """The template's variables."""
+    """Values of the template's variables."""
     landmarks: Landmarks
 
     @cached_property
@@ -45,26 +45,26 @@ class Problem:
 
     @property
     def present(self) -> BoolArray:
-        """(landmarks,) which have two accepted observations or more."""
+        """(landmarks,) whether two or more observations are accepted."""
         m = self.measurements
         return np.asarray(np.bincount(m.landmark, self.accepted, minlength=m.n_landmarks) >= 2)
 
     @property
     def kept(self) -> BoolArray:
-        """(n,) measurements that take part."""
+        """(n,) whether a measurement takes part."""
         return np.asarray(self.accepted & self.present[self.measurements.landmark])
 
     def points_m(self) -> FloatArray:
-        """World points (landmarks, 3), none further away than where parallax is lost in the noise."""
+        """World points (landmarks, 3), metres, none farther than the limit where noise hides parallax."""
         length, w = self.landmarks.length, self.landmarks.vector[:, 3]
-        # Most are nearer than any limit.
+        # Most landmarks are nearer than the least of these limits.
         beyond = length * _FURTHEST_PARALLAX_SIGMAS > w * _LEAST_BASELINE_M * _resolution(self)
         furthest = np.full(len(w), np.inf)
         furthest[beyond] = reach_m(self, beyond) / _FURTHEST_PARALLAX_SIGMAS
         return self.landmarks.points_m(furthest)
 
     def cost(self, loss: Loss = SQUARED) -> float:
-        """True cost: half the squares of priors, ties and given factors, and the loss of what takes part."""
+        """True cost: half the sum of squares of `factors`, and the loss of observations that take part."""
         residual, _ = self.residuals()
         return float(self.factors.error(self.values) + loss.cost(residual)[self.kept].sum())
 
@@ -73,13 +73,13 @@ class Problem:
         return residuals(self.landmarks, self.measurements, self.views)
 
     def placed(self, loss: Loss = SQUARED) -> "Problem":
-        """Landmarks where they fit best with the cameras as they are, be it beyond infinity."""
+        """The problem with landmarks optimised for the present cameras, beyond infinity if need be."""
         weight = self.accepted.astype(float)
         best = refine(self.landmarks, self.measurements, self.views, weight, loss, beyond_infinity=True)
         return replace(self, landmarks=best)
 
     def on(self, template: FactorTemplate) -> "Problem":
-        """The same problem on another template, with cameras as near as its variables allow."""
+        """The same problem on another template, with the nearest cameras that its variables allow."""
         values = template.values(self.template.state(self.values, np.zeros((0, 3))))
         factors = template.factors(self.factors.given, present=self.values)
         return replace(self, template=template, factors=factors, values=values)
@@ -92,7 +92,7 @@ class Problem:
 def reach_m(problem: Problem, of: BoolArray | None = None) -> FloatArray:
     """Distance where the parallax over a landmark's cameras is one sigma of a pixel.
 
-    Of the landmarks in the mask `of` (landmarks,), one after the other; of all without it.
+    `of` (landmarks,) is the mask of the landmarks wanted; default: all.
     """
     m, views = problem.measurements, problem.views
     rows = slice(None) if of is None else np.flatnonzero(of[m.landmark])
@@ -106,36 +106,36 @@ def reach_m(problem: Problem, of: BoolArray | None = None) -> FloatArray:
 
 
 def _resolution(problem: Problem) -> float:
-    """One over the angle, radians, that a sigma of a pixel is, typically."""
+    """Focal length over the typical sigma of a pixel: one over the angle, radians, of that sigma."""
     focal_px = float(np.median(problem.views.calibration[:, 0, 0]))
     return focal_px / problem.measurements.typical_sigma_px
 
 
 class Solver(ABC):
-    """A way to find the least cost of a problem."""
+    """A method that minimises the cost of a problem."""
 
     def __init__(self, on_iteration: Callable[[Iteration], None] | None) -> None:
         self.on_iteration = on_iteration
 
     def require(self, template: FactorTemplate) -> None:  # noqa: B027  most ways have nothing to ask for
-        """Raise InputError where a template lacks something that this solver needs."""
+        """Raise InputError where a template does not suit this solver."""
 
     @abstractmethod
     def approach(self, problem: Problem, rule: StopRule, loss: Loss, stage: str) -> Problem:
-        """The problem about where a robust loss is least, however far that is."""
+        """The problem near the minimum of a robust loss, from poor initial values."""
 
     @abstractmethod
     def adjust(self, problem: Problem, rule: StopRule) -> tuple[Problem, Outcome]:
-        """The problem at the least-squares optimum near by."""
+        """The problem at the least-squares optimum near its values."""
 
 
 def system_of(
     problem: Problem, loss: Loss = SQUARED, cliques: Iterable[Iterable[int]] = ()
 ) -> tuple[LandmarkSystem, IntArray]:
-    """The landmark system of what takes part, and its rows among the landmarks.
+    """The landmark system of the observations that take part, and the rows of its landmarks among all.
 
-    `cliques` are more groups of variables between which its square root is to have room. Raises SolveError
-    where nothing is left.
+    `cliques` are further sets of groups between which its square root shall have blocks. Raises SolveError
+    where no observation takes part.
     """
     m = problem.measurements
     take = problem.kept

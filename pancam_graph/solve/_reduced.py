@@ -19,14 +19,15 @@ class ReducedSystem:
     """The system in the variables of cameras at a problem's values, all factors included."""
 
     system: LandmarkSystem
-    """Linearised there."""
+    """Of the landmarks, linearised at these values."""
     rows: IntArray
-    """Its landmarks among all."""
+    """(n,) rows of its landmarks among all."""
     root: Root
+    """Square root of the system."""
 
     @staticmethod
     def of(problem: Problem, arranged: tuple[LandmarkSystem, IntArray] | None = None) -> "ReducedSystem":
-        """Linearise a problem; `arranged` is its landmark system and rows, where these are known.
+        """Linearise a problem; `arranged` is its landmark system and rows, if these exist already.
 
         Raises SolveError where no observation takes part.
         """
@@ -37,12 +38,12 @@ class ReducedSystem:
 
 
 def joint_root(template: FactorTemplate, factors: Factors, values: gtsam.Values, panels: Panels) -> Root:
-    """Square root of the system left by the landmarks, with all other factors added. Destroys the panels."""
+    """Square root of `joint_panels`. Destroys the panels."""
     return joint_panels(template, factors, values, panels).root()
 
 
 def joint_panels(template: FactorTemplate, factors: Factors, values: gtsam.Values, panels: Panels) -> Panels:
-    """The system left by the landmarks, with all other factors added in place."""
+    """Add all factors except landmarks' to the panels of the eliminated landmarks, and hold columns."""
     add_factors(panels, template.linkage, factors.linearize(values))
     panels.hold(held_columns(template))
     return panels
@@ -51,7 +52,7 @@ def joint_panels(template: FactorTemplate, factors: Factors, values: gtsam.Value
 def loosened_root(problem: Problem, system: LandmarkSystem, factor: float) -> Root:
     """The square root at a problem's values, with the sigmas of all priors multiplied by a factor.
 
-    Ties and given factors stay as they are. `system` is the problem's, and is linearised anew.
+    Ties and given factors are unchanged. `system` is the problem's, and is linearised again.
     """
     template, link, factors = problem.template, problem.template.linkage, problem.factors
     panels = system.linearise(template.posture(problem.values))
@@ -79,13 +80,13 @@ def add_factors(
         if factor is None:
             continue
         keys = factor.keys()
-        # The right-hand side comes as a last column, and is minus the residual.
+        # The last column is the right-hand side, minus the residual.
         normal = weight * factor.augmentedInformation()
         group = [int(linkage.group[linkage.row[key]]) for key in keys]
         columns = [linkage.columns_of(key) for key in keys]
         end = np.cumsum([c.stop - c.start for c in columns])
-        own = [slice(e - (c.stop - c.start), e) for c, e in zip(columns, end, strict=True)]
+        place = [slice(e - (c.stop - c.start), e) for c, e in zip(columns, end, strict=True)]
         for a in range(len(keys)):
-            panels.add_right(group[a], columns[a], -normal[own[a], -1])
+            panels.add_right(group[a], columns[a], -normal[place[a], -1])
             for b in range(a, len(keys)):
-                panels.add_block(group[a], columns[a], group[b], columns[b], normal[own[a], own[b]])
+                panels.add_block(group[a], columns[a], group[b], columns[b], normal[place[a], place[b]])
