@@ -6,9 +6,9 @@ Linearised, with A, B the whitened Jacobians of all observations by cameras and 
 
 Each group of variables (a stop) has one factor. With a square root R'R = S and R'e = s, the factor holds the
 rows of R and e that belong to its group; these are fewer than the group's columns where S is singular. All
-factors together represent S exactly. After a step dx of the variables, landmarks move by dp = -V^-1 (g + E'
-dx), and the error of a factor is the true cost of its block. So GTSAM's Levenberg-Marquardt takes the exact
-joint step of cameras and landmarks, as sparse bundle adjustment does (thesis section 3.8).
+factors together represent S exactly. Landmarks follow a step dx of the variables by dp = -V^-1 (g + E' dx),
+and the error of a factor is the true cost of its block. So GTSAM's Levenberg-Marquardt takes the exact joint
+step of cameras and landmarks, as sparse bundle adjustment does (thesis section 3.8).
 """
 
 from collections.abc import Callable, Sequence

@@ -212,7 +212,7 @@ def _root_of_panel(panel: FloatArray, summed: FloatArray) -> FloatArray:
         raise SolveError("the linearised system is not finite: a camera or a landmark has left the domain")
     scaled = panel[:, :n] * scale[:, None] * scale
     upper, pivot, rank, _ = scipy.linalg.lapack.dpstrf(scaled, tol=_RANK_TOLERANCE)
-    pivot -= 1  # LAPACK counts from 1, and takes the first pivot whatever it is
+    pivot -= 1  # LAPACK counts from 1, and never rejects the first pivot
     if np.max(np.diag(scaled), initial=0.0) <= _RANK_TOLERANCE:
         rank = 0
     rows = np.zeros((rank, panel.shape[1]))

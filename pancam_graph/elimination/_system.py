@@ -390,8 +390,8 @@ class LandmarkSystem:
         before, after = self.reduced.cost, self._moved_cost
         # A landmark whose cost hardly changes is placed as well as before, however large its cost.
         touched = np.abs(after - before) > _TOUCHED * before
-        astray = (after > _LOST * counts) | touched & (after > _STRAY * counts)
-        strays = np.flatnonzero(astray | self._refined)
+        is_stray = (after > _LOST * counts) | touched & (after > _STRAY * counts)
+        strays = np.flatnonzero(is_stray | self._refined)
         self.regained = 0.0
         if len(strays) == 0:
             return

@@ -71,7 +71,7 @@ class GivenFactor:
         """
         try:
             cost = float(self.factor.error(values))
-        except Exception as error:  # whatever a caller's function raises
+        except Exception as error:  # a caller's function may raise any
             raise SolveError(f"{self.name}: expected an error vector, found {_said(error)}") from error
         return cost if np.isfinite(cost) else _WORST
 
@@ -83,7 +83,7 @@ class GivenFactor:
         try:
             linear = self.factor.linearize(values)
             jacobian, minus_residual = linear.jacobian()
-        except Exception as error:  # whatever a caller's function raises
+        except Exception as error:  # a caller's function may raise any
             raise SolveError(f"{self.name}: expected Jacobians, found {_said(error)}") from error
         if not (np.all(np.isfinite(jacobian)) and np.all(np.isfinite(minus_residual))):
             raise SolveError(f"{self.name}: expected finite residuals and Jacobians, found NaN or infinity")
@@ -162,14 +162,14 @@ def _check(one: GivenFactor, values: gtsam.Values, dim: Mapping[int, int]) -> No
 def _called(one: GivenFactor, evaluate: Callable[[], _T]) -> _T:
     try:
         return evaluate()
-    except Exception as error:  # whatever a caller's function raises
+    except Exception as error:  # a caller's function may raise any
         raise InputError(f"{one.name}: expected an error vector, found {_said(error)}") from error
 
 
 def seated(given: GivenFactor, seats: Mapping[int, Seat]) -> gtsam.CustomFactor | None:
     """The factor on a template's variables; None where all variables of it are held.
 
-    Its cost and its linearisation are those of the caller's factor, whatever noise model that has.
+    Its cost and its linearisation are those of the caller's factor, under any noise model.
     """
     moving = [key for key in given.keys if seats[key].parts]
     template_keys = list(dict.fromkeys(k for key in moving for k, _ in seats[key].parts))

@@ -121,7 +121,7 @@ class SoftTemplate(FactorTemplate):
         return [gtsam.PriorFactorVector(slot.key, self.traverse.pan_tilt_rad[frame], diagonal_noise(sigmas))]
 
     def tie_factors(self, images: IntArray) -> FactorList:
-        """The ties of some images' camera poses to the mast, and to their circles where the model says so.
+        """The ties of some images' camera poses to the mast, in the model `circle` also to their circles.
 
         All images share one factor: single factors would take most of the time of a solve.
         """

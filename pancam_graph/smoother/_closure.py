@@ -127,7 +127,7 @@ def judged(
 def _held(station: Station, values: gtsam.Values) -> list[gtsam.NonlinearFactor]:
     """Tight priors on the variables of a station other than its mast, at their values."""
     out: list[gtsam.NonlinearFactor] = []
-    for key in station.own:
+    for key in station.own_keys:
         if key != station.mast:
             value = values.atVector(key)
             out.append(

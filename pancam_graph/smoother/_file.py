@@ -68,7 +68,7 @@ def load_smoother(path: Path) -> SmootherState:
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             arrays = {name: np.asarray(archive[name]) for name in archive.files}
         header = json.loads(arrays["header"].tobytes())
-    except Exception as error:  # whatever zipfile, NumPy and JSON raise at bytes that are not theirs
+    except Exception as error:  # zipfile, NumPy and JSON raise many kinds
         raise InputError(f"{path}: expected a saved smoother, found a damaged or other file") from error
     if not isinstance(header, dict) or header.get("format") != _FORMAT:
         raise InputError(f"{path}: format: expected {short(_FORMAT)}, found {short(_of(header, 'format'))}")

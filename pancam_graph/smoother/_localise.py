@@ -57,7 +57,7 @@ def localise(
         graph.push_back(factor)
     parameters = parameters_of(_RULE, InOrder(blocks.ordering()))
     outcome = optimise(
-        lambda: OnGraph(graph, copied(values, station.own), parameters, {}),
+        lambda: OnGraph(graph, copied(values, station.own_keys), parameters, {}),
         _RULE,
         n_observations=len(placed.measurements.row),
     )

@@ -47,4 +47,4 @@ def sample(drive: DriveMap, station: Station, rows: IntArray) -> Seen | None:
     enough = _ENOUGH_PER_IMAGE * len(station.traverse.images)
     names = names[:: max(1, len(name_of_row) // enough)]
     rows = rows[np.isin(track, names)]
-    return drive.excerpt(names, rows, station) if len(rows) and station.own else None
+    return drive.excerpt(names, rows, station) if len(rows) and station.own_keys else None

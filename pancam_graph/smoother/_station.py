@@ -36,10 +36,12 @@ class Station:
         """Number of the station from which odometry led here; -1: from none."""
         self.motion: gtsam.NonlinearFactor | None = None
         """Factor of odometry from another station, in place of the prior on the mast pose."""
-        self.own = tuple(
+        self.own_keys = tuple(
             self.global_key[k] for k, g in zip(self.link.key, self.link.group, strict=True) if g == 0
         )
-        self.shared = tuple(k for k, g in zip(self.link.key, self.link.group, strict=True) if g == 1)
+        """Keys of the variables of this stop alone."""
+        self.shared_keys = tuple(k for k, g in zip(self.link.key, self.link.group, strict=True) if g == 1)
+        """Keys of the variables that stops share."""
 
     def _global_keys(self) -> dict[int, int]:
         """Key of each variable in a template of the whole drive, by its key in this stop's template."""
@@ -183,7 +185,9 @@ class Patch:
             for s in self.stations
         ]
         self._movable = self.stations if free is None else (free,)
-        self._shared = tuple(sorted({key for s in self.stations for key in s.shared})) if free is None else ()
+        self._shared = (
+            tuple(sorted({key for s in self.stations for key in s.shared_keys})) if free is None else ()
+        )
         self.place = {s.number: i for i, s in enumerate(self.stations)}
         counts = [len(s.traverse.images) for s in self.stations]
         self.image_begin = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
@@ -197,11 +201,11 @@ class Patch:
             for s in self.stations
             for k, d in zip(s.link.key, s.link.dim, strict=True)
         }
-        keys = [*(key for s in self._movable for key in s.own), *self._shared]
+        keys = [*(key for s in self._movable for key in s.own_keys), *self._shared]
         row = {key: i for i, key in enumerate(keys)}
         # A station without variables has no group, so that groups are numbered without gaps.
-        owners = [s for s in self._movable if s.own]
-        group = [g for g, s in enumerate(owners) for _ in s.own] + [len(owners)] * len(self._shared)
+        owners = [s for s in self._movable if s.own_keys]
+        group = [g for g, s in enumerate(owners) for _ in s.own_keys] + [len(owners)] * len(self._shared)
         units, counts, variables, columns, widths, plain = [], [], [], [], [], []
         n_units = 0
         for station, taken in zip(self.stations, self._segments, strict=True):
