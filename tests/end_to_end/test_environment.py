@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[2]
 TOOLS = ("bash", "cat", "cksum", "cp", "dirname", "grep", "head", "mkdir", "rm", "sed", "sort", "tail", "tee")
 
 # A stub answers `-c CODE` by running the code in the real interpreter, which is told to be another version.
-# `-m venv` puts the stub itself into the new environment; everything else is only noted.
+# `-m venv` puts the stub into the new environment, as Python and as the command; all else is only noted.
 STUB = """#!/bin/sh
 case "$1" in
     -c) shift; code=$1; shift; exec {real} -c "import sys; sys.version_info = {version}; {also}
@@ -23,7 +23,8 @@ $code" "$@" ;;
     -m)
         echo "{dotted} $*" >> "{log}"
         case "$2 $3" in
-            "venv --clear") rm -r -f "$4" && mkdir -p "$4/bin" && cp "$0" "$4/bin/python" ;;
+            "venv --clear") rm -r -f "$4" && mkdir -p "$4/bin"
+                cp "$0" "$4/bin/python" && cp "$0" "$4/bin/pancam-graph" ;;
             "pip install") {pip} ;;
             "pytest "*) {pytest} ;;
         esac ;;
@@ -124,7 +125,7 @@ def test_takes_python3_where_it_is_promised(checkout: Checkout) -> None:
     assert "making .venv with Python 3.12.4" in done.stdout
     assert "so " not in done.stdout
     assert all(call.startswith("3.12.4") for call in checkout.calls)
-    assert any("optimize_traverse.py" in call for call in checkout.calls)
+    assert any(call.startswith("3.12.4 refine ") for call in checkout.calls)
 
 
 @pytest.mark.parametrize("dotted", ["3.10.13", "3.99.0"], ids=["too old", "too new"])
