@@ -12,11 +12,14 @@ from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 __all__ = ["modules_behind", "source_digest", "source_of"]
 
 _DOOR = "__init__.py"
+_PARSING = Lock()
+"""Held while a text is parsed: Python 3.11 confuses the depths of parsers in several threads."""
 
 
 def source_digest(*functions: Callable[..., Any], alone: Iterable[str] = ()) -> str:
@@ -73,7 +76,9 @@ def _from_statements(name: str) -> tuple[tuple[str, str, str], ...]:
     path, text = source_of(name)
     package = name if path.name == _DOOR else name.rpartition(".")[0]
     imports: list[tuple[str, str, str]] = []
-    for node in ast.walk(ast.parse(text)):
+    with _PARSING:
+        tree = ast.parse(text)
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             imports += [(alias.name, "", alias.asname or alias.name) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):

@@ -1,13 +1,18 @@
 """Which modules of a package a function runs through."""
 
+import ast
 import importlib
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from time import sleep
 from types import FunctionType
+from typing import Any
 
 import pytest
 
+from pancam_graph.base import sources
 from pancam_graph.base.sources import modules_behind, source_digest
 
 FILES = {
@@ -68,3 +73,28 @@ def test_what_the_link_or_the_wheel_calls_factors_is_found() -> None:
     behind = modules_behind(frozenset(["pancam_graph.solve._solve"]))
     assert "pancam_graph.factors.mast" in behind
     assert "pancam_graph.report._style" not in behind
+
+
+def test_threads_that_ask_at_once_get_what_one_gets(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One text is parsed at a time: Python 3.11 confuses the depths of parsers in several threads."""
+    inside, most = 0, 0
+    parse = ast.parse
+
+    def counted(*given: Any, **named: Any) -> ast.AST:
+        nonlocal inside, most
+        inside += 1
+        most = max(most, inside)
+        sleep(1e-4)  # another thread would come in here
+        tree: ast.AST = parse(*given, **named)
+        inside -= 1
+        return tree
+
+    names = [frozenset({f"pancam_graph.{room}"}) for room in ("graph", "elimination", "landmarks", "rigs")]
+    alone = [sources.modules_behind(name) for name in names]
+    for kept in (sources.modules_behind, sources._imported, sources._from_statements):
+        kept.cache_clear()
+    monkeypatch.setattr(ast, "parse", counted)
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(sources.modules_behind, names)) == alone
+    monkeypatch.undo()
+    assert most == 1
