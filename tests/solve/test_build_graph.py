@@ -23,6 +23,7 @@ from pancam_graph.base.errors import InputError
 from pancam_graph.graph import Flex
 from pancam_graph.rigs import mer_navcam
 from pancam_graph.simulate import Simulation
+from support.parameters import slow_for
 
 SMALL = SimulationOptions(stops=3, pans=3, sweep_rad=1.5, points_per_image=15)
 NEAR_M = 20.0
@@ -67,7 +68,7 @@ def by_gtsam(way: str) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     return graph, gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("way", slow_for("hard, free rig", WAYS))
 def test_gtsams_own_levenberg_marquardt_ends_at_our_optimum(way: str) -> None:
     graph, values = by_gtsam(way)
     ours, keys = solved(way), graph_keys(near(), WAYS[way])

@@ -27,6 +27,7 @@ from pancam_graph.graph import Flex
 from pancam_graph.rigs import mer_navcam
 from pancam_graph.simulate import Simulation
 from support.gtsam_factors import custom, distance_factor
+from support.parameters import slow_for
 
 SMALL = SimulationOptions(stops=2, pans=3, sweep_rad=1.5, points_per_image=15)
 NEAR_M = 20.0
@@ -74,7 +75,7 @@ def plain(way: str) -> Solution:
     return solve(near(), WAYS[way])
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("way", slow_for("alternation", WAYS))
 def test_a_measured_distance_moves_the_second_stop_as_theory_says(way: str) -> None:
     """Theory: the update of a Kalman filter, exact where all is linear."""
     t, before = near(), plain(way)
@@ -156,7 +157,7 @@ def test_angles_of_two_frames_are_tied_where_they_share_a_vector() -> None:
     assert explicit[1] - explicit[0] == pytest.approx(wanted, abs=1e-8)
 
 
-@pytest.mark.parametrize("way", ["hard", "soft", "soft, explicit", "alternation"])
+@pytest.mark.parametrize("way", slow_for("soft", ["hard", "soft", "soft, explicit", "alternation"]))
 def test_a_factor_on_the_rig_holds_it(way: str) -> None:
     t, options = near(), replace(WAYS[way], sharing=SHARED)
     key = graph_keys(t, options).calibration()

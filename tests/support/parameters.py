@@ -1,0 +1,15 @@
+"""Parameters of tests."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import pytest
+
+__all__ = ["slow_for"]
+
+
+def slow_for(slow: str, names: Iterable[str]) -> list[Any]:
+    """The names as parameters of a test, with `slow` marked so. Raises ValueError if it is no name."""
+    listed = list(names)
+    listed.index(slow)
+    return [pytest.param(name, marks=pytest.mark.slow) if name == slow else name for name in listed]
