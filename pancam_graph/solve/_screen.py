@@ -8,6 +8,7 @@ import numpy as np
 
 from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.landmarks import loss_of, refine
+from pancam_graph.solve._chance_links import chance_links
 from pancam_graph.solve._prepare import Prepared, solver_for, triangulated
 from pancam_graph.solve._problem import Problem, Solver
 from pancam_graph.solve._rejection import Snooping, snoop
@@ -18,6 +19,8 @@ __all__ = ["Screened", "ScreeningRounds", "screen", "screened_elsewhere"]
 _LOG = logging.getLogger(__name__)
 
 _ROUNDS = 12
+_CHANCE_ROUNDS = 4
+"""Second passes: each but the last may end with links that chance explains."""
 _ABOUT = 0.002
 """The first pass ends when no more than this share of the observations changes."""
 _GROSS = 3.0
@@ -73,6 +76,7 @@ class ScreeningRounds:
         self._prepared = prepared
         self._solver: Solver = solver_for(prepared.options, prepared.on_iteration, is_near=prepared.is_near)
         self.problem = prepared.problem
+        self._banned = np.zeros(len(prepared.problem.accepted), dtype=bool)
         self.set_aside = np.zeros(len(prepared.observations), dtype=bool)
 
     def from_telemetry(self) -> None:
@@ -98,13 +102,25 @@ class ScreeningRounds:
             scale, n_changed = self._round(scale, cutoff, relative_decrease=1e-3)
             if n_changed <= _ABOUT * len(self.problem.accepted):
                 break
-        self.problem = replace(self.problem, accepted=np.ones_like(self.problem.accepted))
+        for _ in range(_CHANCE_ROUNDS):
+            scale = self._second_pass(scale, cutoff)
+            by_chance = chance_links(
+                self.problem, cutoff * scale * self.problem.measurements.typical_sigma_px
+            )
+            if not by_chance.any():
+                break
+            self._banned |= by_chance
+
+    def _second_pass(self, scale: float, cutoff: float) -> float:
+        """From all observations but the grossest outliers until the same ones stay; the noise scale."""
+        self.problem = replace(self.problem, accepted=~self._banned)
         self._snoop(_GROSS * cutoff)
         for _ in range(_ROUNDS):
             before = scale
             scale, n_changed = self._round(scale, cutoff, relative_decrease=1e-6)
             if n_changed == 0 and abs(scale - before) < 1e-3 * scale:
                 break
+        return scale
 
     def _round(self, scale: float, cutoff_sigma: float, *, relative_decrease: float) -> tuple[float, int]:
         """One robust adjustment and snooping: the noise scale, and how many observations came or went."""
@@ -139,8 +155,9 @@ class ScreeningRounds:
         return snooping.scale
 
     def _adopt(self, snooping: Snooping) -> None:
-        self.problem = replace(self.problem, landmarks=snooping.landmarks, accepted=snooping.accepted)
-        self.set_aside[self.problem.measurements.row[~snooping.accepted]] = True
+        accepted = snooping.accepted & ~self._banned
+        self.problem = replace(self.problem, landmarks=snooping.landmarks, accepted=accepted)
+        self.set_aside[self.problem.measurements.row[~accepted]] = True
 
 
 def _telemetry_px(problem: Problem) -> FloatArray:

@@ -10,7 +10,7 @@ from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.landmarks import CameraViews, Measurements, rays_of, triangulate
 from pancam_graph.landmarks._landmarks import evaluate
 from pancam_graph.solve import snoop
-from pancam_graph.solve._rejection import Snooping
+from pancam_graph.solve._rejection import Snooping, pair_scale
 from support.landmark_scenes import measure, random_points, random_views, unit, views_at
 
 
@@ -210,3 +210,15 @@ def test_what_is_kept_has_residuals_within_the_noise() -> None:
     assert np.linalg.norm(residual[result.accepted], axis=1).max() < 5 * result.scale
     assert np.mean(result.accepted[~bad]) > 0.99
     assert np.mean(result.accepted[bad]) < 0.01
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4, 0.6])
+def test_the_noise_scale_of_pairs_is_that_of_the_noise_whatever_share_is_wrong(share: float) -> None:
+    rng = np.random.default_rng(11)
+    views = random_views(rng, 5)
+    m = measure(views, random_points(rng, 900), noise=rng)
+    wrong = np.flatnonzero(rng.random(len(m.row)) < share)
+    m = shifted(m, wrong, rng.uniform(-400, 400, (len(wrong), 2)))
+    claimed = m.scaled(0.5)  # half of what the noise is
+    scale = pair_scale(claimed, views, np.ones(len(m.row), dtype=bool))
+    assert scale == pytest.approx(2.0, rel=0.1)

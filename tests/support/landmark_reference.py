@@ -173,9 +173,9 @@ def screened(
     views: CameraViews,
     accepted: BoolArray,
     cutoff_sigma: float,
-    min_scale: float,
-) -> tuple[FloatArray, BoolArray, float]:
-    """Vectors, what is accepted and the noise scale; every landmark anew in every sweep."""
+    scale: float,
+) -> tuple[FloatArray, BoolArray]:
+    """Vectors and accepted measurements for a known noise scale; every landmark anew in every sweep."""
     rows = [np.flatnonzero(m.landmark == k) for k in range(m.landmark[-1] + 1)]
     vector, origin, accepted = start.vector.copy(), start.origin_m.copy(), accepted.copy()
     limit = np.append(np.inf, chi2.isf(2 * norm.sf(cutoff_sigma), [1, 2]))
@@ -185,7 +185,6 @@ def screened(
             accepted[r] = True
         if accepted[r].all():
             anew.append(k)
-    scale = min_scale
     everything = tracks(m, views)
     for sweep in range(12):
         verdicts, lost, changed = [], [], False
@@ -204,14 +203,6 @@ def screened(
             along = np.einsum("nij,ni->nj", turn, residual) ** 2
             test = np.sum(np.where(shown, along, 0.0) / np.where(shown, values, 1.0), axis=1)
             verdicts.append((test, shown.sum(1), (residual**2).sum(1), front))
-        if sweep == 0:
-            test, freedom, _, front = (np.concatenate(x) for x in zip(*verdicts, strict=True))
-            ratio = [
-                t / chi2.median(f)
-                for t, f in zip(test[accepted & front], freedom[accepted & front], strict=True)
-                if f
-            ]
-            scale = max(min_scale, float(np.sqrt(np.median(ratio))))
         for k, (test, freedom, squared, front) in enumerate(verdicts):
             before = accepted[rows[k]]
             excess = test / scale**2 - limit[freedom]
@@ -230,4 +221,4 @@ def screened(
         anew = lost
         if not changed:
             break
-    return vector, accepted, scale
+    return vector, accepted

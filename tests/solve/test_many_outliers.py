@@ -1,0 +1,90 @@
+"""Drives of which up to six tenths of the observations are wrong, and links that only seem to hold."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pancam_graph import SimulationOptions, SolveOptions, simulate, solve
+from pancam_graph.base.geometry import FloatArray
+from pancam_graph.data import Solution
+from pancam_graph.rigs import TEMPLATES
+from pancam_graph.simulate import Simulation
+from pancam_graph.solve import prepare
+from pancam_graph.solve._chance_links import chance_links
+
+DRIVE = SimulationOptions(stops=2)
+CUTOFF_PX = 4.0 * 0.3
+
+
+def errors_in_sigmas(simulation: Simulation, solution: Solution) -> tuple[FloatArray, FloatArray]:
+    """Errors of pan and tilt (frames, 2), and of the stops that are not held (stops,), in formal sigmas."""
+    angles = (solution.final.pan_tilt_rad - simulation.truth.pan_tilt_rad) / solution.angle_sigma_rad
+    stops = []
+    for pose, true, covariance in zip(
+        solution.final.world_T_mast, simulation.truth.world_T_mast, solution.stop_covariance, strict=True
+    ):
+        if covariance.any():
+            error = true.localCoordinates(pose)
+            stops.append(np.sqrt(error @ np.linalg.solve(covariance, error) / 6))
+    return angles, np.array(stops)
+
+
+def require_right(simulation: Simulation, solution: Solution) -> None:
+    angles, stops = errors_in_sigmas(simulation, solution)
+    wrong = simulation.truth.outlier
+    assert solution.converged
+    assert np.abs(angles).max() < 6
+    assert stops.max() < 3
+    assert (~solution.used[wrong]).mean() > 0.99
+    assert np.isfinite(solution.rms_final_px)
+
+
+@pytest.mark.parametrize("share", [0.4, 0.6])
+@pytest.mark.parametrize("min_views", [2, 3])
+def test_a_drive_with_given_sigmas_is_solved(share: float, min_views: int) -> None:
+    options = replace(DRIVE, outliers=share, min_views=min_views)
+    simulation = simulate(TEMPLATES["mer-navcam"](), options, seed=11)
+    require_right(simulation, solve(simulation.traverse))
+
+
+def test_a_drive_with_guessed_sigmas_is_solved() -> None:
+    simulation = simulate(TEMPLATES["mer-navcam"](), replace(DRIVE, outliers=0.6), seed=12)
+    observations = simulation.traverse.observations
+    assert observations is not None
+    guessed = replace(observations, origin="images", sigma_px=np.ones(len(observations)))
+    require_right(simulation, solve(simulation.traverse.with_observations(guessed)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rig", ["mer-navcam", "mer-pancam"])
+@pytest.mark.parametrize("stops", [1, 2, 4])
+def test_drives_are_solved_over_seeds(rig: str, stops: int) -> None:
+    for seed in range(20, 26):
+        for share in (0.33, 0.5, 0.6):
+            simulation = simulate(TEMPLATES[rig](), replace(DRIVE, stops=stops, outliers=share), seed=seed)
+            require_right(simulation, solve(simulation.traverse))
+
+
+def test_a_drive_without_outliers_has_no_link_by_chance() -> None:
+    simulation = simulate(TEMPLATES["mer-navcam"](), DRIVE, seed=3)
+    assert not chance_links(prepare(simulation.traverse, SolveOptions()).problem, CUTOFF_PX).any()
+
+
+def test_a_link_of_one_track_among_many_that_were_rejected_is_not_believed() -> None:
+    problem = prepare(simulate(TEMPLATES["mer-navcam"](), DRIVE, seed=3).traverse, SolveOptions()).problem
+    m = problem.measurements
+    frame = problem.template.traverse.image_frame[m.image]
+    sees = np.zeros((frame.max() + 1, m.n_landmarks), dtype=bool)
+    sees[frame, m.landmark] = True
+    shared = sees.astype(int) @ sees.T.astype(int)
+    np.fill_diagonal(shared, 0)
+    a, b = np.unravel_index(shared.argmax(), shared.shape)
+    # Frame b keeps, of all its tracks, those that it alone sees and one that frame a sees too.
+    alone = sees[b] & (sees.sum(axis=0) == 1)
+    link = np.flatnonzero(sees[a] & sees[b] & (sees.sum(axis=0) == 2))[0]
+    assert shared[a, b] > 50
+    accepted = (frame != b) | alone[m.landmark] | (m.landmark == link)
+    outside = chance_links(replace(problem, accepted=accepted), CUTOFF_PX)
+    assert set(m.landmark[outside]) == {link}
+    assert set(frame[outside]) < {a, b}
