@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 PAGE = Path(__file__).parents[2] / "docs" / "gtsam.md"
 
@@ -15,6 +16,8 @@ def numbers(text: str) -> list[float]:
 
 
 def test_the_code_of_the_page_prints_what_it_says() -> None:
+    if not PAGE.exists():
+        pytest.skip("no docs/gtsam.md: it is part of the repository, not of the installed package")
     text = PAGE.read_text(encoding="utf-8")
     code = "\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
     (said,) = re.findall(r"```text\n(.*?)```", text, re.DOTALL)
@@ -26,6 +29,6 @@ def test_the_code_of_the_page_prints_what_it_says() -> None:
     for line, wanted in zip(lines, expected, strict=True):
         assert np.allclose(numbers(line), numbers(wanted), atol=0.101), (line, wanted)
     # What the page claims: a distance and a receiver bring the stop nearer to the truth.
-    alone, _, sigmas, gps = (numbers(line) for line in lines[:1] + lines[1:])
+    alone, _, sigmas, gps = (numbers(line) for line in lines)
     assert sigmas[1] < sigmas[0]
     assert np.abs(gps[:2]).max() < max(2.0, np.abs(alone[:2]).max())
