@@ -4,6 +4,7 @@ import numpy as np
 import scipy
 
 from pancam_graph.base.geometry import BoolArray, IntArray
+from pancam_graph.solve._diagnose import shared_landmarks
 from pancam_graph.solve._problem import Problem
 
 __all__ = ["chance_links"]
@@ -23,8 +24,9 @@ def chance_links(problem: Problem, cutoff_px: float) -> BoolArray:
     """
     m, frame = problem.measurements, problem.template.traverse.image_frame[problem.measurements.image]
     kept = problem.kept
-    shared = _shared_tracks(problem, frame, np.ones(len(kept), dtype=bool))
-    accepted = scipy.sparse.coo_array(_shared_tracks(problem, frame, kept))
+    shape = (len(problem.template.traverse.frames), m.n_landmarks)
+    shared = shared_landmarks(shape, frame, m.landmark)
+    accepted = scipy.sparse.coo_array(shared_landmarks(shape, frame[kept], m.landmark[kept]))
     a, b = accepted.coords
     a, b, n_accepted = (column[a < b] for column in (a, b, accepted.data))
     outside = np.zeros(len(m.row), dtype=bool)
@@ -41,17 +43,6 @@ def chance_links(problem: Problem, cutoff_px: float) -> BoolArray:
         part = _parts(frame[rows].tolist(), links)
         outside[rows] = part != np.bincount(part).argmax()
     return outside
-
-
-def _shared_tracks(problem: Problem, frame: IntArray, rows: BoolArray) -> "scipy.sparse.csr_array":
-    """Number of landmarks (frames, frames) that each two frames see, by some measurements."""
-    m = problem.measurements
-    shape = (len(problem.template.traverse.frames), m.n_landmarks)
-    sees = scipy.sparse.coo_array(
-        (np.ones(int(rows.sum())), (frame[rows], m.landmark[rows])), shape=shape
-    ).tocsr()
-    sees.data[:] = 1  # a frame sees a landmark once, with however many eyes
-    return scipy.sparse.csr_array(sees @ sees.T)
 
 
 def _accident(problem: Problem, cutoff_px: float) -> float:

@@ -8,7 +8,7 @@ import scipy
 from pancam_graph.base.geometry import BoolArray, IntArray
 from pancam_graph.data import Traverse
 
-__all__ = ["components", "connection_warnings", "listed"]
+__all__ = ["components", "connection_warnings", "listed", "shared_landmarks"]
 
 _NAMED = 6
 
@@ -25,6 +25,18 @@ def components(n_members: int, member: IntArray, landmark: IntArray) -> tuple[in
     _, label = scipy.sparse.csgraph.connected_components(links, directed=False)
     names, group = np.unique(label[:n_members], return_inverse=True)
     return len(names), group
+
+
+def shared_landmarks(
+    shape: tuple[int, int], member: IntArray, landmark: IntArray
+) -> "scipy.sparse.csr_array":
+    """Number of landmarks (members, members) that each two members (images, frames or stops) see.
+
+    `member` and `landmark` (n,) are the rows of each observation; `shape` is (members, landmarks).
+    """
+    sees = scipy.sparse.coo_array((np.ones(len(member)), (member, landmark)), shape=shape).tocsr()
+    sees.data[:] = 1  # a member sees a landmark once, with however many eyes
+    return scipy.sparse.csr_array(sees @ sees.T)
 
 
 def connection_warnings(traverse: Traverse, used: BoolArray) -> list[str]:

@@ -8,7 +8,7 @@ import scipy
 from pancam_graph.base.geometry import BoolArray, IntArray
 from pancam_graph.data import Traverse
 from pancam_graph.landmarks import Measurements
-from pancam_graph.solve._diagnose import components
+from pancam_graph.solve._diagnose import components, shared_landmarks
 from pancam_graph.solve._problem import Problem
 
 __all__ = ["Groups", "neighbours", "random_half", "upper_half"]
@@ -95,11 +95,7 @@ def neighbours(traverse: Traverse, problem: Problem) -> tuple[IntArray, IntArray
     """
     m, kept, n = problem.measurements, problem.kept, len(traverse.frames)
     frame = traverse.image_frame[m.image[kept]]
-    sights = scipy.sparse.coo_array(
-        (np.ones(len(frame)), (frame, m.landmark[kept])), shape=(n, m.n_landmarks)
-    ).tocsr()
-    sights.data[:] = 1  # a frame sees a landmark once, with however many eyes
-    shared = scipy.sparse.coo_array(sights @ sights.T)
+    shared = scipy.sparse.coo_array(shared_landmarks((n, m.n_landmarks), frame, m.landmark[kept]))
     i, j = shared.coords
     of_one_stop = (traverse.frame_stop[i] == traverse.frame_stop[j]) & (i < j)
     i, j, count = i[of_one_stop], j[of_one_stop], shared.data[of_one_stop]
