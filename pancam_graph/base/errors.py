@@ -3,11 +3,21 @@
 The text of an error says where (file and entry), what was expected and what was found.
 """
 
+from pancam_graph.base.text import shortened, visible
+
 __all__ = ["CameraError", "GeometryError", "ImageError", "InputError", "PancamGraphError", "SolveError"]
 
 
 class PancamGraphError(Exception):
-    """Base of everything that this package raises on purpose."""
+    """Base of everything that this package raises on purpose.
+
+    Its text quotes files and names of the user's: it is one line that prints, of 1000 characters at most. The
+    whole is in `args`.
+    """
+
+    def __str__(self) -> str:
+        """The sentence."""
+        return shortened(visible(super().__str__()))
 
 
 class InputError(PancamGraphError):

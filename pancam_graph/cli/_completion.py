@@ -2,7 +2,7 @@
 
 from pancam_graph.cli._command import Command, Invocation
 from pancam_graph.cli._parser import CommandParser, LateChoice, Parser
-from pancam_graph.cli._streams import write
+from pancam_graph.cli._streams import must_write
 
 __all__ = ["COMPLETION"]
 
@@ -27,7 +27,7 @@ def _work(call: Invocation) -> int:
 
     program = call.make_program()
     _look_choices_up(program)
-    write("stdout", shtab.complete(program, call.arguments.shell))
+    must_write(shtab.complete(program, call.arguments.shell))
     return 0
 
 

@@ -9,8 +9,9 @@ from types import FrameType
 from typing import NoReturn
 
 from pancam_graph.base.errors import PancamGraphError
+from pancam_graph.base.text import shortened
 from pancam_graph.cli._fault import write_fault_report
-from pancam_graph.cli._streams import flush_all, silence, write
+from pancam_graph.cli._streams import flush_all, ready_streams, silence, write
 
 __all__ = ["BAD_INPUT", "INTERRUPTED", "run", "status_of"]
 
@@ -29,6 +30,11 @@ def status_of(main: Callable[[], int]) -> int:
     2 for bad input, for too little memory, and for a fault of the program itself, of which a full report is
     written into the temporary folder; 130 for Ctrl-C and for SIGTERM; else what the program returns.
     """
+    with ready_streams():
+        return _status_of(main)
+
+
+def _status_of(main: Callable[[], int]) -> int:
     try:
         with _sigterm_as_interrupt():
             status = main()
@@ -38,7 +44,7 @@ def status_of(main: Callable[[], int]) -> int:
         silence("stdout")
         status = BAD_INPUT
     except (PancamGraphError, OSError) as error:
-        write("stderr", str(error).strip())
+        write("stderr", shortened(str(error).strip()))
         status = BAD_INPUT
     except KeyboardInterrupt as interrupt:
         write("stderr", str(interrupt) or "interrupted; nothing was written")

@@ -10,6 +10,7 @@ from importlib import metadata
 from pathlib import Path
 
 from pancam_graph import __version__
+from pancam_graph.base.text import visible
 
 __all__ = ["write_fault_report"]
 
@@ -59,7 +60,7 @@ def _report(error: BaseException) -> str:
         "",
         *(line.rstrip("\n") for line in traceback.format_exception(error)),
     ]
-    return "\n".join(lines) + "\n"
+    return visible("\n".join(lines), lines=True) + "\n"
 
 
 def _version(name: str) -> str:

@@ -6,15 +6,29 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from pancam_graph import __version__
 from pancam_graph.base.errors import InputError
-from pancam_graph.cli._streams import write
+from pancam_graph.base.text import visible
+from pancam_graph.cli._streams import is_terminal, write
 
 __all__ = ["check_log_outside", "logged", "show_log"]
 
 _LOG = logging.getLogger(__name__)
 _FIRST_LINE = "# log of pancam-graph"
+
+
+class _Lines(logging.Formatter):
+    """Messages as one line each that prints; a traceback has lines of its own."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        """The line of a message."""
+        return visible(super().formatMessage(record))
+
+    def formatException(self, ei: Any) -> str:
+        """The lines of a traceback."""
+        return visible(super().formatException(ei), lines=True)
 
 
 class _ToStandardError(logging.Handler):
@@ -72,12 +86,13 @@ def check_log_outside(file: Path | None, out: Path) -> None:
 
 
 def _standard_error() -> logging.Handler:
-    if sys.stderr is not None and sys.stderr.isatty():
-        from rich.console import Console
+    if is_terminal("stderr"):
         from rich.logging import RichHandler
 
-        shown: logging.Handler = RichHandler(console=Console(stderr=True), level=logging.INFO)
-        shown.setFormatter(logging.Formatter("%(message)s"))
+        from pancam_graph.cli._terminal import Terminal
+
+        shown: logging.Handler = RichHandler(console=Terminal(stderr=True), level=logging.INFO)
+        shown.setFormatter(_Lines("%(message)s"))
         return shown
     return _ToStandardError(level=logging.INFO)
 
@@ -97,5 +112,5 @@ def _in_file(file: Path) -> logging.Handler:
         reason = getattr(error, "strerror", None) or str(error)
         raise InputError(f"{expected}, found a place that cannot be written to ({reason})") from error
     handler.setLevel(logging.DEBUG)
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    handler.setFormatter(_Lines("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     return handler

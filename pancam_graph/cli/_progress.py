@@ -1,7 +1,6 @@
 """Progress of long work: events, and the ways to show them on standard error."""
 
 import json
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -9,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, Protocol
 
-from pancam_graph.cli._streams import write
+from pancam_graph.cli._streams import is_terminal, write
 
 if TYPE_CHECKING:
     from rich.status import Status
@@ -82,15 +81,18 @@ class TerminalLine:
 
     def begin(self) -> None:
         """Show the line, still without words."""
-        from rich.console import Console
+        from pancam_graph.cli._terminal import Terminal
 
-        self._status = Console(stderr=True).status("")
+        terminal = Terminal(stderr=True)
+        self._status = terminal.status("", spinner="dots" if terminal.encoding.startswith("utf") else "line")
         self._status.start()
 
     def show(self, event: Event) -> None:
         """Change the line."""
+        from pancam_graph.cli._terminal import words
+
         if self._status is not None:
-            self._status.update(event.text)
+            self._status.update(words(event.text))
 
     def end(self) -> None:
         """Take the line away."""
@@ -156,7 +158,7 @@ def display_for(way: Literal["auto", "json"] = "auto", *, quiet: bool = False) -
         return JsonLines()
     if quiet:
         return NoDisplay()
-    return TerminalLine() if sys.stderr is not None and sys.stderr.isatty() else PlainLines()
+    return TerminalLine() if is_terminal("stderr") else PlainLines()
 
 
 class Progress:

@@ -1,14 +1,17 @@
 """What a solve did, in a few lines."""
 
-import sys
+import math
 from collections import Counter
 
 import numpy as np
 
-from pancam_graph.cli._streams import write
+from pancam_graph.cli._streams import is_terminal, write
 from pancam_graph.data import CrossValidation, Solution
 
 __all__ = ["print_summary"]
+
+_UNDEFINED = "undefined"
+"""The RMS of residuals of which one has no pixel, as of a point behind its camera at the start."""
 
 
 def print_summary(solution: Solution, where: str, *, quiet: bool = False) -> None:
@@ -20,7 +23,7 @@ def print_summary(solution: Solution, where: str, *, quiet: bool = False) -> Non
     warnings = solution.warnings
     if solution.cross_validation is not None:
         warnings = (*warnings, *solution.cross_validation.warnings)
-    if not quiet and sys.stdout is not None and sys.stdout.isatty():
+    if not quiet and is_terminal("stdout"):
         _print_table(solution, where, warnings)
         return
     if not quiet:
@@ -33,33 +36,38 @@ def print_summary(solution: Solution, where: str, *, quiet: bool = False) -> Non
 
 def _one_line(solution: Solution, where: str) -> str:
     used, total = int(solution.used.sum()), len(solution.used)
-    return (
-        f"{'converged' if solution.converged else 'NOT converged'}: RMS {solution.rms_initial_px:.3f} -> "
-        f"{solution.rms_final_px:.3f} px over {used} of {total} observations; {where}"
-    )
+    initial, final = (_number(x) for x in (solution.rms_initial_px, solution.rms_final_px))
+    state = "converged" if solution.converged else "NOT converged"
+    rms = f"{initial} -> {final} px" if initial != _UNDEFINED else f"{final} px (at the start {initial})"
+    return f"{state}: RMS {rms} over {used} of {total} observations; {where}"
 
 
 def _print_table(solution: Solution, where: str, warnings: tuple[str, ...]) -> None:
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console()
+    from pancam_graph.cli._terminal import print_on_terminal, words
+
     table = Table(title=solution.traverse.name or None, title_justify="left")
     for column in ("", "before", "after"):
         table.add_column(column, justify="right" if column else "left")
     table.add_row(
-        "RMS of the residuals, px", f"{solution.rms_initial_px:.3f}", f"{solution.rms_final_px:.3f}"
+        "RMS of the residuals, px", _number(solution.rms_initial_px), _number(solution.rms_final_px)
     )
     table.add_row("cost", f"{solution.cost_initial:.6g}", f"{solution.cost_final:.6g}")
     table.add_row("observations", f"{len(solution.used)}", f"{int(solution.used.sum())} used")
-    console.print(table)
-    state = "converged" if solution.converged else "[bold red]not converged[/]"
-    console.print(f"{state}: {solution.stop_reason}; {solution.seconds.solve:.1f} s")
-    for line in _lines_below(solution):
-        console.print(line, highlight=False)
-    for warning in warnings:
-        console.print(f"[yellow]warning[/] {warning}", highlight=False)
-    console.print(f"results in [bold]{where}[/]", highlight=False)
+    state = "converged" if solution.converged else ("not converged", "bold red")
+    print_on_terminal(
+        table,
+        words(state, f": {solution.stop_reason}; {solution.seconds.solve:.1f} s"),
+        *_lines_below(solution),
+        *(words(("warning", "yellow"), f" {warning}") for warning in warnings),
+        words("results in ", (where, "bold")),
+    )
+
+
+def _number(value: float) -> str:
+    """A number of pixels; in words where observations that are used had no pixel there."""
+    return f"{value:.3f}" if math.isfinite(value) else _UNDEFINED
 
 
 def _lines_below(solution: Solution) -> tuple[str, ...]:

@@ -26,6 +26,7 @@ import numpy as np
 
 from pancam_graph.base.errors import ImageError, InputError
 from pancam_graph.base.geometry import FloatArray, IntArray, wrap_angle
+from pancam_graph.base.text import visible
 from pancam_graph.data import Frame, Image, Stop, Traverse
 from pancam_graph.io._input_format import InputFormat
 from pancam_graph.io._pds_image import LabelledImage, read_labelled_image
@@ -123,16 +124,16 @@ def read_pds(folder: Path | str) -> Traverse:
         fit.rig(f"{kinematics.name}-pds"),
         pointing_sigma=sigma,
         mast_height_m=kinematics.mast_height_m,
-        source=f"PDS labels of {folder.resolve().name}; {kinematics.source}",
+        source=f"PDS labels of {visible(folder.resolve().name)}; {kinematics.source}",
     )
     return Traverse(
-        name=folder.resolve().name,
+        name=visible(folder.resolve().name),
         rig=rig,
         stops=stops,
         frames=tuple(frames[r] for r in order),
         images=tuple(
             Image(
-                id=image.label.file.stem,
+                id=visible(image.label.file.stem),  # a name that is no text has no place in results
                 frame=frame_ids[frame_of[i]],
                 camera=eye_names[eye_of[i]],
                 file=image.label.file.name,

@@ -7,6 +7,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 import numpy as np
 
 from pancam_graph.base.errors import ImageError, InputError, PancamGraphError
+from pancam_graph.base.text import visible
 from pancam_graph.base.whole_files import whole_file
 from pancam_graph.data import Frame, Image, Observations, Stop, Traverse
 from pancam_graph.io._entries import TRAVERSE_FORMAT, VERSION, PoseEntry
@@ -134,7 +135,7 @@ def traverse_of(entries: TraverseFile, folder: Path, observations: Observations 
         for i, s in enumerate(entries.stops)
     )
     return Traverse(
-        name=entries.name if entries.name is not None else folder.resolve().name,
+        name=entries.name if entries.name is not None else visible(folder.resolve().name),
         rig=entries.rig.rig(),
         stops=stops,
         frames=tuple(Frame(**f.model_dump()) for f in entries.frames),

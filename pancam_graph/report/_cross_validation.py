@@ -1,11 +1,11 @@
 """The section of a cross-validation: formal and honest sigmas, and how halves fit each other."""
 
 from collections.abc import Iterator
-from html import escape
 
 import numpy as np
 
 from pancam_graph.data import CrossValidation, Sigmas, Traverse
+from pancam_graph.report._escaped import escape
 from pancam_graph.report._numbers import fixed
 from pancam_graph.report._tables import table
 

@@ -3,12 +3,12 @@
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 
 import numpy as np
 
 from pancam_graph.base.geometry import FloatArray, pose_arrays
+from pancam_graph.report._escaped import escape
 from pancam_graph.report._look import AFTER, BEFORE, REJECTED, axis, layout
 from pancam_graph.report._map import ellipse_outlines, translation_covariance_in_world
 from pancam_graph.report._numbers import Json, polyline, rounded

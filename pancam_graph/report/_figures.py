@@ -1,11 +1,10 @@
 """Plain diagrams: the residuals' histogram, and the corrections of pan and tilt."""
 
-from html import escape
-
 import numpy as np
 
 from pancam_graph.base.geometry import FloatArray, wrap_angle
 from pancam_graph.data import Solution
+from pancam_graph.report._escaped import escape
 from pancam_graph.report._look import AFTER, BEFORE, GRID, INK, MUTED, Figure, axis, layout
 from pancam_graph.report._numbers import Json, fixed, lengths, rounded, short
 

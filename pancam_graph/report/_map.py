@@ -1,11 +1,10 @@
 """The map: stops with their uncertainty ellipses, viewing directions and landmarks from above."""
 
-from html import escape
-
 import numpy as np
 
 from pancam_graph.base.geometry import FloatArray, pose_arrays
 from pancam_graph.data import Solution
+from pancam_graph.report._escaped import escape
 from pancam_graph.report._look import AFTER, BEFORE, INK, RESIDUAL_SCALE, Figure, axis, layout
 from pancam_graph.report._numbers import Json, decimals_for, polyline, round_factor, rounded, short, thinned
 from pancam_graph.report._scene import near_spacing

@@ -1,8 +1,7 @@
 """The section on matching: how many matches were refused, and why."""
 
-from html import escape
-
 from pancam_graph.data import Matching, Traverse
+from pancam_graph.report._escaped import escape
 from pancam_graph.report._numbers import fixed
 from pancam_graph.report._tables import table
 

@@ -1,10 +1,10 @@
 """Mosaics in the page: the picture of one place with each pointing, shown in turn or faded by a slider."""
 
 import base64
-from html import escape
 from itertools import groupby
 
 from pancam_graph.mosaic import Blink, WrittenMosaics
+from pancam_graph.report._escaped import escape
 
 __all__ = ["mosaic_section"]
 

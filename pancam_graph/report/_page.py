@@ -1,11 +1,11 @@
 """The page: introduction, headline figures, and all sections put together in one file."""
 
 import json
-from html import escape
 
 from pancam_graph.data import Solution
 from pancam_graph.mosaic import WrittenMosaics
 from pancam_graph.report._cross_validation import cross_validation_section
+from pancam_graph.report._escaped import escape
 from pancam_graph.report._figures import make_corrections, make_histogram
 from pancam_graph.report._images import image_residuals, vector_panels
 from pancam_graph.report._look import AFTER, BEFORE, REJECTED, Figure, axis, layout

@@ -1,12 +1,12 @@
 """The 3D scene: masts, the circles on which their eyes run, camera frustums and landmarks."""
 
 from dataclasses import dataclass
-from html import escape
 
 import numpy as np
 
 from pancam_graph.base.geometry import FloatArray, IntArray, pose_arrays
 from pancam_graph.data import Solution
+from pancam_graph.report._escaped import escape
 from pancam_graph.report._look import EYES, GRID, INK, RESIDUAL_SCALE, Figure, layout
 from pancam_graph.report._numbers import Json, decimals_for, polyline, round_factor, rounded, short, thinned
 from pancam_graph.report._shown_terrain import ShownTerrain

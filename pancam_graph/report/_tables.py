@@ -1,13 +1,13 @@
 """Tables of images and stops, as HTML that is read without any script."""
 
 from collections.abc import Sequence
-from html import escape
 
 import gtsam
 import numpy as np
 
 from pancam_graph.base.geometry import pose_arrays
 from pancam_graph.data import Solution
+from pancam_graph.report._escaped import escape
 from pancam_graph.report._images import ImageResiduals
 from pancam_graph.report._map import translation_covariance_in_world
 from pancam_graph.report._numbers import fixed

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pancam_graph.base.geometry import FloatArray
+from pancam_graph.base.text import table_cell
 from pancam_graph.data import Solution
 from pancam_graph.results._output import OutputWriter, Written
 
@@ -26,8 +27,8 @@ COLUMNS = (
     "used",
     "reason",
 )
-"""`image` is the image's id; du and dv are projected minus measured, empty where undefined; `used` is 1 or 0;
-`reason` says why an observation was not used."""
+"""`image` is the image's id as `table_cell` writes it; du and dv are projected minus measured, empty where
+undefined; `used` is 1 or 0; `reason` says why an observation was not used."""
 
 
 COVARIANCE_COLUMNS = ("cov_uu_px2", "cov_uv_px2", "cov_vv_px2")
@@ -42,7 +43,7 @@ def residuals_csv(solution: Solution) -> bytes:
     writer.writerow(COLUMNS if covariance is None else COLUMNS + COVARIANCE_COLUMNS)
     observations = solution.traverse.observations
     if observations is not None:
-        ids = [i.id for i in solution.traverse.images]
+        ids = [table_cell(i.id) for i in solution.traverse.images]
         columns: list[Iterable[object]] = [
             [ids[row] for row in observations.image.tolist()],
             observations.track.tolist(),
