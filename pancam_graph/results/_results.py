@@ -47,7 +47,8 @@ def check_out(out: Path | str) -> None:
                 )
             parent = target.parent
     except (OSError, RuntimeError, ValueError) as error:  # a name too long, a ring of links, a NUL
-        raise InputError(f"{expected}, found a path that cannot be used ({error})") from error
+        reason = getattr(error, "strerror", None) or error  # without the path, which stands in front
+        raise InputError(f"{expected}, found a path that cannot be used ({reason})") from error
     if not parent.is_dir():
         raise InputError(f"{expected}, found a file in its place: {parent}")
     if not os.access(parent, os.W_OK | os.X_OK):
