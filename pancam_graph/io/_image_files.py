@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pancam_graph.base.errors import ImageError
+from pancam_graph.base.regular_files import instead_of_file
 from pancam_graph.io._pds_samples import read_pds_image, read_samples
+from pancam_graph.io._picture_size import PICTURE_FORMATS, WantedSize, picture_size, require_size
 
 __all__ = ["GreyImage", "ImageContent", "read_content", "read_image"]
 
@@ -35,25 +37,32 @@ def read_image(path: Path) -> GreyImage:
 
     A file that ends in .img or .IMG is read through its PDS3 label (attached, or a .LBL beside it):
     integers of 8 or 16 bits in either byte order; negative samples, and those that the label calls missing or
-    invalid, become 0. Anything else is left to OpenCV (PNG, TIFF, JPEG, PGM and more), without turning or
-    stretching. Colour becomes luma; an alpha channel is left out. Pixel [0, 0] is the top left one.
+    invalid, become 0. Anything else is left to OpenCV (PNG, TIFF, JPEG, PGM, BMP, WebP, JPEG 2000), without
+    turning or stretching. Colour becomes luma; an alpha channel is left out. Pixel [0, 0] is the top left
+    one.
 
-    Raises ImageError for a file that is missing, unreadable, truncated, or not of 8 or 16 bits.
+    Raises ImageError for a file that is missing, no regular file, unreadable, truncated, of more than
+    `MAX_PIXELS` by its header, or not of 8 or 16 bits.
     """
     return read_content(path).samples
 
 
-def read_content(path: Path) -> ImageContent:
-    """Read an image as `read_image` does, and what else its file says."""
-    if not path.is_file():
-        raise ImageError(f"{path}: expected an image file, found {'a folder' if path.is_dir() else 'none'}")
+def read_content(path: Path, wanted: WantedSize | None = None) -> ImageContent:
+    """Read an image as `read_image` does, and what else its file says.
+
+    A file that is not of the wanted size by its header is refused before anything is decoded.
+    """
+    other = instead_of_file(path)
+    if other is not None:
+        raise ImageError(f"{path}: expected an image file, found {other}")
     if path.suffix.lower() == ".img":
-        return _read_pds(path)
-    return _read_with_opencv(path)
+        return _read_pds(path, wanted)
+    return _read_with_opencv(path, wanted)
 
 
-def _read_pds(path: Path) -> ImageContent:
+def _read_pds(path: Path, wanted: WantedSize | None) -> ImageContent:
     image = read_pds_image(path)
+    require_size(path, (image.layout.width_px, image.layout.height_px), wanted)
     samples = read_samples(image)
     if samples.shape[0] == 1:
         return ImageContent(samples=_unsigned(samples[0]), colour=False, host=image.host)
@@ -71,18 +80,22 @@ def _unsigned(samples: NDArray[Any]) -> GreyImage:
     return positive.astype(np.uint8) if samples.dtype.itemsize == 1 else positive.astype(np.uint16)
 
 
-def _read_with_opencv(path: Path) -> ImageContent:
+def _read_with_opencv(path: Path, wanted: WantedSize | None) -> ImageContent:
     try:
         data = path.read_bytes()
     except OSError as error:
         raise ImageError(f"{path}: expected an image file, could not read it: {error.strerror}") from error
     _require_whole(path, data)
-    image = _decode(data)
+    size = picture_size(data)
+    if size is not None:
+        require_size(path, size, wanted)
+    image = None if size is None else _decode(data)
     if image is None:
         raise ImageError(
-            f"{path}: expected an image that OpenCV reads (PNG, TIFF, JPEG, PGM), found {len(data)} bytes "
-            "that are none"
+            f"{path}: expected an image that can be read ({PICTURE_FORMATS}), found {len(data)} bytes that "
+            "are none"
         )
+    require_size(path, (image.shape[1], image.shape[0]), wanted)  # a header may not agree with what follows
     if image.dtype not in {np.dtype(np.uint8), np.dtype(np.uint16)}:
         raise ImageError(f"{path}: expected samples of 8 or 16 bits, found {image.dtype}")
     colour = False

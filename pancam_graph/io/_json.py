@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import pydantic
 
 from pancam_graph.base.errors import InputError, PancamGraphError
+from pancam_graph.base.regular_files import instead_of_file
 
 __all__ = ["entry_name", "prefixed", "read_bytes", "read_json", "refused_by_schema", "short", "validated"]
 
@@ -71,10 +72,10 @@ def prefixed(where: object) -> Iterator[None]:
 
 def read_bytes(path: Path) -> bytes:
     """Content of a file. Raises InputError saying why it cannot be read."""
+    other = instead_of_file(path)
+    if other is not None:
+        raise InputError(f"{path}: expected a file, found {other}")
     try:
-        if not path.is_file():  # reading from a pipe would wait for ever
-            found = "something else" if path.exists() else "nothing there"
-            raise InputError(f"{path}: expected a file, found {'a folder' if path.is_dir() else found}")
         return path.read_bytes()
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error

@@ -8,7 +8,8 @@ import numpy as np
 from pancam_graph.base.errors import ImageError
 from pancam_graph.base.geometry import BoolArray, wrap_angle
 from pancam_graph.data import Traverse
-from pancam_graph.io._image_files import read_image
+from pancam_graph.io._image_files import read_content
+from pancam_graph.io._picture_size import WantedSize
 
 __all__ = ["MASKS", "mask_file", "read_mask"]
 
@@ -24,7 +25,9 @@ def mask_file(traverse: Traverse, row: int) -> Path | None:
 
     In the folder `masks`, these are looked for in turn, in any format that images have: IMAGE (the image's
     id), CAMERA_panP_tiltT (the camera's name and a pointing in degrees, within half a degree of the image's),
-    CAMERA.
+    CAMERA. Whatever has such a name is the mask, a pipe or a link to nothing too, which `read_mask` refuses:
+    a mask that is passed over would let in what it covers. For the same reason raises ImageError for a
+    `masks` that is there and cannot be listed.
     """
     if traverse.folder is None:
         return None
@@ -33,9 +36,12 @@ def mask_file(traverse: Traverse, row: int) -> Path | None:
         return traverse.folder / image.mask
     folder = traverse.folder / MASKS
     try:
-        masks = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
-    except OSError:
-        return None
+        masks = sorted(p for p in folder.iterdir() if not p.name.startswith("."))
+    except OSError as error:
+        if not (folder.exists() or folder.is_symlink()):
+            return None
+        reason = error.strerror or str(error)
+        raise ImageError(f"{folder}: expected a folder of masks, found: {reason}") from error
     frame = traverse.frames[traverse.image_frame[row]]
     exact = [p for p in masks if p.stem == image.id]
     pointed = []
@@ -56,10 +62,6 @@ def read_mask(path: Path, width_px: int, height_px: int, image: str) -> BoolArra
     Raises ImageError as `read_image` does, and for a mask of another size than the image, which `image`
     names.
     """
-    mask = read_image(path)
-    if mask.shape != (height_px, width_px):
-        raise ImageError(
-            f"{path}: expected a mask of {width_px} x {height_px} pixels as of image {image}, "
-            f"found {mask.shape[1]} x {mask.shape[0]}"
-        )
+    words = f"a mask of {width_px} x {height_px} pixels as of image {image}"
+    mask = read_content(path, WantedSize(width_px=width_px, height_px=height_px, words=words)).samples
     return np.asarray(mask > (0 if mask.max() <= 1 else np.iinfo(mask.dtype).max // 2))

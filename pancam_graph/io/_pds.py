@@ -24,11 +24,12 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from pancam_graph.base.errors import ImageError, InputError
+from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray, IntArray, wrap_angle
 from pancam_graph.base.text import visible
 from pancam_graph.data import Frame, Image, Stop, Traverse
 from pancam_graph.io._input_format import InputFormat
+from pancam_graph.io._pds_exposures import one_of_each_exposure
 from pancam_graph.io._pds_image import LabelledImage, read_labelled_image
 from pancam_graph.io._pictures import left_out
 from pancam_graph.rigs import MastKinematics, ReferenceSigma, RigFit, RigFitOptions, fit_rig
@@ -76,27 +77,29 @@ LOCALISATION_SIGMA = LocalisationSigma()
 def read_pds(folder: Path | str) -> Traverse:
     """Read all *.IMG files of a folder, with PDS3 labels attached or in a .LBL beside each.
 
-    The traverse has no observations yet: they are to be found in its images. Its warnings say where the
-    rig misses a label's camera by more than 0.1 mm or 0.1 mrad, and where labels of one stop disagree.
+    The traverse has no observations yet: they are to be found in its images. Of several products of one
+    exposure the best is used (`one_of_each_exposure`). Files that cannot be used are left out: no regular
+    file, shorter than the label says, without a label or an entry of it (camera model, rover pose, mast
+    angles), of a camera that is not on the mast. Warnings say what was left out, where the rig misses a
+    label's camera by more than 0.1 mm or 0.1 mrad, and where labels of one stop disagree.
 
-    Raises InputError naming file and entry for a folder without .IMG files, a label that is missing, no
-    label, or without an entry (camera model, rover pose, mast angles), a camera that is not on the mast,
-    images of two rovers or two site frames, and ImageError if all files are shorter than their labels say.
-    If only some are, they are left out with a warning.
+    Raises InputError naming file and entry for a folder without .IMG files, for images of two rovers or two
+    site frames, and, where no file can be used, for the first of them.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of rover images, found {_kind(folder)}")
-    files = sorted(f for f in folder.iterdir() if f.suffix.lower() == ".img" and f.is_file())
+    files = sorted(f for f in folder.iterdir() if f.suffix.lower() == ".img")
     if not files:
         raise InputError(f"{folder}: expected images with PDS labels (*.IMG), found none")
-    images, unusable = list[LabelledImage](), dict[str, ImageError]()
+    products, unusable = list[LabelledImage](), dict[str, InputError]()
     for file in files:
-        _add_image(file, images, unusable)
-    if not images:
+        _add_image(file, products, unusable)
+    if not products:
         raise next(iter(unusable.values()))
-    kinematics = _common_mast(images)
-    warnings = left_out(unusable)
+    kinematics = _common_mast(products)
+    exposures = one_of_each_exposure(products)
+    images, warnings = exposures.images, [*left_out(unusable), *exposures.warnings]
     eye_of, eye_names = _sort_eyes(images)
     stop_ids, stops = _sort_stops(images, kinematics, warnings)
     frame_of, frames_first = _sort_frames(images, eye_of)
@@ -152,10 +155,10 @@ PDS3 = InputFormat(
 )
 
 
-def _add_image(file: Path, images: list[LabelledImage], unusable: dict[str, ImageError]) -> None:
+def _add_image(file: Path, images: list[LabelledImage], unusable: dict[str, InputError]) -> None:
     try:
         images.append(read_labelled_image(file))
-    except ImageError as error:
+    except InputError as error:
         unusable[file.stem] = error
 
 

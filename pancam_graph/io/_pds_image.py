@@ -17,6 +17,7 @@ from pancam_graph.rigs import camera_z_up, pose_z_up
 __all__ = ["LabelledImage", "read_labelled_image"]
 
 _CAMERA_GROUPS = ("GEOMETRIC_CAMERA_MODEL", "GEOMETRIC_CAMERA_MODEL_PARMS")
+_CLOCK = "SPACECRAFT_CLOCK_START_COUNT"
 _ROVER_GROUPS = ("ROVER_COORDINATE_SYSTEM", "ROVER_COORDINATE_SYSTEM_PARMS", "ROVER_COORD_SYSTEM_PARMS")
 
 
@@ -32,6 +33,11 @@ class LabelledImage:
     rover: LabelledRover
     mast_counter: int | None
     """Number of motions of the mast so far; None where the label has no such counter."""
+    clock_start: str | None
+    """The spacecraft's clock at the start of the exposure; None where the label has none."""
+    first_line_sample: tuple[int, int]
+    """Where on the detector the first pixel is, counted from 1."""
+    sample_bits: int
     pan_tilt_rad: tuple[float, float]
     """Measured pan and tilt of the chain."""
     world_T_rover: gtsam.Pose3
@@ -59,7 +65,7 @@ def read_labelled_image(file: Path) -> LabelledImage:
         pan_tilt_rad = rover.mast.pan_tilt_rad(*rover.joints_rad(label))
     except (CameraError, GeometryError) as error:
         raise InputError(f"{label.label_file}: {error}") from error
-    counter = label.counter()
+    counter, samples = label.counter(), label.group("IMAGE")
     for name in ("SITE", "DRIVE"):
         if name not in counter:
             raise InputError(
@@ -73,6 +79,9 @@ def read_labelled_image(file: Path) -> LabelledImage:
         stop=(counter["SITE"], counter["DRIVE"]),
         rover=rover,
         mast_counter=counter.get("PMA", counter.get("RSM")),
+        clock_start=label.top.text(_CLOCK) if _CLOCK in label.top.items else None,
+        first_line_sample=(samples.integer("FIRST_LINE", 1), samples.integer("FIRST_LINE_SAMPLE", 1)),
+        sample_bits=8 * layout.dtype.itemsize,
         pan_tilt_rad=pan_tilt_rad,
         world_T_rover=pose_z_up(site_T_rover),
         model=camera_z_up(model),

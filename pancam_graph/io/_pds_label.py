@@ -16,21 +16,25 @@ import numpy as np
 
 from pancam_graph.base.errors import ImageError, InputError
 from pancam_graph.base.geometry import FloatArray
+from pancam_graph.base.regular_files import instead_of_file, is_missing
+from pancam_graph.io._picture_size import MAX_PIXELS
 
 __all__ = ["ImageLayout", "LabelGroup", "PdsLabel", "read_label"]
 
 _MAX_LABEL_BYTES = 1 << 20
+_MAX_QUOTED = 120
 _STARTS = (b"PDS_VERSION_ID", b"ODL_VERSION_ID", b"CCSD3ZF")
 _END = re.compile(rb"^[ \t]*END[ \t]*(?:\r|\n|\x00|\Z)", re.MULTILINE)
-_BLOCK = re.compile(
-    r"[ \t]*(?P<end>BEGIN_|END_)?(?P<kind>GROUP|OBJECT)[ \t]*=[ \t]*(?P<name>.*?)[ \t]*(/\*.*\*/)?[ \t]*"
-)
+_MAX_PARSED = 1 << 17
+"""Characters of the longest text that is parsed, which takes some seconds; labels have a quarter of it."""
+_BLOCK = re.compile(r"[ \t]*(?P<end>BEGIN_|END_)?(?P<kind>GROUP|OBJECT)[ \t]*=(?P<rest>.*)")
 _WANTED = re.compile(
     r"IMAGE|GEOMETRIC_CAMERA_MODEL(_PARMS)?|(ROVER|PMA|RSM)_(COORD_|COORDINATE_)SYSTEM(_PARMS)?"
     r"|(PMA|RSM)_ARTICULATION_STATE(_PARMS)?"
 )
 _NO_VALUE = 1e29
 """Numbers above this mean none: labels have 1e30 where telemetry has no value."""
+_MAX_INTEGER = 2**63 - 1
 
 _SAMPLE_KINDS = {
     "INTEGER": ">i",
@@ -83,8 +87,9 @@ class ImageLayout:
 
     def require_complete(self) -> None:
         """Raise ImageError if the file is missing or shorter than its label says."""
-        if not self.file.is_file():
-            raise ImageError(f"{self.file}: expected an image file, found none")
+        other = instead_of_file(self.file)
+        if other is not None:
+            raise ImageError(f"{self.file}: expected an image file, found {other}")
         size = self.file.stat().st_size
         if size < self.end_bytes:
             raise ImageError(
@@ -112,33 +117,39 @@ class LabelGroup:
 
     def text(self, key: str) -> str:
         """An entry as text, blanks stripped."""
-        return str(_plain(self.value(key))).strip()
+        return self._text(key, self.value(key))
 
     def integer(self, key: str, default: int | None = None) -> int:
         """An integer of 0 or above."""
         if default is not None and key not in self.items:
             return default
         number = _plain(self.value(key))
-        if isinstance(number, bool) or not isinstance(number, int) or number < 0:
-            self._fail(key, "an integer of 0 or above", repr(number))
+        if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number <= _MAX_INTEGER:
+            self._fail(key, "an integer of 0 or above", _quoted(number))
         return number
 
     def names(self, key: str) -> list[str]:
         """A list of words."""
-        return [str(v).strip() for v in _as_list(self.value(key))]
+        return [self._text(key, v) for v in _as_list(self.value(key))]
+
+    def _text(self, key: str, value: Any) -> str:
+        try:
+            return str(_plain(value)).strip()
+        except ValueError:  # Python's limit on the length of integers
+            self._fail(key, "a text", _quoted(value))
 
     def numbers(self, key: str, count: int | None = None) -> FloatArray:
         """Finite numbers, (count,) if a count is given, units dropped (angles: see `angles_rad`)."""
         values = [_plain(v) for v in _as_list(self.value(key))]
         if count is not None and len(values) != count:
-            self._fail(key, f"{count} numbers", values)
+            self._fail(key, f"{count} numbers", f"{len(values)}")
         return np.array([self._number(key, v) for v in values])
 
     def _number(self, key: str, value: Any) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float):
-            self._fail(key, "a number", repr(value))
-        if not np.isfinite(value) or abs(value) > _NO_VALUE:
-            self._fail(key, "a finite number", value)
+            self._fail(key, "a number", _quoted(value))
+        if not abs(value) <= _NO_VALUE:  # not a number neither
+            self._fail(key, "a finite number", _quoted(value))
         return float(value)
 
     def angles_rad(self, key: str = "ARTICULATION_DEVICE_ANGLE") -> dict[str, float]:
@@ -213,10 +224,10 @@ class PdsLabel:
             image.integer("LINES"),
             image.integer("BANDS", 1),
         )
-        if min(width, height, bands) < 1:
+        if min(width, height, bands) < 1 or width * height * bands > MAX_PIXELS:
             raise ImageError(
-                f"{image.where}: LINES, LINE_SAMPLES, BANDS: expected 1 or more of each, "
-                f"found {height}, {width}, {bands}"
+                f"{image.where}: LINES, LINE_SAMPLES, BANDS: expected 1 or more of each and at most "
+                f"{MAX_PIXELS} in all, found {height}, {width}, {bands}"
             )
         storage = "BAND_SEQUENTIAL"
         if bands > 1 and "BAND_STORAGE_TYPE" in image.items:
@@ -229,7 +240,8 @@ class PdsLabel:
             width_px=width,
             height_px=height,
             bands=bands,
-            dtype=np.dtype(f"{_SAMPLE_KINDS[kind]}{bits // 8}"),
+            # Bytes of rovers are never below 0, whatever the label calls them.
+            dtype=np.dtype(f"{_SAMPLE_KINDS[kind]}{bits // 8}") if bits == 16 else np.dtype(np.uint8),
             line_prefix_bytes=image.integer("LINE_PREFIX_BYTES", 0),
             line_suffix_bytes=image.integer("LINE_SUFFIX_BYTES", 0),
             storage=storage,
@@ -239,14 +251,17 @@ class PdsLabel:
         # A pointer is a record (from 1), a byte (from 1, <BYTES>), a file, or a file and one of the two.
         pointer = _as_list(self.top.value("^IMAGE"))
         file = self.file
+        if not pointer:
+            raise ImageError(f"{self.label_file}: ^IMAGE: expected a record or a byte, found an empty list")
         if isinstance(pointer[0], str):
             file = _sibling(self.label_file, str(pointer.pop(0)))
         if not pointer:
             return file, 0
         place = _plain(pointer[0])
-        if len(pointer) > 1 or isinstance(place, bool) or not isinstance(place, int) or place < 1:
+        whole = isinstance(place, int) and not isinstance(place, bool) and 1 <= place <= _MAX_INTEGER
+        if len(pointer) > 1 or not whole:
             raise ImageError(
-                f"{self.label_file}: ^IMAGE: expected a record or a byte, 1 or above, found {place!r}"
+                f"{self.label_file}: ^IMAGE: expected a record or a byte, 1 or above, found {_quoted(place)}"
             )
         if str(getattr(pointer[0], "units", "")).upper().startswith("BYTE"):
             return file, place - 1
@@ -262,7 +277,7 @@ def read_label(file: Path) -> PdsLabel:
     label_file = file
     if not _looks_like_label(head):
         detached = [file.with_suffix(s) for s in (".LBL", ".lbl", ".Lbl")]
-        label_file = next((f for f in detached if f.is_file()), file)
+        label_file = next((f for f in detached if not is_missing(f)), file)
         if label_file != file:
             head = _head(label_file)
         if not _looks_like_label(head):
@@ -296,12 +311,12 @@ def _split_groups(label_file: Path, text: str) -> tuple[str, dict[str, str]]:
             lines.append(line)
         elif block["end"] == "END_":
             name, outer = stack.pop() if stack else ("none open", top)
-            if block["name"].upper() != name:
-                found = f"END_{block['kind']} = {block['name']}"
+            if _block_name(block).upper() != name:
+                found = f"END_{block['kind']} = {_block_name(block)}"
                 raise InputError(f"{label_file}: expected the end of group {name}, found {found}")
             lines = outer
         else:
-            name = block["name"].upper()
+            name = _block_name(block).upper()
             stack.append((name, lines))
             lines = []
             if _WANTED.fullmatch(name):
@@ -313,17 +328,26 @@ def _split_groups(label_file: Path, text: str) -> tuple[str, dict[str, str]]:
     return "\n".join(top), {name: "\n".join(body) for name, body in used.items()}
 
 
+def _block_name(block: re.Match[str]) -> str:
+    """Name of a group or an object, without the comment behind it."""
+    rest = block["rest"].strip(" \t")
+    begin = rest.find("/*")
+    commented = begin >= 0 and len(rest) >= begin + 4 and rest.endswith("*/")
+    return rest[:begin].rstrip(" \t") if commented else rest
+
+
 def _parsed(where: Path | str, text: str) -> dict[str, Any]:
     """Entries of a text without groups; the first of two entries of one name."""
-    from pvl.exceptions import LexerError, ParseError, QuantityError  # noqa: PLC0415  only labels need PVL
-
+    expected = f"{where}: expected entries of a PDS3 label"
+    if len(text) > _MAX_PARSED:
+        raise InputError(f"{expected} of at most {_MAX_PARSED} characters, found {len(text)}")
     try:
         module = _parser().parse(text + "\nEND\n")
-    except (ParseError, LexerError, QuantityError, ValueError, StopIteration) as error:
-        first_line = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise InputError(
-            f"{where}: expected entries of a PDS3 label, found text that is none: {first_line}"
-        ) from error
+    except RecursionError as error:
+        raise InputError(f"{expected}, found brackets nested too deeply") from error
+    except Exception as error:  # PVL raises many kinds at text that is no label
+        first_line = _cut((str(error).strip() or type(error).__name__).splitlines()[0])
+        raise InputError(f"{expected}, found text that is none: {first_line}") from error
     return dict(reversed(list(module.items())))
 
 
@@ -345,6 +369,9 @@ def _parser() -> Any:
 
 
 def _head(file: Path) -> bytes:
+    other = instead_of_file(file)
+    if other is not None:
+        raise InputError(f"{file}: expected an image file, found {other}")
     try:
         with file.open("rb") as stream:
             return stream.read(_MAX_LABEL_BYTES)
@@ -365,13 +392,25 @@ def _shown(head: bytes) -> str:
 def _sibling(label_file: Path, name: str) -> Path:
     # A pointer names a file in the label's own folder; archives disagree about the case of its name.
     if Path(name).name != name or name in {"", ".", ".."}:
-        raise ImageError(f"{label_file}: ^IMAGE: expected a file beside the label, found {name!r}")
+        raise ImageError(f"{label_file}: ^IMAGE: expected a file beside the label, found {_quoted(name)}")
     file = label_file.with_name(name)
-    if not file.exists():
+    if is_missing(file):
         for other in label_file.parent.iterdir():
             if other.name.lower() == name.lower():
                 return other
     return file
+
+
+def _quoted(value: Any) -> str:
+    """A value as error messages quote it."""
+    try:
+        return _cut(repr(value))
+    except ValueError:  # Python's limit on the length of integers
+        return "an integer of too many digits"
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= _MAX_QUOTED else f"{text[:_MAX_QUOTED]}..."
 
 
 def _plain(value: Any) -> Any:

@@ -90,4 +90,5 @@ def _no_data(label: PdsLabel) -> tuple[float, ...]:
     image = label.group("IMAGE").items
     entries = (image.get(key) for key in ("MISSING_CONSTANT", "INVALID_CONSTANT"))
     values = [v for entry in entries for v in (entry if isinstance(entry, list | tuple) else [entry])]
-    return tuple(float(v) for v in values if isinstance(v, int | float) and not isinstance(v, bool))
+    numbers = [v for v in values if isinstance(v, int | float) and not isinstance(v, bool)]
+    return tuple(float(v) for v in numbers if abs(v) <= np.iinfo(np.int64).max)  # no sample is beyond

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from pancam_graph.base.errors import ImageError
+from pancam_graph.base.errors import ImageError, InputError
 from pancam_graph.data import Traverse
 from pancam_graph.io._file_memory import FileMemory
 from pancam_graph.io._image_files import GreyImage, ImageContent, read_content
+from pancam_graph.io._picture_size import WantedSize
 
 __all__ = [
     "left_out",
@@ -39,13 +40,9 @@ def read_picture(traverse: Traverse, row: int) -> ImageContent:
     path, eye = picture_file(traverse, row), traverse.rig.eyes[int(traverse.image_eye[row])]
     if path is None:
         raise ImageError(f"image {traverse.images[row].id}: expected an image file, found none")
-    content = read_content(path)
-    camera, (height_px, width_px) = eye.camera, content.samples.shape
-    if (width_px, height_px) != (camera.width_px, camera.height_px):
-        raise ImageError(
-            f"{path}: expected {camera.width_px} x {camera.height_px} pixels as of camera {eye.name} "
-            f"of the rig {traverse.rig.name}, found {width_px} x {height_px}"
-        )
+    width_px, height_px = eye.camera.width_px, eye.camera.height_px
+    words = f"{width_px} x {height_px} pixels as of camera {eye.name} of the rig {traverse.rig.name}"
+    content = read_content(path, WantedSize(width_px=width_px, height_px=height_px, words=words))
     if _KEYS.recall(path) is None:
         _KEYS.keep(path, _key(content.samples))
     return content
@@ -96,7 +93,7 @@ def same_pictures(traverse: Traverse) -> dict[int, int]:
     return same
 
 
-def left_out(errors: Mapping[str, ImageError]) -> list[str]:
+def left_out(errors: Mapping[str, InputError]) -> list[str]:
     """Warnings of images, by id, whose files cannot be used: the first five, and a count of the others."""
     named = [f"image {name} is left out: {error}" for name, error in list(errors.items())[:_NAMED]]
     more = len(errors) - _NAMED

@@ -7,6 +7,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 import numpy as np
 
 from pancam_graph.base.errors import ImageError, InputError, PancamGraphError
+from pancam_graph.base.regular_files import instead_of_file, is_missing
 from pancam_graph.base.text import visible
 from pancam_graph.base.whole_files import whole_file
 from pancam_graph.data import Frame, Image, Observations, Stop, Traverse
@@ -238,7 +239,7 @@ def _unusable_images(files: list[Path | None], traverse: Traverse) -> dict[str, 
                     f"found {content.host}: images of two rovers"
                 )
     named = [file for file in files if file is not None]
-    lost = traverse.observations is not None and not any(file.exists() for file in named)
+    lost = traverse.observations is not None and all(is_missing(file) for file in named)
     if len(unusable) == len(named) > 0 and not lost:
         row, first_error = next(iter(unusable.items()))
         raise _at(traverse, row, first_error) from first_error
@@ -267,6 +268,7 @@ def _copies(traverse: Traverse, folder: Path) -> list[tuple[Path, Path]]:
         if mask is not None:
             files[folder / mask.relative_to(traverse.folder)] = mask
     for source in files.values():
-        if not source.is_file():
-            raise ImageError(f"{source}: expected an image file to copy along, found none")
+        other = instead_of_file(source)
+        if other is not None:
+            raise ImageError(f"{source}: expected an image file to copy along, found {other}")
     return [(source, target) for target, source in files.items()]

@@ -526,7 +526,7 @@ def test_image_files(folder: Path) -> None:
     data["images"][3]["file"] = "a.png"
     path.write_text(json.dumps(data))
     image = folder / "a.png"
-    lost = f"image s0f0_cahvor is left out: {image}: expected an image file, found none"
+    lost = f"image s0f0_cahvor is left out: {image}: expected an image file, found nothing there"
     assert read_input(folder).warnings == (lost,)
     image.mkdir()
     refused(folder, "images[3] (s0f0_cahvor)", "a.png", "a folder", kind=ImageError)

@@ -90,7 +90,7 @@ def spoil(file: Path, kind: str) -> str:
     """Spoil an image file; what is then said of it."""
     if kind == "missing":
         file.unlink()
-        return "expected an image file, found none"
+        return "expected an image file, found nothing there"
     if kind == "truncated":
         whole = file.read_bytes()
         file.write_bytes(whole[: len(whole) // 2])
@@ -135,9 +135,9 @@ def test_image_files_none_of_which_can_be_used_are_refused_by_name(truth: Traver
 
 
 def test_of_many_image_files_a_few_are_named() -> None:
-    errors = {f"i{k}": ImageError(f"{k}.png: expected an image file, found none") for k in range(9)}
+    errors = {f"i{k}": ImageError(f"{k}.png: expected an image file, found nothing there") for k in range(9)}
     assert left_out(errors)[4:] == [
-        "image i4 is left out: 4.png: expected an image file, found none",
+        "image i4 is left out: 4.png: expected an image file, found nothing there",
         "4 more images are left out, whose files cannot be used either",
     ]
     assert len(left_out(dict(list(errors.items())[:5]))) == 5

@@ -127,7 +127,9 @@ def test_a_missing_mask_and_one_outside_the_folder_are_refused(tmp_path: Path) -
     path = tmp_path / "traverse.json"
     plain = path.read_text()
     path.write_text(plain.replace('"camera": "left",', '"camera": "left", "mask": "no.png",'))
-    with pytest.raises(ImageError, match=r"images\[0\].*no\.png: expected an image file, found none"):
+    with pytest.raises(
+        ImageError, match=r"images\[0\].*no\.png: expected an image file, found nothing there"
+    ):
         read_traverse(tmp_path)
     path.write_text(plain.replace('"camera": "left",', '"camera": "left", "mask": "../no.png",'))
     with pytest.raises(InputError, match=r"images\[0\]\.mask: expected a path inside the traverse folder"):

@@ -312,7 +312,7 @@ def test_image_files_are_copied_to_another_folder(tmp_path: Path) -> None:
     write_traverse(expected, tmp_path / "deep" / "there")
     assert_same(read_traverse(tmp_path / "deep" / "there"), expected)
     (tmp_path / "here" / "pictures" / "a.png").unlink()
-    with pytest.raises(InputError, match=r"a\.png: expected an image file to copy along, found none"):
+    with pytest.raises(InputError, match=r"a\.png: .* to copy along, found nothing there"):
         write_traverse(expected, tmp_path / "nowhere")
     assert not (tmp_path / "nowhere").exists()
 
