@@ -565,7 +565,7 @@ def test_folders_that_are_none(tmp_path: Path) -> None:
 def test_a_pipe_is_no_file(folder: Path) -> None:
     (folder / "observations.npz").unlink()
     os.mkfifo(folder / "observations.npz")
-    refused(folder, "observations.npz: expected a file", "something else")
+    refused(folder, "observations.npz: expected a file", "a pipe")
 
 
 def test_solution_files_are_checked_too(tmp_path: Path) -> None:
