@@ -30,7 +30,7 @@ def _work(call: Invocation) -> int:
     from pancam_graph import SimulationOptions, SmootherOptions, TraverseSmoother, simulate
     from pancam_graph.report import DriveStep, write_drive
     from pancam_graph.rigs import rig_template
-    from pancam_graph.smoother._incremental import stops_of
+    from pancam_graph.smoother import stops_of
 
     arguments = call.arguments
     options = SimulationOptions(

@@ -109,14 +109,13 @@ def _work(call: Invocation) -> int:
     from pancam_graph import SolveOptions, cross_validate, find_observations, read_input, solve
     from pancam_graph.cli._resumable import resumable
     from pancam_graph.cli._summary import print_summary
-    from pancam_graph.data._sharing import parse_sharing
+    from pancam_graph.data import parse_sharing
     from pancam_graph.images import cache_folder
     from pancam_graph.landmarks.kernel import must_compile
     from pancam_graph.mosaic import MosaicOptions
     from pancam_graph.results import check_exports, check_out, write_results
-    from pancam_graph.smoother._incremental import solve_incrementally
-    from pancam_graph.solve._solve import COMPILING
-    from pancam_graph.solve._stopping import criteria
+    from pancam_graph.smoother import solve_incrementally
+    from pancam_graph.solve import COMPILING, criteria
 
     arguments, progress = call.arguments, call.progress
     chosen: dict[str, Any] = {n: getattr(arguments, n) for n in ("model", "landmarks", "method", "loss")}

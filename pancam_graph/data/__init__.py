@@ -18,6 +18,7 @@ from pancam_graph.data._sharing import Freedom as Freedom
 from pancam_graph.data._sharing import Quantity as Quantity
 from pancam_graph.data._sharing import Sharing as Sharing
 from pancam_graph.data._sharing import default_sigma as default_sigma
+from pancam_graph.data._sharing import parse_sharing as parse_sharing
 from pancam_graph.data._solution import Incremental as Incremental
 from pancam_graph.data._solution import Refined as Refined
 from pancam_graph.data._solution import RigCorrection as RigCorrection

@@ -24,8 +24,10 @@ from pancam_graph.solve._screen import Screened as Screened
 from pancam_graph.solve._screen import screen as screen
 from pancam_graph.solve._screen import screened_elsewhere as screened_elsewhere
 from pancam_graph.solve._solution_of import solution_of as solution_of
+from pancam_graph.solve._solve import COMPILING as COMPILING
 from pancam_graph.solve._solve import SolveOptions as SolveOptions
 from pancam_graph.solve._solve import solve as solve
 from pancam_graph.solve._stopping import StopRule as StopRule
+from pancam_graph.solve._stopping import criteria as criteria
 from pancam_graph.solve.cross_validation._cross_validate import CrossValidation as CrossValidation
 from pancam_graph.solve.cross_validation._cross_validate import cross_validate as cross_validate

@@ -31,3 +31,17 @@ def test_a_door_offers_only_its_own_under_the_same_names(door: str) -> None:
             assert not alias.name.startswith("_")
             offered.append(alias.name)
     assert len(set(offered)) == len(offered)
+
+
+def test_rooms_import_each_other_by_their_doors() -> None:
+    """Of another room nothing private is imported; `base` has public modules instead of a door."""
+    beside_the_door = {
+        f"{path.relative_to(PACKAGE).as_posix()}: {module}"
+        for path in PACKAGE.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ImportFrom | ast.Import)
+        for module in ([node.module or ""] if isinstance(node, ast.ImportFrom) else [a.name for a in node.names])
+        if module.startswith("pancam_graph.") and "._" in module
+        if module.split(".")[1] != path.relative_to(PACKAGE).parts[0]
+    }
+    assert beside_the_door == set()
