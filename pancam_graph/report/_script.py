@@ -90,16 +90,21 @@ function drawVectors(page) {
     layout.images = image.picture === null ? [] : ["", "2"].map((n) => ({ source: image.picture,
       xref: `x${n}`, yref: `y${n}`, x: -0.5, y: -0.5, sizex: image.width, sizey: image.height,
       xanchor: "left", yanchor: "top", sizing: "stretch", layer: "below" }));
-    layout.annotations = ["before", "after"].map((side, i) => ({ text: `<b>${side}</b>, vectors ${
-      factors[i] === 1 ? "at true length" : `${factors[i].toLocaleString("en")} times enlarged`}`,
+    const place = document.getElementById("vectors");
+    const narrow = place.clientWidth < 900;  // where a title and the legend have no room beside each other
+    if (narrow) Object.assign(layout, { margin: { ...layout.margin, t: 70, b: 85 },
+      legend: { ...layout.legend, x: 0, xanchor: "left", y: 0, yanchor: "bottom", yref: "container" } });
+    layout.annotations = ["before", "after"].map((side, i) => ({
+      text: `<b>${side}</b>${narrow ? "<br>" : ", "}vectors ${
+        factors[i] === 1 ? "at true length" : `${factors[i].toLocaleString("en")} times enlarged`}`,
+      align: "left",
       xref: `x${i ? "2" : ""} domain`, yref: "paper", x: 0, y: 1.005, xanchor: "left", yanchor: "bottom",
       showarrow: false }));
     note.textContent = (image.shown < image.total
       ? `${image.shown} of the ${image.total} observations are drawn. ` : "") +
       (image.picture === null ? "There is no picture of this image, so its frame is empty." : "");
     // As high as two panels side by side need, for any shape of image.
-    const place = document.getElementById("vectors");
-    const high = 0.485 * (place.clientWidth - 75) * image.height / image.width + 100;
+    const high = 0.485 * (place.clientWidth - 75) * image.height / image.width + (narrow ? 160 : 100);
     place.style.height = `${Math.round(Math.min(Math.max(high, 300), 860))}px`;
     Plotly.react(place, data, layout, config);
     Plotly.Plots.resize(place);

@@ -52,4 +52,16 @@ tbody tr:hover { background: #eef6fb; }
 .notes li { max-width: 130ch; margin-bottom: 4px; }
 .failed { color: #b54300; padding: 14px; }
 code { font-size: 14px; }
+@media print {
+  /* Paper has no scroll bars and no buttons: tables are whole, with all columns. */
+  .scroll, .warnings ul { max-height: none; overflow: visible; }
+  table { font-size: 9px; }
+  th, td { padding: 2px 4px; white-space: normal; overflow-wrap: anywhere; }
+  th { position: static; }
+  th button { font-size: 9px; text-align: inherit; }
+  th button::after { content: none !important; }
+  tr, .plot, .figures div { break-inside: avoid; }
+  h2 { break-after: avoid; }
+  .modebar, .controls span:not([id]) { display: none !important; }
+}
 """
