@@ -10,7 +10,7 @@ from pancam_graph.cli._parser import CommandParser
 __all__ = ["DRIVE"]
 
 _DESCRIPTION = """\
-Simulate a drive of 30 stops and back, and follow it stop by stop: estimate against truth and odometry.
+Simulate a drive that ends where it began, and follow it stop by stop: estimate against truth and odometry.
 
 A line for each stop on the terminal; OUT, an HTML page, replays the estimate with its ellipses.
 
@@ -21,7 +21,9 @@ Exit status: 0 written, 2 bad input or a fault (nothing is written), 130 interru
 def _add_options(parser: CommandParser) -> None:
     parser.add_argument("out", metavar="OUT", type=Path, help="HTML file to write")
     add_rig_option(parser)
-    parser.add_argument("--stops", type=int, default=30, help="places of the mast (%(default)s)")
+    parser.add_argument(
+        "--stops", type=int, default=30, help="number of places where the mast stands (%(default)s)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="another seed, another drive (%(default)s)")
 
 

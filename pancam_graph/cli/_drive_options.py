@@ -48,18 +48,42 @@ def add_drive_options(
     add = parser.add_argument
     add_rig_option(parser)
     add("--seed", type=int, default=0, help="another seed, another world (%(default)s)")
-    add("--stops", type=int, default=stops, help="places of the mast (%(default)s)")
-    add("--spacing-m", "--step-m", type=float, default=spacing_m, help="from stop to stop (%(default)s)")
-    add("--pans", "--azimuths", type=int, default=pans, help=f"frames per row ({say_pans})")
-    add("--sweep-deg", **_angle("sweep_rad", sweep_rad), help=f"range of pan ({say_sweep})")
-    add("--tilts-deg", **_angle("tilts_rad"), nargs="+", help=f"of each row, up positive ({say_tilts})")
-    add("--pointing-scale", type=float, default=1.0, help="errors of pan and tilt, times the rig's (1)")
-    add("--sigma-stop-m", type=float, default=0.1, help="odometry's, per axis (%(default)s)")
-    add("--sigma-stop-deg", **_angle("sigma_stop_rad", 0.01), help="odometry's, per axis (0.57)")
-    add("--focal-error", type=float, default=0.0, help="of the rig that the traverse claims, a share (0)")
-    add("--mount-error-deg", **_angle("mount_error_rad", 0.0), help="of its mounts (0)")
-    add("--mount-error-m", type=float, default=0.0, help="of its mounts (0)")
-    add("--radius-error-m", type=float, default=0.0, help="of its circles (0)")
+    add("--stops", type=int, default=stops, help="number of places where the mast stands (%(default)s)")
+    add(
+        "--spacing-m",
+        "--step-m",
+        type=float,
+        default=spacing_m,
+        help="distance from stop to stop, metres (%(default)s)",
+    )
+    add("--pans", "--azimuths", type=int, default=pans, help=f"number of frames per row ({say_pans})")
+    add("--sweep-deg", **_angle("sweep_rad", sweep_rad), help=f"range of pan that a row covers ({say_sweep})")
+    add("--tilts-deg", **_angle("tilts_rad"), nargs="+", help=f"tilt of each row, up positive ({say_tilts})")
+    add("--pointing-scale", type=float, default=1.0, help="factor on the rig's errors of pan and tilt (1)")
+    add(
+        "--sigma-stop-m",
+        type=float,
+        default=0.1,
+        help="sigma of the telemetry's place of a stop, per axis (%(default)s)",
+    )
+    add(
+        "--sigma-stop-deg",
+        **_angle("sigma_stop_rad", 0.01),
+        help="sigma of the telemetry's attitude of a stop, per axis (0.57)",
+    )
+    add(
+        "--focal-error",
+        type=float,
+        default=0.0,
+        help="error of the focal lengths that traverse.json claims, a share (0)",
+    )
+    add(
+        "--mount-error-deg",
+        **_angle("mount_error_rad", 0.0),
+        help="error of the turns of mounts that it claims (0)",
+    )
+    add("--mount-error-m", type=float, default=0.0, help="error of the places of mounts that it claims (0)")
+    add("--radius-error-m", type=float, default=0.0, help="error of the radii of eyes that it claims (0)")
 
 
 def drive_options(arguments: Namespace, options: type[_Options]) -> _Options:

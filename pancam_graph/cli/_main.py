@@ -11,7 +11,7 @@ from pancam_graph.cli._command import Command, Invocation
 from pancam_graph.cli._config import read_config
 from pancam_graph.cli._ending import run, status_of
 from pancam_graph.cli._log import check_log_outside, logged
-from pancam_graph.cli._parser import CommandParser, LateChoice, Parser, Several
+from pancam_graph.cli._parser import Assignment, CommandParser, LateChoice, Parser, Several
 from pancam_graph.cli._progress import Progress, display_for
 from pancam_graph.cli._registry import COMMANDS
 
@@ -100,10 +100,10 @@ def _called(command: Command, words: Sequence[str], prog: str) -> int:
 
 
 def _one_by_one(parser: Parser, words: Sequence[str]) -> list[str]:
-    """A command line in which each entry of a list with known choices stands behind an option of its own.
+    """A command line in which each entry of a list that can be told stands behind an option of its own.
 
     `--export colmap cahvor FOLDER` becomes `--export colmap --export=cahvor FOLDER`: the list ends before
-    the first word that is no choice, which argparse cannot do.
+    the first word that is none of its entries, which argparse cannot do.
     """
     spread, waiting = list[str](), list(words)
     while waiting:
@@ -112,11 +112,10 @@ def _one_by_one(parser: Parser, words: Sequence[str]) -> list[str]:
         if word == "--":
             break
         action = parser.option(word)
-        if isinstance(action, Several) and isinstance(action.type, LateChoice):
+        if isinstance(action, Several) and isinstance(action.type, LateChoice | Assignment):
             if "=" not in word and waiting:
                 spread.append(waiting.pop(0))
-            choices = set(action.type.names())
-            while waiting and waiting[0] in choices:
+            while waiting and action.type.takes(waiting[0]):
                 spread.append(f"{word.partition('=')[0]}={waiting.pop(0)}")
     return [*spread, *waiting]
 

@@ -14,6 +14,7 @@ from pancam_graph.cli._streams import must_write, write
 
 __all__ = [
     "COMMON_OPTIONS",
+    "Assignment",
     "CommandParser",
     "Flag",
     "LateChoice",
@@ -43,6 +44,10 @@ class LateChoice:
     names: Callable[[], Iterable[str]]
     """Looks the names up."""
 
+    def takes(self, word: str) -> bool:
+        """Whether a word of a command line is one of the names."""
+        return word in self.names()
+
     def __call__(self, text: str) -> str:
         """The argument itself. Raises ArgumentTypeError where it is none of the names."""
         names = list(self.names())
@@ -50,6 +55,19 @@ class LateChoice:
             raise argparse.ArgumentTypeError(
                 f"expected one of {', '.join(names)}; found {text!r}{nearest(text, names)}"
             )
+        return text
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """Type of an argument NAME=VALUE; what names and values there are, others check."""
+
+    def takes(self, word: str) -> bool:
+        """Whether a word of a command line can be such an argument, and is no option."""
+        return "=" in word and not word.startswith("-")
+
+    def __call__(self, text: str) -> str:
+        """The argument itself."""
         return text
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from pancam_graph.cli._command import Command, Invocation
-from pancam_graph.cli._parser import CommandParser, Flag, LateChoice, Several
+from pancam_graph.cli._parser import Assignment, CommandParser, Flag, LateChoice, Several
 
 __all__ = ["REFINE"]
 
@@ -23,8 +23,9 @@ Exit status: 0 solved, 1 not converged (results are written), 2 bad input or a f
 130 interrupted.
 """
 _SHARING_HELP = (
-    "what of the rig is estimated, and who shares it: QUANTITY=SCOPE[:ENTRY[~SIGMA],...] with quantities "
-    "calibration (fx_px fy_px skew_px cx_px cy_px, or focal), mounts and pan_T_tilt (rx_rad ry_rad rz_rad "
+    "what of the rig is estimated, and who shares it, in one or more WORDs: "
+    "QUANTITY=SCOPE[:ENTRY[~SIGMA],...] with quantities calibration (fx_px fy_px skew_px cx_px cy_px, or "
+    "focal), mounts and pan_T_tilt (rx_rad ry_rad rz_rad "
     "x_m y_m z_m), radius (radius_m; model circle) and scopes fixed, all, eye, stop, image; without entries "
     "all are free; SIGMA is the prior's, inf for none; what traverse.json says of a quantity is overridden; "
     "for example calibration=eye:focal mounts=eye"
@@ -70,12 +71,13 @@ def _add_options(parser: CommandParser) -> None:
     add(
         "--stop",
         action=Several,
+        type=Assignment(),
         default=(),
         metavar="NAME=NUMBER",
-        help="when the final iterations end; may be given for each of max_iterations (default 100), "
+        help="when the final iterations end; one or more of max_iterations (default 100), "
         "relative_decrease (of the cost, 1e-7), relative_step, max_gradient, residual_sigmas; 0: not used",
     )
-    add("--sharing", nargs="+", default=(), metavar="WORD", help=_SHARING_HELP)
+    add("--sharing", action=Several, type=Assignment(), default=(), metavar="WORD", help=_SHARING_HELP)
     add(
         "--incremental",
         action=Flag,

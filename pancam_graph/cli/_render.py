@@ -32,16 +32,28 @@ def _add_options(parser: CommandParser) -> None:
     )
     add = parser.add_argument
     add("--out", metavar="OUT", type=Path, required=True, help="folder to write; must be new or empty")
-    add("--rocks", dest="rock_abundance", type=float, default=0.05, help="share of ground (%(default)s)")
+    add(
+        "--rocks",
+        dest="rock_abundance",
+        type=float,
+        default=0.05,
+        help="share of the ground that rocks cover (%(default)s)",
+    )
     add(
         "--sun-elevation-deg",
         dest="sun_elevation_rad",
         type=degrees,
         default=degrees("38"),
         metavar="SUN_ELEVATION_DEG",
-        help="height of the sun (38)",
+        help="height of the sun above the horizon (38)",
     )
-    add("--bits", type=int, choices=(8, 12), default=8, help="of samples; 12 in 16-bit files (%(default)s)")
+    add(
+        "--bits",
+        type=int,
+        choices=(8, 12),
+        default=8,
+        help="bits of a sample; 12 are written in 16-bit files (%(default)s)",
+    )
     add("--deck", action=Flag, help="show the rover's own deck, which moves along with it")
 
 

@@ -33,10 +33,20 @@ def _add_options(parser: CommandParser) -> None:
     )
     add = parser.add_argument
     add("out", metavar="OUT", type=Path, help="folder to write; must be new or empty")
-    add("--points-per-image", type=int, default=25, help="density (%(default)s)")
-    add("--noise-px", type=float, default=0.3, help="sigma per coordinate (%(default)s)")
+    add(
+        "--points-per-image",
+        type=int,
+        default=25,
+        help="about how many terrain points an image shows (%(default)s)",
+    )
+    add("--noise-px", type=float, default=0.3, help="sigma of the pixels, per coordinate (%(default)s)")
     add("--noise-stretch", type=float, default=1.0, help="length over width of error ellipses (1: round)")
-    add("--outliers", type=float, default=0.0, help="share of random pixels (%(default)s)")
+    add(
+        "--outliers",
+        type=float,
+        default=0.0,
+        help="share of observations that are random pixels (%(default)s)",
+    )
 
 
 def _work(call: Invocation) -> int:

@@ -40,7 +40,9 @@ def test_rooms_import_each_other_by_their_doors() -> None:
         for path in PACKAGE.rglob("*.py")
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
         if isinstance(node, ast.ImportFrom | ast.Import)
-        for module in ([node.module or ""] if isinstance(node, ast.ImportFrom) else [a.name for a in node.names])
+        for module in (
+            [node.module or ""] if isinstance(node, ast.ImportFrom) else [a.name for a in node.names]
+        )
         if module.startswith("pancam_graph.") and "._" in module
         if module.split(".")[1] != path.relative_to(PACKAGE).parts[0]
     }

@@ -110,7 +110,8 @@ def row_subtraction() -> Callable[..., None]:
         trial: Any = numba.njit(subtract_row_in_vectors)
         trial(tiles, 4, arms, 0, 3, pair)
     except Exception as error:
-        _LOG.info("elimination without vectors, which takes longer: %s", error)
+        reason = " ".join(str(error).split())  # Numba's has many lines
+        _LOG.info("elimination without vectors, which takes longer: %s", reason)
         return subtract_row
     if not np.allclose(tiles, expected, rtol=1e-12, atol=1e-12):
         _LOG.info("elimination without vectors, which takes longer: they give other numbers")
