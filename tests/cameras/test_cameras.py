@@ -72,7 +72,7 @@ def pixel(camera: Camera, point: tuple[float, float, float]) -> FloatArray:
     return np.asarray(uv[0])
 
 
-def test_published_pixels() -> None:
+def test_pixels_of_published_models() -> None:
     a = pixel(MODEL_A, (-0.593194, 0.294442, 0.545509))
     assert a == pytest.approx([599.66607394, 131.22968783], abs=5e-9)
     assert pixel(MODEL_B, POINT_B) == pytest.approx(PIXEL_B, abs=5e-9)

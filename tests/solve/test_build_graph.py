@@ -10,7 +10,6 @@ import pytest
 from pancam_graph import (
     Freedom,
     Sharing,
-    SimulationOptions,
     Solution,
     SolveOptions,
     Traverse,
@@ -20,41 +19,29 @@ from pancam_graph import (
     solve,
 )
 from pancam_graph.base.errors import InputError
-from pancam_graph.graph import Flex
 from pancam_graph.rigs import mer_navcam
-from pancam_graph.simulate import Simulation
 from support.parameters import slow_for
+from support.small_drives import HARD, SMALL, SOFT, near_part, simulated
 
-SMALL = SimulationOptions(stops=3, pans=3, sweep_rad=1.5, points_per_image=15)
-NEAR_M = 20.0
-TO_THE_END = SolveOptions(loss="none", relative_decrease=1e-12)
+POINTS = 6
+"""Points per image of the drive that GTSAM solves: its time grows with them, what is compared does not."""
 FOCAL = Freedom(scope="all", free=("focal",))
 WAYS = {
-    "hard": TO_THE_END,
+    "hard": HARD,
     "hard, free rig": replace(
-        TO_THE_END,
+        HARD,
         sharing=Sharing(calibration=FOCAL, mounts=Freedom(scope="eye"), pan_T_tilt=Freedom(scope="all")),
     ),
-    "soft": replace(TO_THE_END, tie="soft", flex=Flex(rotation_rad=1e-4, translation_m=1e-3)),
-    "soft, free calibration": replace(TO_THE_END, tie="soft", sharing=Sharing(calibration=FOCAL)),
-    "circle": replace(TO_THE_END, model="circle"),
-    "free": replace(TO_THE_END, model="free"),
+    "soft": SOFT,
+    "soft, free calibration": replace(HARD, tie="soft", sharing=Sharing(calibration=FOCAL)),
+    "circle": replace(HARD, model="circle"),
+    "free": replace(HARD, model="free"),
 }
 
 
-@cache
-def simulated(seed: int) -> Simulation:
-    return simulate(mer_navcam(), SMALL, seed=seed)
-
-
-@cache
-def near(seed: int = 2) -> Traverse:
-    """Without landmarks on the horizon, which explicit points end at infinity for."""
-    simulation = simulated(seed)
-    t = simulation.traverse
-    assert t.observations is not None
-    distance = np.linalg.norm(simulation.truth.landmarks_m, axis=1)
-    return t.with_observations(t.observations.select((distance < NEAR_M)[t.observations.track]))
+def near() -> Traverse:
+    """Three stops, of which the last two are free, and the landmarks near by."""
+    return near_part(simulated(2, stops=3, points_per_image=POINTS))
 
 
 @cache
@@ -100,7 +87,7 @@ def test_two_stops_are_better_known_to_each_other_than_from_far_away() -> None:
     """Odometry adds up along a drive: each stop's own covariance grows, that of neighbours does not."""
     options = replace(SMALL, stops=5, odometry=True)
     t = simulate(mer_navcam(), options, seed=3).traverse
-    solution = solve(t, TO_THE_END)
+    solution = solve(t, HARD)
     ids = [stop.id for stop in t.stops]
     relative = np.sqrt(np.trace(solution.relative_covariance(ids[3], ids[4])[3:, 3:]))
     assert relative < 0.7 * np.sqrt(np.trace(solution.stop_covariance[4][3:, 3:]))
@@ -108,8 +95,9 @@ def test_two_stops_are_better_known_to_each_other_than_from_far_away() -> None:
 
 def relative_square(seed: int) -> float:
     """Squared error of the third stop as the second sees it, over its covariance."""
-    t, true = near(seed), simulated(seed).truth.world_T_mast
-    solution = solve(t, TO_THE_END)
+    simulation = simulated(seed, stops=3)
+    t, true = near_part(simulation), simulation.truth.world_T_mast
+    solution = solve(t, HARD)
     masts = solution.final.world_T_mast
     error = masts[1].between(masts[2]).localCoordinates(true[1].between(true[2]))
     return float(error @ np.linalg.solve(solution.relative_covariance(t.stops[1].id, t.stops[2].id), error))
@@ -129,8 +117,8 @@ def test_errors_between_stops_are_as_large_as_their_covariance_says_over_many_se
 def test_all_stops_and_frames_are_in_the_graph_held_ones_with_a_constraint() -> None:
     t = near()
     held = replace(t, frames=(replace(t.frames[0], sigma_pan_rad=0.0, sigma_tilt_rad=0.0), *t.frames[1:]))
-    graph, values = build_graph(held, TO_THE_END)
-    keys = graph_keys(held, TO_THE_END)
+    graph, values = build_graph(held, HARD)
+    keys = graph_keys(held, HARD)
     found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     mast, angles = keys.mast(held.stops[0].id), keys.angles(held.frames[0].id)
     assert found.atPose3(mast).equals(held.stops[0].world_T_mast, 1e-12)
@@ -143,11 +131,11 @@ def test_what_a_solution_used_is_taken_by_least_squares() -> None:
     assert t.observations is not None
     used = np.ones(len(t.observations), dtype=bool)
     used[t.observations.track == t.observations.track[0]] = False
-    whole, _ = build_graph(t, TO_THE_END)
-    graph, values = build_graph(t, replace(TO_THE_END, loss="huber"), used=used)
+    whole, _ = build_graph(t, HARD)
+    graph, values = build_graph(t, replace(HARD, loss="huber"), used=used)
     assert whole.size() - graph.size() == int((~used).sum())
     found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
-    part = solve(t.with_observations(t.observations.select(used)), TO_THE_END)
+    part = solve(t.with_observations(t.observations.select(used)), HARD)
     assert graph.error(found) == pytest.approx(part.cost_final, rel=1e-6)
 
 

@@ -11,7 +11,6 @@ import pytest
 from pancam_graph import (
     Freedom,
     Sharing,
-    SimulationOptions,
     Solution,
     SolveOptions,
     Traverse,
@@ -23,16 +22,11 @@ from pancam_graph import (
 )
 from pancam_graph.base.errors import InputError, SolveError
 from pancam_graph.base.geometry import FloatArray
-from pancam_graph.graph import Flex
 from pancam_graph.rigs import mer_navcam
-from pancam_graph.simulate import Simulation
 from support.gtsam_factors import custom, distance_factor
 from support.parameters import slow_for
+from support.small_drives import HARD, SMALL, SOFT, near_part, simulated
 
-SMALL = SimulationOptions(stops=2, pans=3, sweep_rad=1.5, points_per_image=15)
-NEAR_M = 20.0
-HARD = SolveOptions(loss="none", relative_decrease=1e-12)
-SOFT = replace(HARD, tie="soft", flex=Flex(rotation_rad=1e-4, translation_m=1e-3))
 SHARED = Sharing(calibration=Freedom(scope="all", free=("focal",)))
 WAYS = {
     "hard": HARD,
@@ -48,21 +42,9 @@ WAYS = {
 }
 
 
-@cache
-def simulated(seed: int = 2, stops: int = 2) -> Simulation:
-    return simulate(mer_navcam(), replace(SMALL, stops=stops), seed=seed)
-
-
 def near(seed: int = 2, stops: int = 2) -> Traverse:
     """Without landmarks that are too far for explicit ones."""
     return near_part(simulated(seed, stops))
-
-
-def near_part(simulation: Simulation) -> Traverse:
-    t = simulation.traverse
-    assert t.observations is not None
-    distance = np.linalg.norm(simulation.truth.landmarks_m, axis=1)
-    return t.with_observations(t.observations.select((distance < NEAR_M)[t.observations.track]))
 
 
 def distance_m(solution: Solution, a: int = 0, b: int = 1) -> float:
@@ -261,8 +243,8 @@ def test_halves_of_a_cross_validation_have_the_factors() -> None:
 
 def normalised_square(seed: int, options: SolveOptions) -> float:
     """Squared error of the second stop over its covariance, with its distance measured to 1 mm."""
-    simulation = simulated(seed)
-    t, true = near(seed), simulation.truth.world_T_mast
+    simulation = simulated(seed, stops=2)
+    t, true = near_part(simulation), simulation.truth.world_T_mast
     masts = [graph_keys(t, options).mast(stop.id) for stop in t.stops]
     sigma = 1e-3
     measured = float(np.linalg.norm(true[1].translation() - true[0].translation()))

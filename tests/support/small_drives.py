@@ -1,0 +1,35 @@
+"""Small simulated drives that GTSAM's own optimisers solve in a second or two, and options for them."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from pancam_graph import SimulationOptions, SolveOptions, Traverse, simulate
+from pancam_graph.graph import Flex
+from pancam_graph.rigs import mer_navcam
+from pancam_graph.simulate import Simulation
+
+__all__ = ["HARD", "NEAR_M", "SMALL", "SOFT", "near_part", "simulated"]
+
+SMALL = SimulationOptions(stops=2, pans=3, sweep_rad=1.5, points_per_image=15)
+NEAR_M = 20.0
+"""Landmarks farther away end at infinity where they are explicit variables."""
+HARD = SolveOptions(loss="none", relative_decrease=1e-12)
+"""Every observation, to the end, with a hard tie."""
+SOFT = replace(HARD, tie="soft", flex=Flex(rotation_rad=1e-4, translation_m=1e-3))
+
+
+@cache
+def simulated(seed: int, stops: int, points_per_image: int = SMALL.points_per_image) -> Simulation:
+    """A small drive, made once."""
+    options = replace(SMALL, stops=stops, points_per_image=points_per_image)
+    return simulate(mer_navcam(), options, seed=seed)
+
+
+def near_part(simulation: Simulation) -> Traverse:
+    """The traverse with the observations of landmarks within `NEAR_M` of the world's origin alone."""
+    t = simulation.traverse
+    assert t.observations is not None
+    distance = np.linalg.norm(simulation.truth.landmarks_m, axis=1)
+    return t.with_observations(t.observations.select((distance < NEAR_M)[t.observations.track]))
