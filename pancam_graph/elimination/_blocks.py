@@ -64,7 +64,7 @@ class Layout:
     """Columns that segments touch, group by group; the number of columns of each segment is made even."""
 
     group_width: IntArray
-    """(groups,) columns of each"""
+    """(groups,) number of columns of each group"""
     segment_column: IntArray
     """(segments,) first column of each in its group"""
     row: tuple[IntArray, ...]

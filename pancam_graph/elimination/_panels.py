@@ -21,7 +21,7 @@ class Pattern:
     """Fill-in of the square root by blocks, in an order of elimination that keeps it small."""
 
     dim: IntArray
-    """(groups,) columns of each"""
+    """(groups,) number of columns of each group"""
     order: tuple[int, ...]
     """Groups in the order of elimination."""
     after: tuple[tuple[int, ...], ...]

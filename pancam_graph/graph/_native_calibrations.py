@@ -24,9 +24,9 @@ class _Native:
     """The variables `C` that replace one variable `K` of n entries."""
 
     variable: RigVariable
-    """`K`."""
+    """The variable `K` that is replaced."""
     keys: tuple[int, ...]
-    """Of each `C`."""
+    """Key of each `C`."""
     nominal: FloatArray
     """(5 keys,) nominal fx, fy, skew, cx and cy of each"""
     along: FloatArray

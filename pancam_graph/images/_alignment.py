@@ -43,11 +43,11 @@ class Ties:
     """Points of one stop's terrain, and pixels in images of another stop that show them."""
 
     row: IntArray
-    """(n,) row of the terrain."""
+    """(n,) row of each point in the terrain of its stop."""
     image: IntArray
-    """(n,)"""
+    """(n,) row of the image that shows it."""
     uv_px: FloatArray
-    """(n, 2)"""
+    """(n, 2) where the image shows it, raw pixels."""
     sigma_px: FloatArray
     """(n,) standard deviation of each coordinate."""
 

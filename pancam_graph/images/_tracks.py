@@ -16,13 +16,13 @@ class Links:
     """Matches over all pairs of images: each says that two features show the same point."""
 
     image_a: IntArray
-    """(n,)"""
+    """(n,) row of the first image."""
     feature_a: IntArray
-    """(n,)"""
+    """(n,) row of the feature among those of the first image."""
     image_b: IntArray
-    """(n,)"""
+    """(n,) row of the second image."""
     feature_b: IntArray
-    """(n,)"""
+    """(n,) row of the feature among those of the second image."""
     distance: FloatArray
     """(n,) distance of the two descriptors; the smaller, the better."""
 

@@ -24,7 +24,7 @@ class CircleFit:
     rotation: FloatArray
     """(3, 3) R; its z axis is the circle's normal, its x axis points to the first centre."""
     radius_m: float
-    """rho."""
+    """rho, the radius of the circle."""
     angle_rad: FloatArray
     """(n,) phi of each point; the first is 0."""
     residual_m: FloatArray

@@ -43,9 +43,9 @@ class FreeCameras:
     calibration: FloatArray
     """(n, 3, 3) upper-triangular K, its diagonal above 0, the last entry 1"""
     world_R_camera: FloatArray
-    """(n, 3, 3)"""
+    """(n, 3, 3) orientation of each camera"""
     centre_m: FloatArray
-    """(n, 3) in the world"""
+    """(n, 3) centre of each camera in the world, metres"""
 
     @property
     def projections(self) -> FloatArray:
@@ -58,9 +58,9 @@ class CircleCameras:
     """Parameters of the model `circle`: centres on a circle by their angles, orientations free (eq. 4.9)."""
 
     calibration: FloatArray
-    """(n, 3, 3) K"""
+    """(n, 3, 3) calibration matrix K of each camera"""
     world_R_camera: FloatArray
-    """(n, 3, 3)"""
+    """(n, 3, 3) orientation of each camera"""
     circle: CircleFit
     """Pose and radius of the circle, the angle of each camera on it, and the residuals of the given
     centres."""
@@ -86,7 +86,7 @@ class MastCameras:
     eye: IntArray
     """(n,) index of each camera's eye in the rig"""
     calibration: FloatArray
-    """(n, 3, 3) K"""
+    """(n, 3, 3) calibration matrix K of each camera"""
     world_T_mast: gtsam.Pose3
     pan_tilt_rad: FloatArray
     """(n, 2) of each camera; the eyes of one frame may differ"""

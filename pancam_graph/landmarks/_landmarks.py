@@ -44,11 +44,11 @@ class CameraViews:
     """Pinhole cameras of all images."""
 
     world_R_camera: FloatArray
-    """(images, 3, 3)"""
+    """(images, 3, 3) orientation of each camera"""
     world_t_camera: FloatArray
-    """(images, 3) metres"""
+    """(images, 3) centre of each camera in the world, metres"""
     calibration: FloatArray
-    """(images, 3, 3) upper-triangular K"""
+    """(images, 3, 3) calibration matrix K, upper triangular"""
 
     @cached_property
     def to_pixel(self) -> FloatArray:
@@ -63,7 +63,7 @@ class Measurements:
     row: IntArray
     """(n,) row in the traverse's observations"""
     image: IntArray
-    """(n,)"""
+    """(n,) row of the image of each observation"""
     landmark: IntArray
     """(n,) landmark row, ascending, without gaps"""
     uv_px: FloatArray

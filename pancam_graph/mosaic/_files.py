@@ -43,10 +43,10 @@ class Blink:
     """Two pictures of one place, one with each pointing, that the report shows in turn."""
 
     group: str
-    """Stop and camera."""
+    """Names of the stop and the camera; the report lists pictures by them."""
     title: str
     captions: dict[Pointing, str]
-    """What is said under each."""
+    """Text under the picture of each pointing."""
     jpeg: dict[Pointing, bytes]
     width_px: int
     height_px: int

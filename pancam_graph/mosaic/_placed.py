@@ -60,11 +60,11 @@ class View:
     """All cameras and landmarks as one pointing has them, in the world, seen from one stop's refined mast."""
 
     world_R_camera: FloatArray
-    """(images, 3, 3)"""
+    """(images, 3, 3) orientation of each camera."""
     world_t_camera: FloatArray
-    """(images, 3)"""
+    """(images, 3) centre of each camera, metres."""
     landmarks_m: FloatArray
-    """(landmarks, 3); a row of NaN where there is no usable point."""
+    """(landmarks, 3) metres; a row of NaN where there is no usable point."""
 
 
 def view_from_stop(solution: Solution, stop: int, pointing: Pointing) -> View:

@@ -35,9 +35,9 @@ class RigGroup:
     """Cameras whose poses relative to each other are the same in some frames."""
 
     cameras: dict[int, Camera] = field(default_factory=dict)
-    """Camera by eye."""
+    """Camera of each eye, by the number of the eye in the rig."""
     head_T_camera: dict[int, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
-    """Mount by eye: rotation (3, 3) and translation (3,)."""
+    """Mount of each eye, by the same number: rotation (3, 3) and translation (3,)."""
     own: bool = False
     """Whether it serves one frame alone, whose eyes are not where the rig's mounts put them."""
 

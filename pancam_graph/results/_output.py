@@ -20,10 +20,10 @@ class Written:
     """The solution and what earlier outputs have added to it: what an output is made from."""
 
     solution: Solution
-    """With the warnings of the outputs so far."""
+    """The solution, with the warnings of the outputs so far."""
     brightness: "Brightness"
     mosaic_options: "MosaicOptions | None"
-    """None: no mosaics are written."""
+    """How mosaics are drawn; None: none are written."""
     progress: Callable[[str, int, int], None] | None
     """Told of a stage, how many of its parts are done, and how many there are."""
     seconds: Callable[[], float]

@@ -31,7 +31,7 @@ class Truth:
     """What really was, in the order of the traverse's entries. No solver may see it."""
 
     rig: Rig
-    """That made the images."""
+    """The rig that the observations were made with; the traverse may claim another."""
     world_T_mast: tuple[gtsam.Pose3, ...]
     """Mast pose of each stop."""
     pan_tilt_rad: FloatArray

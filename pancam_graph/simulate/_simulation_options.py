@@ -47,11 +47,11 @@ class DriveOptions:
     focal_error: float = 0.0
     """Standard deviation of the focal length of each eye in the rig that the traverse claims, as a share."""
     mount_error_rad: float = 0.0
-    """Standard deviation of each component of the rotation of its mounts."""
+    """Standard deviation of each component of the rotation of each mount in that rig."""
     mount_error_m: float = 0.0
-    """Standard deviation of each component of where they sit."""
+    """Standard deviation of each component of the position of each mount in that rig."""
     radius_error_m: float = 0.0
-    """Standard deviation of the radius of its circle, at the mean tilt."""
+    """Standard deviation of the radius of each eye's circle in that rig, at the mean tilt."""
 
     def __post_init__(self) -> None:
         """Check ranges."""

@@ -29,13 +29,13 @@ class GroundModel:
     wave_rad_m: FloatArray
     """(waves, 2) wave vectors of the rolling ground, radians per metre."""
     wave_height_m: FloatArray
-    """(waves,) amplitudes."""
+    """(waves,) amplitude of each wave, metres."""
     wave_phase_rad: FloatArray
-    """(waves,) phases."""
+    """(waves,) phase of each wave at the origin, radians."""
     rocks: float
     """Share of square metres with a rock on them."""
     rock_key: int
-    """Which rocks."""
+    """Seed of the rocks: where they lie, and how large they are."""
     ridge_centre_m: FloatArray
     """(2,) x and y of the middle of the basin that the ridge surrounds."""
     ridge_distance_m: float

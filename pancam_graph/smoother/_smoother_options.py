@@ -69,7 +69,7 @@ class Closure:
     other: str
     """Id of the stop of that part which shares most of the tracks."""
     observations: int
-    """Their number."""
+    """Number of the observations that close the loop."""
     inliers: float
     """Share of the observations that agree on one pose of the stop."""
     sigmas: float
@@ -106,7 +106,7 @@ class Update:
     closures: tuple[Closure, ...] = ()
     """Loop closures that were tested."""
     warnings: tuple[str, ...] = ()
-    """Sentences for the user."""
+    """What a user should know of the update, a sentence each."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -114,10 +114,10 @@ class Estimate:
     """Estimated mast poses and angles, in the order in which stops were added."""
 
     stops: tuple[str, ...]
-    """Ids."""
+    """Id of each stop."""
     world_T_mast: tuple[gtsam.Pose3, ...]
-    """Of each stop."""
+    """Mast pose of each stop."""
     frames: tuple[str, ...]
-    """Ids."""
+    """Id of each frame."""
     pan_tilt_rad: FloatArray
-    """(frames, 2) pan and tilt"""
+    """(frames, 2) pan and tilt of each frame, radians"""

@@ -152,9 +152,9 @@ class Ended:
     """End of a fit."""
 
     problem: Problem
-    """At the optimum."""
+    """The problem with its values at the optimum."""
     system: LandmarkSystem
-    """Of the observations that take part."""
+    """The eliminated system of the observations that take part."""
     rows: IntArray
     """(n,) rows of the system's landmarks among all."""
     joint: Root | None

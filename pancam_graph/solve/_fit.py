@@ -25,7 +25,7 @@ class Fitted:
 
     screened: Screened
     problem: Problem
-    """At the optimum."""
+    """The problem with its values at the optimum."""
     outcome: Outcome
     """How the iterations ended; costs of all rounds."""
     noise: PixelNoise

@@ -24,12 +24,12 @@ class Judged:
 
     fitted: Fitted
     state: State
-    """At the optimum."""
+    """Poses, angles and landmarks at the optimum."""
     uncertainty: Uncertainty
     used: BoolArray
     """(observations,) whether each took part in the fit."""
     warnings: tuple[str, ...]
-    """Those of all stages."""
+    """Warnings of all stages, a sentence each."""
 
 
 def judge(fitted: Fitted) -> Judged:

@@ -42,9 +42,9 @@ class Iteration:
     stage: str
     """"screening" while outliers are sought, "approach" from afar, "solve" for the final least squares."""
     number: int
-    """From 1 on."""
+    """Number of the iteration in its stage, from 1."""
     cost: float
-    """After the iteration."""
+    """Cost after the iteration."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,7 +52,7 @@ class Outcome:
     """Result of the iterations."""
 
     values: gtsam.Values
-    """At the end."""
+    """Values of the variables after the last iteration."""
     converged: bool
     """Whether a rule of convergence ended the iterations."""
     reason: str

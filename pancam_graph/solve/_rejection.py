@@ -39,7 +39,7 @@ class Snooping:
 
     landmarks: Landmarks
     accepted: BoolArray
-    """(n,)"""
+    """(n,) whether each observation is to be believed."""
     scale: float
     """Robust estimate of the noise, in units of the given sigmas."""
     behind: BoolArray
