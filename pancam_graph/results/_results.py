@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pancam_graph.base.errors import InputError
-from pancam_graph.base.whole_files import whole_folder
+from pancam_graph.base.whole_files import recover, whole_folder
 from pancam_graph.data import Solution
 from pancam_graph.images import CACHE, is_cache
 from pancam_graph.io import refused_by_schema
@@ -24,15 +24,17 @@ __all__ = ["check_out", "write_results"]
 def check_out(out: Path | str) -> None:
     """Make sure that results can go to `out`, without writing anything; for before a long solve.
 
+    Where a run that wrote to `out` was killed, the older results that it had moved aside come back first.
     Raises InputError unless `out` is new, an empty folder, or a folder with nothing but older results and
     the cache of a run, interrupted or not, and its place can be written to.
     """
     out = Path(out)
     expected = f"{out}: expected a new folder or one of older results"
     try:
+        target = out.resolve()
+        recover(target, keep=CACHE)
         if out.is_symlink() and not out.exists():
             raise InputError(f"{expected}, found a link that leads nowhere")
-        target = out.resolve()
         if not out.exists():
             parent = next(p for p in target.parents if p.exists())
         elif not out.is_dir():

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from pancam_graph.base.errors import InputError
-from pancam_graph.base.whole_files import whole_file, whole_folder
+from pancam_graph.base.whole_files import recover, whole_file, whole_folder
 from pancam_graph.io import write_traverse
 from pancam_graph.simulate._drive import Truth
 from pancam_graph.simulate._render import Rendering
@@ -30,7 +30,8 @@ def write_truth(truth: Truth, folder: Path) -> None:
 
 
 def check_new(folder: Path) -> None:
-    """Raise InputError unless a folder is new or empty."""
+    """Raise InputError unless a folder is new or empty; what a killed run has left beside it is deleted."""
+    recover(folder)
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         raise InputError(f"{folder}: expected a new or empty folder, found files")
 
