@@ -7,7 +7,7 @@ vector of all angles of a stop. A `Seat` reads one of the caller's variables fro
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -22,9 +22,10 @@ __all__ = ["GivenFactor", "Seat", "UserFactors", "check_given", "given_factors",
 UserFactors = Sequence[gtsam.NonlinearFactor] | gtsam.NonlinearFactorGraph | gtsam.NonlinearFactor
 """Factors as a caller may pass them: a sequence, a graph, or one factor."""
 
-_T = TypeVar("_T")
 _WORST = 1e30
 """Cost that stands for an error that is not finite, so that an optimiser rejects the step."""
+_STEEPEST = 1e14
+"""Largest whitened Jacobian: beyond it, rounding of a pose of some metres changes the cost."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,6 +81,8 @@ class GivenFactor:
 
         Raises SolveError where the factor raises an exception, or is not finite.
         """
+        if isinstance(self.factor, gtsam.CustomFactor):  # its function may return another shape anywhere
+            self.require_shapes(values)
         try:
             linear = self.factor.linearize(values)
             jacobian, minus_residual = linear.jacobian()
@@ -88,6 +91,31 @@ class GivenFactor:
         if not (np.all(np.isfinite(jacobian)) and np.all(np.isfinite(minus_residual))):
             raise SolveError(f"{self.name}: expected finite residuals and Jacobians, found NaN or infinity")
         return list(linear.keys()), jacobian, -minus_residual
+
+    def require_shapes(self, values: gtsam.Values) -> None:
+        """Evaluate a factor with a noise model, whose residual and Jacobians must fit it and each other.
+
+        GTSAM itself reads beyond the end of a Jacobian with too few rows. Raises SolveError for shapes that
+        do not fit, and where the factor raises an exception.
+        """
+        jacobians = gtsam.JacobianVector([np.zeros((0, 0))] * len(self.keys))
+        try:
+            rows = len(np.atleast_1d(self.factor.unwhitenedError(values, jacobians)))
+        except Exception as error:  # a caller's function may raise any
+            raise SolveError(f"{self.name}: expected an error vector, found {_said(error)}") from error
+        noise = self.factor.noiseModel()
+        if noise is not None and noise.dim() != rows:
+            raise SolveError(
+                f"{self.name}: expected a noise model of {rows} rows as its error vector has, "
+                f"found {noise.dim()}"
+            )
+        for key, jacobian in zip(self.keys, jacobians, strict=True):
+            if jacobian.shape != (rows, dim := _dim(values, key)):
+                shown = gtsam.DefaultKeyFormatter(key)
+                raise SolveError(
+                    f"{self.name}: expected for {shown} a Jacobian of {rows} x {dim}, "
+                    f"found {jacobian.shape[0]} x {jacobian.shape[1]}"
+                )
 
 
 def given_factors(factors: UserFactors | None, keys: GraphKeys) -> tuple[GivenFactor, ...]:
@@ -98,6 +126,8 @@ def given_factors(factors: UserFactors | None, keys: GraphKeys) -> tuple[GivenFa
         factors = [factors.at(i) for i in range(factors.size())]
     elif isinstance(factors, gtsam.NonlinearFactor):
         factors = [factors]
+    if not isinstance(factors, Iterable):
+        raise InputError(f"factors: expected GTSAM factors in a sequence or a graph, found {_kind(factors)}")
     out = []
     for i, factor in enumerate(factors):
         if not isinstance(factor, gtsam.NonlinearFactor):
@@ -107,7 +137,11 @@ def given_factors(factors: UserFactors | None, keys: GraphKeys) -> tuple[GivenFa
             raise InputError(f"{where}: expected a factor on one variable or more, found it on none")
         names = [keys.name(key, where) for key in factor.keys()]  # noqa: SIM118  a gtsam factor
         name = f"factors: factor {i} ({_kind(factor)} on {', '.join(names)})"
+        if len(set(factor.keys())) < len(names):
+            raise InputError(f"{name}: expected each variable once, found one twice")
         noise = factor.noiseModel() if hasattr(factor, "noiseModel") else None
+        if isinstance(noise, gtsam.noiseModel.Robust):
+            noise = noise.noise()
         if noise is not None and noise.isConstrained():
             raise InputError(
                 f"{name}: expected sigmas above 0, found a constraint; a sigma far below the others' does it"
@@ -116,54 +150,37 @@ def given_factors(factors: UserFactors | None, keys: GraphKeys) -> tuple[GivenFa
     return tuple(out)
 
 
-def check_given(
-    given: Iterable[GivenFactor], seats: Mapping[int, Seat], values: gtsam.Values, keys: GraphKeys
-) -> None:
+def check_given(given: Iterable[GivenFactor], seats: Mapping[int, Seat], values: gtsam.Values) -> None:
     """Evaluate factors once at values of a template, before GTSAM does it unguarded.
 
     Raises InputError naming the factor for one that cannot move anything, raises an exception, is not finite,
-    or has a noise model or a Jacobian of another size than its residual and its variables.
+    has a noise model or a Jacobian of another size than its residual and its variables, or sigmas so small
+    that rounding alone is many of them.
     """
     for one in given:
         if not any(seats[key].parts for key in one.keys):
             raise InputError(
                 f"{one.name}: expected a variable that is free, found only such as telemetry holds (sigma 0)"
             )
-        _check(one, _own_values(one, seats, values), {key: keys.dim(key) for key in one.keys})
+        _check(one, _own_values(one, seats, values))
 
 
-def _check(one: GivenFactor, values: gtsam.Values, dim: Mapping[int, int]) -> None:
-    factor = one.factor
-    if isinstance(factor, gtsam.NoiseModelFactor):
-        jacobians = gtsam.JacobianVector([np.zeros((0, 0))] * len(one.keys))
-        residual = _called(one, lambda: np.atleast_1d(factor.unwhitenedError(values, jacobians)))
-        noise, n = factor.noiseModel(), len(residual)
-        if noise is not None and noise.dim() != n:
-            raise InputError(
-                f"{one.name}: expected a noise model of {n} rows as its error vector has, found {noise.dim()}"
-            )
-        # GTSAM itself reads beyond the end of a Jacobian with too few rows.
-        for key, jacobian in zip(one.keys, jacobians, strict=True):
-            if jacobian.shape != (n, dim[key]):
-                shown = gtsam.DefaultKeyFormatter(key)
-                raise InputError(
-                    f"{one.name}: expected for {shown} a Jacobian of {n} x {dim[key]}, "
-                    f"found {jacobian.shape[0]} x {jacobian.shape[1]}"
-                )
-    cost = _called(one, lambda: float(factor.error(values)))
-    if not np.isfinite(cost):
-        raise InputError(f"{one.name}: expected a finite error at the start, found {cost}")
+def _check(one: GivenFactor, values: gtsam.Values) -> None:
     try:
-        one.linear(values)
+        if isinstance(one.factor, gtsam.NoiseModelFactor):
+            one.require_shapes(values)
+        if one.cost(values) >= _WORST:
+            found = one.factor.error(values)
+            raise InputError(f"{one.name}: expected a finite error at the start, found {found}")
+        _, jacobian, _ = one.linear(values)
     except SolveError as error:
         raise InputError(str(error)) from error
-
-
-def _called(one: GivenFactor, evaluate: Callable[[], _T]) -> _T:
-    try:
-        return evaluate()
-    except Exception as error:  # a caller's function may raise any
-        raise InputError(f"{one.name}: expected an error vector, found {_said(error)}") from error
+    steepest = float(np.abs(jacobian).max(initial=0.0))
+    if steepest > _STEEPEST:
+        raise InputError(
+            f"{one.name}: expected at most {_STEEPEST:.0e} sigmas per radian or metre, as 64 bits "
+            f"resolve, found {steepest:.1e}"
+        )
 
 
 def seated(given: GivenFactor, seats: Mapping[int, Seat]) -> gtsam.CustomFactor | None:

@@ -15,6 +15,8 @@ from pancam_graph.graph._rig_variables import RigVariable, RigVariables
 __all__ = ["GraphKeys"]
 
 _NAMED = 6
+_INDEX_BITS = 56
+"""A key of GTSAM is a letter above so many bits of an index."""
 _CALLED: dict[Quantity, str] = {
     "calibration": "calibration",
     "mounts": "mount",
@@ -100,12 +102,13 @@ class GraphKeys:
         """Name of a variable in words. Raises InputError, beginning with `where`, for an unknown key."""
         if key in self._name:
             return self._name[key]
-        shown = gtsam.DefaultKeyFormatter(key)
-        letter, index = chr(gtsam.symbolChr(key)), gtsam.symbolIndex(key)
+        # By hand: GTSAM fails on letters that are no ASCII.
+        letter, index = chr(key >> _INDEX_BITS), key & ((1 << _INDEX_BITS) - 1)
+        shown = f"{letter}{index}" if letter.isascii() and letter.isalpha() else str(key)
         alike = [k for k in self._name if chr(gtsam.symbolChr(k)) == letter]
         hint = ""
         if alike:
-            nearest = min(alike, key=lambda k: abs(int(gtsam.symbolIndex(k)) - int(index)))
+            nearest = min(alike, key=lambda k: abs(int(gtsam.symbolIndex(k)) - index))
             hint = f"; is {gtsam.DefaultKeyFormatter(nearest)}, the {self._name[nearest]}, meant?"
         elif letter == Kind.LANDMARK.value:
             hint = "; factors on terrain points are not supported yet"

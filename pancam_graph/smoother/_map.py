@@ -87,7 +87,7 @@ class DriveMap:
         """
         given = given_factors(factors, template.keys)
         seats = template.seats(given)
-        check_given(given, seats, values, template.keys)
+        check_given(given, seats, values)
         new: FactorList = [factor for one in given if (factor := seated(one, seats)) is not None]
         self.given += given
         self.seated += new

@@ -191,7 +191,7 @@ def _first_state(traverse: Traverse, start: Start, cameras: FreeCameras | None) 
 def _factors(template: FactorTemplate, values: gtsam.Values, factors: UserFactors | None) -> Factors:
     """Priors and ties of the rig, and the caller's factors, each evaluated once at the start."""
     given = given_factors(factors, template.keys)
-    check_given(given, template.seats(given), values, template.keys)
+    check_given(given, template.seats(given), values)
     return template.factors(given)
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from itertools import count
 
 import gtsam
 import numpy as np
@@ -269,6 +270,10 @@ def test_errors_are_as_large_as_covariances_say_over_many_seeds(way: str) -> Non
 # --- bad input ---
 
 
+def robust(noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(1.0), noise)
+
+
 def identity(dim: int) -> Callable[[int], FloatArray]:
     return lambda _place: np.eye(dim)
 
@@ -291,6 +296,22 @@ def bad() -> dict[str, tuple[object, str]]:
         "a landmark": (
             [gtsam.PriorFactorPoint3(int(gtsam.symbol("L", 0)), np.zeros(3), noise(3, 1.0))],
             "factors on terrain points are not supported yet",
+        ),
+        "a key that is no symbol": (
+            [gtsam.PriorFactorPose3(2**64 - 1, gtsam.Pose3(), noise(6, 1.0))],
+            "angles of 12 frames; found 18446744073709551615",
+        ),
+        "a variable twice": (
+            [gtsam.BetweenFactorPose3(mast, mast, gtsam.Pose3(), noise(6, 1.0))],
+            "on mast of stop0001, mast of stop0001): expected each variable once, found one twice",
+        ),
+        "a constraint in a robust loss": (
+            [gtsam.PriorFactorPose3(mast, gtsam.Pose3(), robust(gtsam.noiseModel.Constrained.All(6)))],
+            "expected sigmas above 0, found a constraint",
+        ),
+        "sigmas below rounding": (
+            [gtsam.PriorFactorPose3(mast, t.stops[1].world_T_mast, noise(6, 1e-18))],
+            "expected at most 1e+14 sigmas per radian or metre, as 64 bits resolve, found 1.0e+18",
         ),
         "another type": (
             [gtsam.PriorFactorPose3(angles, gtsam.Pose3(), noise(6, 1.0))],
@@ -337,6 +358,25 @@ def test_a_bad_factor_is_told_in_one_sentence(what: str) -> None:
     assert text.startswith("factors: factor 0")
     assert expected in text
     assert "\n" not in text
+
+
+def test_no_factors_at_all_are_told_too() -> None:
+    with pytest.raises(
+        InputError, match="factors: expected GTSAM factors in a sequence or a graph, found int"
+    ):
+        solve(near(), HARD, factors=5)  # type: ignore[arg-type]  # bad input
+
+
+def test_a_jacobian_that_changes_its_shape_on_the_way_is_no_crash() -> None:
+    """GTSAM would read beyond its end."""
+    t = near()
+    mast = graph_keys(t).mast(t.stops[1].id)
+    calls = count()
+    factor = custom([mast], 2, lambda _: np.zeros(2), lambda _: np.zeros((2 if next(calls) < 3 else 1, 6)))
+    with pytest.raises(
+        SolveError, match=r"on mast of stop0001\): expected for M1 a Jacobian of 2 x 6, found 1"
+    ):
+        solve(t, WAYS["hard, explicit"], factors=[factor])
 
 
 def test_a_factor_that_fails_on_the_way_is_named() -> None:
