@@ -12,11 +12,14 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Iterator
+import signal
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
+from types import FrameType
 
 __all__ = ["recover", "whole_file", "whole_folder"]
 
@@ -90,25 +93,59 @@ def whole_folder(path: Path, *, keep: str | None = None) -> Iterator[Path]:
     What was at `path` is moved aside just before the renaming and deleted just after it, except for its entry
     of the name `keep`, which moves into the new folder. If the block raises or the renaming fails, the new
     folder is deleted and `path` is as before. Missing parents are made. If the process is killed, `recover`
-    brings back the older folder; it is called here first.
+    brings back the older folder; it is called here first. An interrupt during the renaming waits until
+    that is done, and its text then says that `path` was written.
     """
     path = path.resolve()  # a link stays, and what it leads to is replaced
     path.parent.mkdir(parents=True, exist_ok=True)
     recover(path, keep=keep)
-    with _claimed(path) as beside:
-        partial, older = beside.partial, beside.older
-        try:
-            partial.mkdir()
-            yield partial
-            if path.exists():
-                path.rename(older)
-                if keep is not None and (older / keep).exists():
-                    (older / keep).rename(partial / keep)
-            partial.rename(path)
-        except BaseException:  # an interrupt from the keyboard too
-            _undo(beside, keep)
-            raise
-        _delete_older(beside)
+    is_written = False
+    try:
+        with _claimed(path) as beside:
+            partial, older = beside.partial, beside.older
+            try:
+                partial.mkdir()
+                yield partial
+                with _uninterrupted():
+                    if path.exists():
+                        path.rename(older)
+                        if keep is not None and (older / keep).exists():
+                            (older / keep).rename(partial / keep)
+                    partial.rename(path)
+                    is_written = True
+                    _delete_older(beside)
+            except BaseException:  # an interrupt from the keyboard too
+                if not is_written:
+                    with _uninterrupted():
+                        _undo(beside, keep)
+                raise
+    except KeyboardInterrupt as interrupt:
+        if is_written:
+            raise KeyboardInterrupt(f"interrupted; {path} was written whole before") from interrupt
+        raise
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Signals to end the program wait while the block runs; then their handlers are called."""
+    if threading.current_thread() is not threading.main_thread():  # only the main thread has handlers
+        yield
+        return
+    waiting: list[tuple[int, FrameType | None]] = []
+    handlers: dict[int, Callable[[int, FrameType | None], object]] = {}
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)  # Windows has no SIGHUP
+        handler = None if number is None else signal.getsignal(number)
+        if number is not None and callable(handler):
+            handlers[number] = handler
+            signal.signal(number, lambda signum, frame: waiting.append((signum, frame)))
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        for number, frame in waiting:
+            handlers[number](number, frame)
 
 
 def recover(path: Path, *, keep: str | None = None) -> None:

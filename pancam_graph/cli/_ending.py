@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from pancam_graph.base.errors import PancamGraphError
 from pancam_graph.base.text import shortened
@@ -28,7 +28,7 @@ def status_of(main: Callable[[], int]) -> int:
     """Run a program and return its exit status; a failure is one sentence on standard error.
 
     2 for bad input, for too little memory, and for a fault of the program itself, of which a full report is
-    written into the temporary folder; 130 for Ctrl-C and for SIGTERM; else what the program returns.
+    written into the temporary folder; 130 for Ctrl-C, SIGTERM and SIGHUP; else what the program returns.
     """
     with ready_streams():
         return _status_of(main)
@@ -36,7 +36,7 @@ def status_of(main: Callable[[], int]) -> int:
 
 def _status_of(main: Callable[[], int]) -> int:
     try:
-        with _sigterm_as_interrupt():
+        with _signals_as_interrupt():
             status = main()
     except SystemExit as end:  # argparse: 0 after --help, 2 after a complaint
         status = end.code if isinstance(end.code, int) else 0 if end.code is None else BAD_INPUT
@@ -61,17 +61,31 @@ def _status_of(main: Callable[[], int]) -> int:
 
 
 @contextmanager
-def _sigterm_as_interrupt() -> Iterator[None]:
-    """While the block runs, SIGTERM interrupts the program as Ctrl-C does."""
+def _signals_as_interrupt() -> Iterator[None]:
+    """While the block runs, SIGTERM and SIGHUP interrupt the program as Ctrl-C does.
+
+    A signal that is ignored stays so: nohup ignores SIGHUP, a shell Ctrl-C for what runs in the background.
+    """
     if threading.current_thread() is not threading.main_thread():  # only it may set handlers
         yield
         return
+    came: list[int] = []
 
     def interrupt(signum: int, frame: FrameType | None) -> NoReturn:
+        came.append(signum)
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, interrupt)
+    before: dict[int, Any] = {}
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)  # Windows has no SIGHUP
+        if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
+            before[number] = signal.signal(number, interrupt)
     try:
         yield
+    except Exception as error:
+        if came:  # raised within C code, which made an exception of its own of it
+            raise KeyboardInterrupt from error
+        raise
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)

@@ -20,8 +20,8 @@ def resumable(out: Path) -> Iterator[None]:
     before = [path for path in (out, cache_folder(out)) if path.exists()]
     try:
         yield
-    except KeyboardInterrupt:
-        if is_cache(cache_folder(out)):
+    except KeyboardInterrupt as interrupt:
+        if not str(interrupt) and is_cache(cache_folder(out)):
             raise KeyboardInterrupt(
                 f"interrupted; no results were written; what was found in the images so far is in "
                 f"{cache_folder(out)}: run the same command again to go on from there"

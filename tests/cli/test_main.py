@@ -219,8 +219,8 @@ def test_a_fault_in_a_subcommand_is_no_traceback_on_the_terminal(tmp_path: Path)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals and pipes are another thing there")
-@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_program_after_it_has_cleaned_up(sent: signal.Signals) -> None:
+@pytest.mark.parametrize("sent", ["SIGINT", "SIGTERM", "SIGHUP"])  # by name: Windows has no SIGHUP
+def test_a_signal_ends_the_program_after_it_has_cleaned_up(sent: str) -> None:
     code = """
 import signal, sys, time
 from pancam_graph.cli import run
@@ -238,9 +238,38 @@ run(work)
     ) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
-        process.send_signal(sent)
+        process.send_signal(getattr(signal, sent))
         out, err = process.communicate()
     assert (process.returncode, out, err) == (130, "cleaned up\n", "interrupted; nothing was written\n")
+
+
+def test_an_interrupt_that_c_code_made_an_error_of_is_one(capsys: Captured) -> None:
+    """As imports of extension modules do, and callbacks through C++."""
+
+    def work() -> int:
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except KeyboardInterrupt as interrupt:
+            raise ImportError("initialization failed") from interrupt
+        return 0
+
+    assert status_of(work) == 130
+    assert capsys.readouterr().err == "interrupted; nothing was written\n"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals and pipes are another thing there")
+def test_a_hangup_that_nohup_ignores_stays_ignored() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+
+        def work() -> int:
+            signal.raise_signal(signal.SIGHUP)
+            return 0
+
+        assert status_of(work) == 0
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals and pipes are another thing there")
@@ -291,7 +320,24 @@ def test_a_log_takes_the_place_of_nothing(tmp_path: Path, capsys: Captured) -> N
     assert (tmp_path / "thesis.tex").read_text() == "years of work"
     assert main([*words, str(tmp_path / "made" / "log")]) == 2
     assert "expected a log outside" in capsys.readouterr().err
+    assert main([*words, str(tmp_path / "made")]) == 2
+    assert "expected a log at another place than the results, found the same" in capsys.readouterr().err
     assert not (tmp_path / "made").exists()
+    page = str(tmp_path / "page.html")
+    assert main(["drive", page, "--stops", "2", "--log", page]) == 2
+    assert "found the same" in capsys.readouterr().err
+    assert not (tmp_path / "page.html").exists()
+
+
+@pytest.mark.parametrize(("place", "says"), [(".", "found a folder"), ("no/page.html", "found no folder")])
+def test_a_place_for_no_page_is_told_before_the_drive(
+    tmp_path: Path, capsys: Captured, place: str, says: str
+) -> None:
+    assert main(["drive", str(tmp_path / place), "--stops", "2"]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    assert says in err
 
 
 def test_a_fault_is_in_the_log_too(tmp_path: Path) -> None:
