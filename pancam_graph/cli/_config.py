@@ -62,7 +62,7 @@ def read_config(path: Path, parser: Parser, command: str, commands: Collection[s
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_bytes().decode("utf-8"))
+        return tomllib.loads(path.read_bytes().decode("utf-8-sig"))  # editors of Windows write a mark first
     except OSError as error:
         reason = error.strerror or str(error)
         raise InputError(f"{path}: expected a file of options, found none to read ({reason})") from error

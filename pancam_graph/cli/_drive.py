@@ -1,8 +1,10 @@
 """The subcommand drive: a simulated drive followed stop by stop, as a page."""
 
 import math
+import os
 from pathlib import Path
 
+from pancam_graph.base.errors import InputError
 from pancam_graph.cli._command import Command, Invocation
 from pancam_graph.cli._drive_options import add_rig_option
 from pancam_graph.cli._parser import CommandParser
@@ -27,6 +29,17 @@ def _add_options(parser: CommandParser) -> None:
     parser.add_argument("--seed", type=int, default=0, help="another seed, another drive (%(default)s)")
 
 
+def _check_page(page: Path) -> None:
+    """Raise InputError, before a long drive, for a place where no file can be written."""
+    expected = f"{page}: expected a place for an HTML file in a folder that exists"
+    if page.exists() and not page.is_file():  # a device would be replaced
+        raise InputError(f"{expected}, found {'a folder' if page.is_dir() else 'no file'} in its place")
+    if not page.parent.is_dir():
+        raise InputError(f"{expected}, found no folder {page.parent}")
+    if not os.access(page if page.exists() else page.parent, os.W_OK):
+        raise InputError(f"{expected}, found no permission to write there")
+
+
 def _work(call: Invocation) -> int:
     """Simulate, follow, write."""
     from pancam_graph import SimulationOptions, SmootherOptions, TraverseSmoother, simulate
@@ -40,6 +53,7 @@ def _work(call: Invocation) -> int:
         tilts_rad=(-0.2,), points_per_image=12, detection=0.4, noise_px=0.5, link_stops=2, reach_m=16.0,
         max_turn_rad=math.pi, max_zoom=6.0, sigma_stop_m=0.3, sigma_stop_rad=0.01,
     )  # fmt: skip
+    _check_page(arguments.out)
     steps: list[DriveStep] = []
     with call.progress.shown("simulating"):
         simulation = simulate(rig_template(arguments.rig), options, seed=arguments.seed)

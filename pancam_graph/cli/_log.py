@@ -80,8 +80,12 @@ def show_log(*, verbose: bool) -> None:
 
 
 def check_log_outside(file: Path | None, out: Path) -> None:
-    """Raise InputError for a log in the folder of results, which is replaced as a whole."""
-    if file is not None and out.resolve() in file.resolve().parents:
+    """Raise InputError for a log at the place of the results or in their folder, which is replaced whole."""
+    if file is None:
+        return
+    if out.resolve() == file.resolve():
+        raise InputError(f"{file}: expected a log at another place than the results, found the same")
+    if out.resolve() in file.resolve().parents:
         raise InputError(f"{file}: expected a log outside {out}, whose content is replaced, found it inside")
 
 

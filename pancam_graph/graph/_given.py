@@ -98,6 +98,7 @@ class GivenFactor:
         GTSAM itself reads beyond the end of a Jacobian with too few rows. Raises SolveError for shapes that
         do not fit, and where the factor raises an exception.
         """
+        assert isinstance(self.factor, gtsam.NoiseModelFactor)
         jacobians = gtsam.JacobianVector([np.zeros((0, 0))] * len(self.keys))
         try:
             rows = len(np.atleast_1d(self.factor.unwhitenedError(values, jacobians)))

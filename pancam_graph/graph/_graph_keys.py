@@ -96,14 +96,15 @@ class GraphKeys:
 
     def dim(self, key: int) -> int:
         """Number of the tangent's components of a key."""
-        return len(self._entries[key])
+        return len(self.entries(key))
 
     def name(self, key: int, where: str = "key") -> str:
         """Name of a variable in words. Raises InputError, beginning with `where`, for an unknown key."""
         if key in self._name:
             return self._name[key]
         # By hand: GTSAM fails on letters that are no ASCII.
-        letter, index = chr(key >> _INDEX_BITS), key & ((1 << _INDEX_BITS) - 1)
+        letter = chr(key >> _INDEX_BITS) if 0 <= key < 1 << 64 else ""
+        index = key & ((1 << _INDEX_BITS) - 1)
         shown = f"{letter}{index}" if letter.isascii() and letter.isalpha() else str(key)
         alike = [k for k in self._name if chr(gtsam.symbolChr(k)) == letter]
         hint = ""

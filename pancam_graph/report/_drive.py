@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pancam_graph.base.geometry import FloatArray, pose_arrays
+from pancam_graph.base.whole_files import whole_file
 from pancam_graph.report._escaped import escape
 from pancam_graph.report._look import AFTER, BEFORE, REJECTED, axis, layout
 from pancam_graph.report._map import ellipse_outlines, translation_covariance_in_world
@@ -68,8 +69,8 @@ class DriveStep:
 
 
 def write_drive(steps: Sequence[DriveStep], simulation: Simulation, path: Path | str) -> None:
-    """Write the replay as one self-contained HTML file; its folder must exist."""
-    Path(path).write_text(_page(steps, simulation), encoding="utf-8", newline="\n")
+    """Write the replay as one self-contained HTML file, whole or not at all; its folder must exist."""
+    whole_file(Path(path).resolve(), _page(steps, simulation).encode())
 
 
 def _page(steps: Sequence[DriveStep], simulation: Simulation) -> str:

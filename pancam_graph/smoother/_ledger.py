@@ -66,10 +66,12 @@ class Ledger:
         """Append observations of images (n,), rows of the drive's images; return their rows (n,).
 
         `carried_px` (n, 2) are their pixels in the pinhole of the same camera; `valid` (n,) whether these
-        exist.
+        exist. One that was removed takes its old row: an image sees a track once.
         """
-        n, new = len(observations), np.zeros(0)
-        rows = np.arange(self._n, self._n + n)
+        rows = self._find_among(self.all_with(Fate.REMOVED), image, observations.track)
+        is_new = rows < 0
+        n, new = int(is_new.sum()), np.zeros(0)
+        rows[is_new] = np.arange(self._n, self._n + n)
         for name, column in self._column.items():
             if len(column) < self._n + n:
                 new = np.zeros((max(2 * len(column), self._n + n), *column.shape[1:]), column.dtype)
@@ -132,13 +134,17 @@ class Ledger:
 
     def find(self, image: IntArray, track: IntArray) -> IntArray:
         """Rows (n,) of observations of tracks (n,) in images (n,); -1 for one that is not in the ledger."""
-        there = np.flatnonzero(self.fate != int(Fate.REMOVED))
+        return self._find_among(np.flatnonzero(self.fate != int(Fate.REMOVED)), image, track)
+
+    def _find_among(self, there: IntArray, image: IntArray, track: IntArray) -> IntArray:
+        """The same among some rows only."""
         if not len(there):
             return np.full(len(track), -1)
         known, wanted = _pairs(self.image[there], self.track[there]), _pairs(image, track)
         order = np.argsort(known, kind="stable")
         at = order[np.searchsorted(known[order], wanted).clip(max=len(order) - 1)]
-        return np.where(known[at] == wanted, there[at], -1)
+        rows: IntArray = np.where(known[at] == wanted, there[at], -1)
+        return rows
 
     def with_fate(self, rows: IntArray, fate: Fate) -> IntArray:
         """Those of the rows that have this fate."""

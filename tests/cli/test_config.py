@@ -71,6 +71,14 @@ def test_numbers_are_those_of_the_command_line_to_the_last_bit(tmp_path: Path) -
     assert list(from_file.tilts_rad) == list(typed.tilts_rad)
 
 
+def test_a_byte_order_mark_is_no_content(tmp_path: Path) -> None:
+    """Some editors of Windows write one before UTF-8."""
+    file = tmp_path / "options.toml"
+    file.write_bytes(b"\xef\xbb\xbf[refine]\r\nmodel = 'free'\r\n")
+    words = ["F", "--out", "o", "--config", str(file)]
+    assert parse(COMMANDS["refine"], words, "pancam-graph refine").model == "free"
+
+
 def test_the_command_line_wins(tmp_path: Path) -> None:
     text = (
         '[refine]\nout = "file"\nmodel = "free"\nexport = "colmap"\nstop = "max_iterations=3"\nmosaic = true'

@@ -89,3 +89,10 @@ def test_a_key_of_something_else_is_told_with_its_neighbour(traverse: Traverse, 
     assert "terrain points" in said(lambda: keys.name(int(gtsam.symbol("L", 0))))
     assert "no such variable" in said(lambda: keys.name(int(gtsam.symbol("R", 0))))
     assert np.all([keys.dim(keys.mast(s.id)) == 6 for s in traverse.stops])
+
+
+@pytest.mark.parametrize("key", [3, -1, 1 << 64, (1 << 64) - 1])
+def test_a_number_that_is_no_key_is_bad_input(keys: GraphKeys, key: int) -> None:
+    for ask in (keys.name, keys.dim, keys.entries):
+        with pytest.raises(InputError, match=rf"key: expected keys of graph_keys.*; found {key}$"):
+            ask(key)

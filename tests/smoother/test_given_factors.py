@@ -95,6 +95,28 @@ def test_stops_added_later_hang_on_the_factors() -> None:
     assert apart(smoother, batch.final.world_T_mast) < 2e-3
 
 
+def test_observations_that_were_removed_come_back_under_the_factors(tmp_path: Path) -> None:
+    smoother = followed(3)
+    some = factors_of(drive())[1:]
+    smoother.add_factors(some[:1])
+    observations = smoother.traverse.observations
+    assert observations is not None
+    cost, covariance = smoother.cost, smoother.covariance(drive().stops[2].id)
+    back = observations.select(np.arange(len(observations)) % 7 == 3)
+    smoother.remove(back)
+    assert smoother.cost < cost
+    smoother.add_observations(back)
+    assert smoother.cost == pytest.approx(cost, rel=1e-4)
+    assert smoother.covariance(drive().stops[2].id) == pytest.approx(covariance, rel=1e-3, abs=1e-10)
+    again = smoother.traverse.observations
+    assert again is not None
+    assert np.array_equal(again.uv_px, observations.uv_px)
+    smoother.add_factors(some[1:])
+    smoother.save(tmp_path / "drive.npz")
+    loaded = TraverseSmoother.load(tmp_path / "drive.npz", some)
+    assert loaded.cost == pytest.approx(smoother.cost, rel=1e-6)
+
+
 def test_a_kept_drive_goes_on_with_the_factors(tmp_path: Path) -> None:
     smoother = followed(3)
     some = factors_of(drive())[1:]
