@@ -21,6 +21,8 @@ from typing import Any, TypeVar, cast
 
 import numba
 
+from pancam_graph.base.kept_code import KeptCode, kept_code
+
 __all__ = ["Compiling", "entry", "folder_digest", "inlined", "is_on_disk", "part", "uncounted"]
 
 _F = TypeVar("_F", bound=Callable[..., Any])
@@ -54,7 +56,11 @@ class Compiling:
         """Compile a function that Python calls, and keep the machine code on disk."""
         digest = folder_digest(Path(function.__code__.co_filename).parent)
         function.__qualname__ = f"{function.__qualname__}-{digest}"  # Numba names files after it
-        return self._compile(function, cache=True)
+        compiled: Any = self._compile(function)
+        kept = kept_code(function) if hasattr(compiled, "stats") else None  # without: compilation is off
+        if kept is not None:
+            compiled._cache = kept  # as cache=True sets one that fails where no folder can be written to
+        return cast(_F, compiled)
 
     def part(self, function: _F) -> _F:
         """Compile a function that only compiled functions call."""
@@ -84,11 +90,7 @@ def is_on_disk(function: Callable[..., Any]) -> bool:
 
     True where compilation is switched off (NUMBA_DISABLE_JIT).
     """
-    stats: Any = getattr(function, "stats", None)
-    if stats is None:
+    if not hasattr(function, "stats"):
         return True
-    try:
-        # Only Numba itself knows whether it takes what is on disk, and does not tell through a public name.
-        return bool(cast(Any, function)._cache._cache_file._load_index())
-    except AttributeError:
-        return any(Path(stats.cache_path).glob(f"*.{function.__qualname__}-*.nbi"))
+    kept = cast(Any, function)._cache
+    return isinstance(kept, KeptCode) and kept.is_there

@@ -32,29 +32,35 @@ class _Lines(logging.Formatter):
 
 
 class _ToStandardError(logging.Handler):
-    """Messages as lines on standard error."""
+    """Messages as lines on standard error, each with its level in front."""
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write a message."""
         write("stderr", f"{record.levelname:<8}{record.getMessage()}")
 
 
+class _Warnings(logging.Handler):
+    """Warnings as lines on standard error, as those of a solution stand there."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a message."""
+        write("stderr", f"warning: {record.getMessage()}")
+
+
 @contextmanager
 def logged(*, verbose: bool, file: Path | None) -> Iterator[None]:
     """While the block runs, the package's log goes to standard error if `verbose`, and to a file if given.
 
-    The file gets everything, with times: what it held before stays. Raises InputError where it cannot be
-    written, or holds what is no log of this program.
+    If not `verbose`, its warnings alone go to standard error. The file gets everything, with times: what it
+    held before stays. Raises InputError where it cannot be written, or holds what is no log of this program.
     """
     root, package = logging.getLogger(), logging.getLogger("pancam_graph")
     levels = root.level, package.level
-    handlers: list[logging.Handler] = []
-    if verbose:
-        handlers.append(_standard_error())
+    handlers = [_standard_error() if verbose else _Warnings(level=logging.WARNING)]
     if file is not None:
         handlers.append(_in_file(file))
     for handler in handlers:
-        root.addHandler(handler)
+        (root if handler.level < logging.WARNING else package).addHandler(handler)
     if verbose:
         root.setLevel(logging.INFO)
     if file is not None:
@@ -70,6 +76,7 @@ def logged(*, verbose: bool, file: Path | None) -> Iterator[None]:
         package.setLevel(levels[1])
         for handler in handlers:
             root.removeHandler(handler)
+            package.removeHandler(handler)
             handler.close()
 
 
