@@ -44,6 +44,7 @@ def save_smoother(state: SmootherState, path: Path) -> None:
         "version": _VERSION,
         "options": options,
         "n_given": state.n_given,
+        "origin": "given" if state.traverse.observations is None else state.traverse.observations.origin,
         "traverse": traverse_entries(state.traverse).model_dump(exclude={"sharing"}),
     }
     text = json.dumps(header, allow_nan=False, ensure_ascii=False).encode()
@@ -92,8 +93,9 @@ def _state(path: Path, header: dict[str, Any], arrays: dict[str, NDArray[Any]]) 
     traverse = traverse_of(validated(TraverseFile, header["traverse"], path), path.parent)
     if "observations_image" in arrays:
         columns: dict[str, Any] = {name: arrays[f"observations_{name}"] for name in _COLUMNS[:-1]}
-        covariance = arrays.get("observations_covariance_px2")
-        traverse = traverse.with_observations(Observations(**columns, covariance_px2=covariance))
+        columns |= {"covariance_px2": arrays.get("observations_covariance_px2")}
+        columns |= {"origin": "images" if header.get("origin") == "images" else "given"}
+        traverse = traverse.with_observations(Observations(**columns))
         if len(arrays["fate"]) != len(arrays["observations_image"]):
             raise ValueError("fate: another length than the observations")
     return SmootherState(

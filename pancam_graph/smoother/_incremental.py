@@ -22,9 +22,18 @@ from pancam_graph.data import (
     Traverse,
 )
 from pancam_graph.graph import HardTemplate, UserFactors
+from pancam_graph.smoother._ledger import Fate
 from pancam_graph.smoother._smoother import TraverseSmoother
 from pancam_graph.smoother._smoother_options import SmootherOptions, Update
-from pancam_graph.solve import SolveOptions, fitted_elsewhere, judge, prepare, screened_elsewhere, solution_of
+from pancam_graph.solve import (
+    SolveOptions,
+    fitted_elsewhere,
+    judge,
+    prepare,
+    screened_again,
+    screened_elsewhere,
+    solution_of,
+)
 
 __all__ = ["solve_incrementally", "stops_of"]
 
@@ -101,15 +110,27 @@ def _as_solution(
     updates: list[Update],
     factors: UserFactors | None,
 ) -> Solution:
-    """The smoother's estimate as a solution of the traverse."""
+    """The smoother's estimate as a solution of the traverse.
+
+    The outliers are judged once more, as `solve` does, now that all stops are known: what is kept should not
+    depend on the order in which they came. Rejected loop closures stay out.
+    """
     assert traverse.observations is not None
     used = np.zeros(len(traverse.observations), dtype=bool)
-    used[_rows_as_added(traverse)] = smoother.used
+    unbelieved = used.copy()
+    as_added = _rows_as_added(traverse)
+    used[as_added] = smoother.used
+    unbelieved[as_added] = smoother.state().fate == int(Fate.CLOSURE)
     costs = tuple(u.cost for u in updates)
     with blas_on_one_thread():
-        screened = screened_elsewhere(prepare(traverse, options, factors=factors), smoother.values(), used)
-        with_factors = costs if factors is None else (*costs, smoother.cost)
-        fitted = fitted_elsewhere(screened, with_factors, f"{len(updates)} stops added one by one")
+        before = screened_elsewhere(prepare(traverse, options, factors=factors), smoother.values(), used)
+        screened = screened_again(before, unbelieved)
+        fitted = fitted_elsewhere(
+            screened,
+            costs if factors is None else (*costs, smoother.cost),
+            f"{len(updates)} stops added one by one",
+            is_optimum=screened is before,
+        )
         solution = solution_of(judge(fitted))
     warnings = (w for u in updates for w in u.warnings)
     return replace(

@@ -1,7 +1,7 @@
 """All observations that a smoother was given, and the present use of each."""
 
 from enum import IntEnum
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,8 @@ class Fate(IntEnum):
     """Part of a loop closure that was rejected."""
     REMOVED = 5
     """Taken back by the caller."""
+    CHANCE = 6
+    """It fits, but among so many outliers chance alone explains that."""
 
 
 _COLUMNS: dict[str, tuple[tuple[int, ...], type]] = {
@@ -50,6 +52,7 @@ class Ledger:
             name: np.zeros((1024, *shape), dtype) for name, (shape, dtype) in _COLUMNS.items()
         }
         self.has_covariances = False
+        self._origin: Literal["given", "images"] = "given"
 
     def __len__(self) -> int:
         """Number of observations."""
@@ -80,6 +83,8 @@ class Ledger:
         self._n += n
         covariance = observations.covariance_px2
         self.has_covariances |= covariance is not None
+        if observations.origin == "images":
+            self._origin = "images"
         if covariance is None:
             covariance = np.square(observations.sigma_px)[:, None, None] * np.eye(2)
         fate = np.where(valid, int(Fate.WAITING), int(Fate.OUTSIDE))
@@ -130,6 +135,7 @@ class Ledger:
             uv_px=self._all("uv_px").copy(),
             sigma_px=self._all("sigma_px").copy(),
             covariance_px2=covariance,
+            origin=self._origin,
         )
 
     def find(self, image: IntArray, track: IntArray) -> IntArray:
@@ -145,6 +151,11 @@ class Ledger:
         at = order[np.searchsorted(known[order], wanted).clip(max=len(order) - 1)]
         rows: IntArray = np.where(known[at] == wanted, there[at], -1)
         return rows
+
+    @property
+    def is_out(self) -> BoolArray:
+        """(n,) whether each was judged and left out, alone or with its loop closure."""
+        return np.isin(self.fate, [int(Fate.OUTLIER), int(Fate.CHANCE), int(Fate.CLOSURE)])
 
     def with_fate(self, rows: IntArray, fate: Fate) -> IntArray:
         """Those of the rows that have this fate."""

@@ -150,20 +150,43 @@ class DriveMap:
         around = self.near_blocks(track) | set(self.station_of(rows).tolist())
         out = ledger.all_with(Fate.OUTLIER)
         rows = distinct(rows, out[np.isin(self.station_of(out), list(around))])
-        track = distinct(ledger.track[rows])
-        track_of_row, station = np.searchsorted(track, ledger.track[rows]), self.station_of(rows)
-        home = self.home(track)
-        known = home >= 0
-        enough = np.bincount(track_of_row, minlength=len(track)) >= 2
-        first = np.full(len(track), len(self.stations))
-        np.minimum.at(first, track_of_row, station)
-        home = np.where(known, home, np.where(enough, first, -1))
-        of_row = home[track_of_row]
+        of_row = self._home_or_first(rows)
         self._rebuild(
             [(name, rows[of_row == name], rows[:0]) for name in distinct(of_row[of_row >= 0]).tolist()],
             cameras,
             change,
         )
+
+    def _home_or_first(self, rows: IntArray) -> IntArray:
+        """Block (n,) that each row belongs to: its track's, or a new one by the first station that sees it.
+
+        -1 where the track has no landmark and only one row.
+        """
+        track = distinct(self.ledger.track[rows])
+        track_of_row = np.searchsorted(track, self.ledger.track[rows])
+        enough = np.bincount(track_of_row, minlength=len(track)) >= 2
+        home, first = self.home(track), np.full(len(track), len(self.stations))
+        np.minimum.at(first, track_of_row, self.station_of(rows))
+        return np.asarray(np.where(home >= 0, home, np.where(enough, first, -1))[track_of_row])
+
+    def use(
+        self, rows: IntArray, accepted: BoolArray, by_chance: BoolArray, cameras: Postures, change: Change
+    ) -> None:
+        """Use those of some rows (n,) that are accepted, and no others; rebuild their blocks without a test.
+
+        A row that is out `by_chance` is not tested again by later updates.
+        """
+        ledger = self.ledger
+        was_used = ledger.fate[rows] == int(Fate.USED)
+        new, lost = rows[accepted & ~was_used], rows[~accepted & was_used]
+        ledger.set_fate(rows[~accepted], Fate.OUTLIER)
+        ledger.set_fate(rows[by_chance], Fate.CHANCE)
+        ledger.set_fate(new, Fate.WAITING)
+        new = distinct(new, self.idle(ledger.track[new], Fate.WAITING))
+        of_new, of_lost = self._home_or_first(new), self.home(ledger.track[lost])
+        names = distinct(of_new[of_new >= 0], of_lost)
+        parts = [(name, new[of_new == name], lost[of_lost == name]) for name in names.tolist()]
+        self._rebuild(parts, cameras, change, tested=True)
 
     def give_up(self, rows: IntArray, cameras: Postures, change: Change) -> None:
         """Rebuild blocks without these rows, whose fate is set already.
@@ -201,9 +224,18 @@ class DriveMap:
                 change.touched.add(name)
 
     def _rebuild(
-        self, parts: Sequence[tuple[int, IntArray, IntArray]], cameras: Postures, change: Change
+        self,
+        parts: Sequence[tuple[int, IntArray, IntArray]],
+        cameras: Postures,
+        change: Change,
+        *,
+        tested: bool = False,
     ) -> None:
-        """Rebuild blocks, given for each its name, the rows to add and the rows to remove."""
+        """Rebuild blocks, given for each its name, the rows to add and the rows to remove.
+
+        `tested`: the rows are no outliers, and only those by cameras that their landmark lies behind go.
+        """
+        cutoff = None if tested else self._outlier_sigma
         names: list[int] = []
         work: list[tuple[Placed | None, Patch, IntArray, IntArray]] = []
         for name, rows, lost in parts:
@@ -218,18 +250,26 @@ class DriveMap:
             cameras.of_all(patch.stations)
             names.append(name)
             work.append((None if block is None else block.placed, patch, rows, lost))
-        for name, made in zip(names, each(lambda one: self._rebuilt(*one, cameras), work), strict=True):
+        rebuilt = each(lambda one: self._rebuilt(*one, cameras, cutoff), work)
+        for name, (*_, lost), made in zip(names, work, rebuilt, strict=True):
             self._settle(name, made, change)
+            self._set_home(np.setdiff1d(self.ledger.track[lost], made.seen.placed.track), -1)
 
     def _rebuilt(
-        self, known: Placed | None, patch: Patch, rows: IntArray, lost: IntArray, cameras: Postures
+        self,
+        known: Placed | None,
+        patch: Patch,
+        rows: IntArray,
+        lost: IntArray,
+        cameras: Postures,
+        cutoff_sigma: float | None,
     ) -> "_Rebuilt":
         """The rebuilt block; the state of the drive is not changed."""
         seen = gathered(self.ledger, self.image_station, patch, known, rows, lost)
         if not len(seen.placed.track):
             return _Rebuilt(seen=seen, stays=np.zeros(0, dtype=bool), block=None)
         views = patch.views(cameras)
-        seen = believed(placed_anew(seen, views), views, self._outlier_sigma)
+        seen = believed(placed_anew(seen, views), views, cutoff_sigma)
         placed, m = seen.placed, seen.placed.measurements
         stays = np.bincount(m.landmark, seen.accepted, minlength=m.n_landmarks) >= 2
         used = seen.accepted & stays[m.landmark]

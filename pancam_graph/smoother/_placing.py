@@ -19,7 +19,7 @@ from pancam_graph.landmarks import (
 from pancam_graph.smoother._ledger import Fate, Ledger
 from pancam_graph.smoother._sets import distinct
 from pancam_graph.smoother._station import Patch
-from pancam_graph.solve import snoop
+from pancam_graph.solve import robust_scale, snoop
 
 __all__ = ["Placed", "Seen", "believed", "combined", "gathered", "placed_anew"]
 
@@ -200,6 +200,7 @@ def believed(seen: Seen, views: CameraViews, cutoff_sigma: float | None) -> Seen
     # The noise scale comes from all landmarks of the block: the touched ones may be few, and all wrong.
     judged = count > 2
     scale = float(np.sqrt(np.median(total[judged] / (2 * count[judged] - 3)))) if judged.any() else 1.0
+    scale = robust_scale(scale, m, views, seen.accepted)
     rows = np.flatnonzero(suspect[m.landmark])
     part = m.part(rows)
     snooping = snoop(

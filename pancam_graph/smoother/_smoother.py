@@ -22,6 +22,7 @@ from pancam_graph.smoother._localise import localise
 from pancam_graph.smoother._map import Change, DriveMap
 from pancam_graph.smoother._nearness import by_nearness, sample
 from pancam_graph.smoother._odometry import guess, join, local_priors
+from pancam_graph.smoother._sets import distinct
 from pancam_graph.smoother._smoother_options import Estimate, SmootherOptions, Update
 from pancam_graph.smoother._state import SmootherState, state_of
 from pancam_graph.smoother._station import Postures, Station, copied
@@ -202,10 +203,10 @@ class TraverseSmoother:
         seen = sample(drive, station, near)
         if seen is not None:
             located = localise(station, known, seen, local_priors(station, previous, known), robust=True)
-            new.update(located.values)
             known.update(located.values)
         change = Change()
-        drive.take_in(near, Postures(known), change, far)
+        known = run.take_in(near, known, change, far, around)
+        new = copied(known, new.keys())
         first = drive.stations[0].shared_priors() if station.number == 0 else []
         run.advance(change, [*first, *station.factors(firm=False)], new)
         run.close_loops(far)
@@ -230,7 +231,8 @@ class TraverseSmoother:
             run.rows = drive.ledger.with_fate(self._append(observations, image), Fate.WAITING)
             near, far = by_nearness(drive, run.rows, {})
             change = Change()
-            drive.take_in(near, Postures(engine.estimate), change, far)
+            around = {n for i in distinct(drive.station_of(run.rows)).tolist() for n in drive.near(i)}
+            run.take_in(near, engine.estimate, change, far, around)
             run.advance(change)
             run.close_loops(far)
             return run.finished()

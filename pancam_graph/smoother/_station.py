@@ -77,13 +77,17 @@ class Station:
             out.insert(key, read_variable(values, name))
         return out
 
-    def start(self, world_T_mast: gtsam.Pose3) -> gtsam.Values:
-        """Initial values of its variables: the mast at a pose, angles from telemetry, the rig uncorrected."""
+    def start(self, world_T_mast: gtsam.Pose3, pan_tilt_rad: FloatArray | None = None) -> gtsam.Values:
+        """Initial values of its variables: the mast at a pose, angles (frames, 2), the rig uncorrected.
+
+        Without angles they are telemetry's.
+        """
         t = self.traverse
-        rotation, centre = t.camera_poses([world_T_mast])
+        pan_tilt_rad = t.pan_tilt_rad if pan_tilt_rad is None else pan_tilt_rad
+        rotation, centre = t.camera_poses([world_T_mast], pan_tilt_rad)
         state = State(
             world_T_mast=(world_T_mast,),
-            pan_tilt_rad=t.pan_tilt_rad,
+            pan_tilt_rad=pan_tilt_rad,
             world_R_camera=rotation,
             world_t_camera=centre,
             landmarks_m=np.zeros((0, 3)),

@@ -7,13 +7,15 @@ import gtsam
 import numpy as np
 
 from pancam_graph.base.geometry import IntArray
+from pancam_graph.graph import Kind, kind_of
 from pancam_graph.smoother._closure import Loop, bridge, judged, loops
 from pancam_graph.smoother._covariances import relative_covariance
 from pancam_graph.smoother._engine import Engine, Rounds
+from pancam_graph.smoother._judgement import judged_together, many_are_wrong
 from pancam_graph.smoother._ledger import Fate
 from pancam_graph.smoother._map import Change, DriveMap
 from pancam_graph.smoother._smoother_options import Closure, SmootherOptions, Update
-from pancam_graph.smoother._station import Postures, Station
+from pancam_graph.smoother._station import Postures, Station, copied
 from pancam_graph.smoother._warnings import warnings_of
 
 __all__ = ["UpdateRun"]
@@ -33,6 +35,33 @@ class UpdateRun:
         self._rejected = 0
         self._rounds: list[Rounds] = []
         self._closures: list[Closure] = []
+
+    def take_in(
+        self, rows: IntArray, values: gtsam.Values, change: Change, far: IntArray, around: set[int]
+    ) -> gtsam.Values:
+        """Assign observations to landmarks and reject outliers; the values to go on from.
+
+        Where too many are outliers for a test that holds the cameras, the stations `around`, given by number,
+        are judged together, and a new station is moved to where that puts it. Rows `far` take no part.
+        """
+        drive, options, ledger = self._drive, self._options, self._drive.ledger
+        before = ledger.is_out.copy()
+        drive.take_in(rows, Postures(values), change, far)
+        if options.outlier_sigma is None or not many_are_wrong(drive, self.rows):
+            return values
+        judgement = judged_together(drive, around, values, options, far)
+        if judgement is None:
+            return values
+        if self._station is not None:
+            moved = self._station.start(
+                judgement.world_T_mast[self._station.number], judgement.pan_tilt_rad[self._station.number]
+            )
+            own = [k for k in self._station.own_keys if kind_of(k) in {Kind.MAST, Kind.ANGLES}]
+            values = gtsam.Values(values)
+            values.update(copied(moved, own))
+        drive.use(judgement.rows, judgement.accepted, judgement.by_chance, Postures(values), change)
+        change.rejected = int(np.sum(ledger.is_out & ~before))
+        return values
 
     def advance(
         self,

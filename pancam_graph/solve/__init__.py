@@ -19,9 +19,11 @@ from pancam_graph.solve._optimise import parameters_of as parameters_of
 from pancam_graph.solve._prepare import Prepared as Prepared
 from pancam_graph.solve._prepare import prepare as prepare
 from pancam_graph.solve._problem import Problem as Problem
+from pancam_graph.solve._rejection import robust_scale as robust_scale
 from pancam_graph.solve._rejection import snoop as snoop
 from pancam_graph.solve._screen import Screened as Screened
 from pancam_graph.solve._screen import screen as screen
+from pancam_graph.solve._screen import screened_again as screened_again
 from pancam_graph.solve._screen import screened_elsewhere as screened_elsewhere
 from pancam_graph.solve._solution_of import solution_of as solution_of
 from pancam_graph.solve._solve import COMPILING as COMPILING

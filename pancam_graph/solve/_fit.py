@@ -71,13 +71,16 @@ def fit(screened: Screened) -> Fitted:
     )
 
 
-def fitted_elsewhere(screened: Screened, costs: Sequence[float], reason: str) -> Fitted:
+def fitted_elsewhere(
+    screened: Screened, costs: Sequence[float], reason: str, *, is_optimum: bool = True
+) -> Fitted:
     """A problem that was fitted elsewhere, over what it accepts: `costs` on the way, and why that ended.
 
-    Where residuals decide how large the noise is, or pixels depend on the range, the rounds of `fit` follow.
+    Where it is not the optimum of what it accepts, residuals decide how large the noise is, or pixels depend
+    on the range, the rounds of `fit` follow.
     """
     prepared, problem = screened.prepared, screened.problem
-    if prepared.rescales_noise or problem.template.rig_variables.pupil_moves:
+    if not is_optimum or prepared.rescales_noise or problem.template.rig_variables.pupil_moves:
         if is_carried_anew(problem):
             problem = carried_again(problem, prepared.observations, prepared.noise)
         fitted = fit(replace(screened, problem=problem))

@@ -25,7 +25,7 @@ from pancam_graph.landmarks import (
 )
 from pancam_graph.solve._noise_scale import noise_scale
 
-__all__ = ["Snooping", "pair_scale", "snoop"]
+__all__ = ["Snooping", "pair_scale", "robust_scale", "snoop"]
 
 _SUSPICIOUS = 3.0
 """The median of the tests is trusted up to this noise scale, or this multiple of the scale by pairs."""
@@ -79,11 +79,7 @@ def snoop(
     while len(which):  # each sweep takes an observation from every landmark that stays in it
         tests.update(which, fresh)
         if scale is None:
-            scale = tests.median_scale()
-            if scale > _SUSPICIOUS:
-                by_pairs = pair_scale(measurements, views, accepted)
-                scale = by_pairs if scale > _SUSPICIOUS * by_pairs else scale
-            scale = max(min_scale, scale)
+            scale = max(min_scale, robust_scale(tests.median_scale(), measurements, views, accepted))
         over_landmarks(
             kernel.reject,
             which,
@@ -108,6 +104,16 @@ def snoop(
         scale=min_scale if scale is None else scale,
         behind=~tests.in_front,
     )
+
+
+def robust_scale(
+    by_median: float, measurements: Measurements, views: CameraViews, accepted: BoolArray
+) -> float:
+    """A noise scale `by_median` of residuals, or `pair_scale` where most of these must be outliers."""
+    if by_median <= _SUSPICIOUS:
+        return by_median
+    by_pairs = pair_scale(measurements, views, accepted)
+    return by_pairs if by_median > _SUSPICIOUS * by_pairs else by_median
 
 
 def pair_scale(measurements: Measurements, views: CameraViews, accepted: BoolArray) -> float:

@@ -14,7 +14,7 @@ from pancam_graph.solve._problem import Problem, Solver
 from pancam_graph.solve._rejection import Snooping, snoop
 from pancam_graph.solve._stopping import StopRule
 
-__all__ = ["Screened", "ScreeningRounds", "screen", "screened_elsewhere"]
+__all__ = ["Screened", "ScreeningRounds", "screen", "screened_again", "screened_elsewhere"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -36,6 +36,8 @@ class Screened:
     """Cameras about where they fit; the measurements to use are accepted."""
     set_aside: BoolArray
     """(observations,) whether each was an outlier in any round, also if it was accepted again later."""
+    by_chance: BoolArray
+    """(observations,) whether each was left out though it fits, since chance alone explains its links."""
     is_near: bool
     """Whether the cameras were adjusted already, so that no rigid mast is fitted first."""
 
@@ -52,32 +54,52 @@ def screen(prepared: Prepared) -> Screened:
             prepared=prepared,
             problem=prepared.problem,
             set_aside=np.zeros(n, dtype=bool),
+            by_chance=np.zeros(n, dtype=bool),
             is_near=prepared.is_near,
         )
     rounds = ScreeningRounds(prepared)
     rounds.from_telemetry()
-    rounds.to_the_end()
-    return Screened(prepared=prepared, problem=rounds.problem, set_aside=rounds.set_aside, is_near=True)
+    rounds.bring_near()
+    return rounds.to_the_end()
 
 
 def screened_elsewhere(prepared: Prepared, values: gtsam.Values, used: BoolArray) -> Screened:
     """The prepared problem at values that were estimated elsewhere, with the observations (n,) used there."""
     accepted = used[prepared.problem.measurements.row]
     problem = triangulated(replace(prepared.problem, accepted=accepted, values=values)).placed()
-    return Screened(
-        prepared=prepared, problem=problem, set_aside=np.zeros(len(used), dtype=bool), is_near=True
-    )
+    nothing = np.zeros(len(used), dtype=bool)
+    return Screened(prepared=prepared, problem=problem, set_aside=nothing, by_chance=nothing, is_near=True)
+
+
+def screened_again(screened: Screened, excluded: BoolArray) -> Screened:
+    """The observations judged anew, from where the cameras are; those `excluded` (n,) are not accepted.
+
+    The same object, unless one test of all observations with the cameras held judges more than very few of
+    them otherwise. Where the residuals decide how large the noise is, they are always judged anew: whoever
+    judged them before did not know it.
+    """
+    prepared = screened.prepared
+    if prepared.options.loss == "none":
+        return screened
+    rounds = ScreeningRounds(replace(prepared, problem=screened.problem, is_near=True), excluded)
+    if prepared.rescales_noise or rounds.would_change() > _ABOUT:
+        return rounds.to_the_end()
+    return screened
 
 
 class ScreeningRounds:
     """Rounds of robust adjustment and data snooping: the problem as it stands, and what was set aside."""
 
-    def __init__(self, prepared: Prepared) -> None:
+    def __init__(self, prepared: Prepared, excluded: BoolArray | None = None) -> None:
+        """Rounds of a problem; observations `excluded` (n,) are never accepted."""
         self._prepared = prepared
         self._solver: Solver = solver_for(prepared.options, prepared.on_iteration, is_near=prepared.is_near)
         self.problem = prepared.problem
-        self._banned = np.zeros(len(prepared.problem.accepted), dtype=bool)
-        self.set_aside = np.zeros(len(prepared.observations), dtype=bool)
+        self._scale = 1.0
+        nothing = np.zeros(len(prepared.observations), dtype=bool)
+        self._banned = (nothing if excluded is None else excluded)[self.problem.measurements.row]
+        self.set_aside = nothing.copy()
+        self.by_chance = nothing.copy()
 
     def from_telemetry(self) -> None:
         """Set gross outliers aside at the start, where errors of telemetry add to the noise."""
@@ -95,13 +117,27 @@ class ScreeningRounds:
             )
         )
 
-    def to_the_end(self) -> None:
-        """Robust adjustment and data snooping in turn, in two passes, until the same observations stay."""
-        cutoff, scale = self._prepared.options.outlier_sigma, 1.0
+    def bring_near(self) -> None:
+        """The first pass: robust adjustment and data snooping in turn until few observations change."""
         for _ in range(_ROUNDS):
-            scale, n_changed = self._round(scale, cutoff, relative_decrease=1e-3)
+            self._scale, n_changed = self._round(
+                self._scale, self._prepared.options.outlier_sigma, relative_decrease=1e-3
+            )
             if n_changed <= _ABOUT * len(self.problem.accepted):
                 break
+
+    def would_change(self) -> float:
+        """Share of the observations that one test of all of them judges otherwise than they are."""
+        before = self.problem
+        self.problem = replace(before, accepted=~self._banned)
+        self._snoop(self._prepared.options.outlier_sigma)
+        share = float(np.mean(self.problem.accepted != before.accepted))
+        self.problem = before
+        return share
+
+    def to_the_end(self) -> Screened:
+        """Second passes until chance explains no link any more."""
+        cutoff, scale = self._prepared.options.outlier_sigma, self._scale
         for _ in range(_CHANCE_ROUNDS):
             scale = self._second_pass(scale, cutoff)
             by_chance = chance_links(
@@ -110,6 +146,14 @@ class ScreeningRounds:
             if not by_chance.any():
                 break
             self._banned |= by_chance
+            self.by_chance[self.problem.measurements.row[by_chance]] = True
+        return Screened(
+            prepared=self._prepared,
+            problem=self.problem,
+            set_aside=self.set_aside,
+            by_chance=self.by_chance,
+            is_near=True,
+        )
 
     def _second_pass(self, scale: float, cutoff: float) -> float:
         """From all observations but the grossest outliers until the same ones stay; the noise scale."""
