@@ -1,7 +1,7 @@
 """Observations of a few stations judged as `solve` judges those of a whole drive, where outliers are many.
 
-The tests of an update hold the cameras where a first localisation put them. That serves while most
-observations are right; where many are wrong, the localisation is off, and adjustment and tests must alternate.
+The test of an update holds the cameras where the first localisation put them. Where many observations are
+wrong, these have pulled the localisation away, so that adjustment and test must alternate.
 """
 
 from collections.abc import Iterable
@@ -23,7 +23,7 @@ from pancam_graph.solve import Screened, SolveOptions, prepare, screen
 __all__ = ["Judgement", "judged_together", "many_are_wrong"]
 
 _MANY = 0.2
-"""Share of outliers among the observations of an update, from which on their stations are judged together."""
+"""Largest share of outliers among the tested observations of an update with which that test is trusted."""
 _JUDGED = (Fate.WAITING, Fate.USED, Fate.OUTLIER, Fate.CHANCE)
 
 
@@ -36,7 +36,7 @@ class Judgement:
     accepted: BoolArray
     """(n,)"""
     by_chance: BoolArray
-    """(n,) whether each is left out though it fits."""
+    """(n,) whether each is left out though it fits, since chance alone explains its links."""
     world_T_mast: dict[int, gtsam.Pose3]
     """Mast pose by number of the station."""
     pan_tilt_rad: dict[int, FloatArray]
@@ -44,19 +44,19 @@ class Judgement:
 
 
 def many_are_wrong(drive: DriveMap, rows: IntArray) -> bool:
-    """Whether of the rows of an update that were tested so many are outliers that the test is in doubt."""
+    """Whether so many of the tested rows of an update are outliers that the test is in doubt."""
     fate = drive.ledger.fate[rows]
-    n_wrong = np.sum((fate == int(Fate.OUTLIER)) | (fate == int(Fate.CHANCE)))
-    return bool(n_wrong > _MANY * (n_wrong + np.sum(fate == int(Fate.USED))))
+    n_wrong = int(np.sum(fate == int(Fate.OUTLIER)))
+    return n_wrong > _MANY * (n_wrong + int(np.sum(fate == int(Fate.USED))))
 
 
 def judged_together(
     drive: DriveMap, stations: Iterable[int], values: gtsam.Values, options: SmootherOptions, but: IntArray
 ) -> Judgement | None:
-    """All observations between stations, given by number, judged by an adjustment of these stations alone.
+    """All observations of some stations, given by number, judged by an adjustment of these alone.
 
-    It starts at `values`. Rows `but` take no part. None where no track is seen twice, or where the stations
-    alone are not determined.
+    It starts at `values`. Rows `but`, removed ones and rejected loop closures take no part. None where no
+    track is seen twice, or where the stations alone are not determined.
     """
     members = [drive.stations[i] for i in sorted(stations)]
     ledger = drive.ledger
@@ -82,7 +82,7 @@ def judged_together(
 
 
 def _alone(members: list[Station], values: gtsam.Values, options: SmootherOptions) -> Traverse:
-    """The stations as a traverse. Odometry from others counts from where their estimate is."""
+    """The stations as a traverse; with odometry their priors are where `values` have them."""
     stops = [s.traverse.stops[0] for s in members]
     if options.telemetry == "odometry":
         stops = [replace(o, world_T_mast=s.world_T_mast(values)) for o, s in zip(stops, members, strict=True)]
@@ -96,6 +96,7 @@ def _alone(members: list[Station], values: gtsam.Values, options: SmootherOption
 
 
 def _judgement(rows: IntArray, members: list[Station], screened: Screened) -> Judgement:
+    """The outcome of a screening by rows of the ledger (observations,) and by station."""
     problem = screened.problem
     measured = problem.measurements.row
     state = problem.template.state(problem.values, np.zeros((0, 3)))

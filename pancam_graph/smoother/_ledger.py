@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.data import Observations
 
-__all__ = ["Fate", "Ledger"]
+__all__ = ["Fate", "Ledger", "left_out"]
 
 
 class Fate(IntEnum):
@@ -30,6 +30,8 @@ class Fate(IntEnum):
     CHANCE = 6
     """It fits, but among so many outliers chance alone explains that."""
 
+
+_LEFT_OUT = (Fate.OUTLIER, Fate.CLOSURE, Fate.CHANCE)
 
 _COLUMNS: dict[str, tuple[tuple[int, ...], type]] = {
     "image": ((), np.int64),
@@ -152,11 +154,6 @@ class Ledger:
         rows: IntArray = np.where(known[at] == wanted, there[at], -1)
         return rows
 
-    @property
-    def is_out(self) -> BoolArray:
-        """(n,) whether each was judged and left out, alone or with its loop closure."""
-        return np.isin(self.fate, [int(Fate.OUTLIER), int(Fate.CHANCE), int(Fate.CLOSURE)])
-
     def with_fate(self, rows: IntArray, fate: Fate) -> IntArray:
         """Those of the rows that have this fate."""
         with_it: IntArray = rows[self.fate[rows] == int(fate)]
@@ -169,6 +166,11 @@ class Ledger:
     def set_fate(self, rows: IntArray, fate: Fate) -> None:
         """Set the fate of some rows."""
         self.fate[rows] = int(fate)
+
+
+def left_out(fate: NDArray[np.int8]) -> BoolArray:
+    """(n,) whether each was judged and left out, alone or with its loop closure."""
+    return np.isin(fate, [int(one) for one in _LEFT_OUT])
 
 
 def _pairs(image: IntArray, track: IntArray) -> IntArray:

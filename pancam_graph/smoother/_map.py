@@ -172,9 +172,9 @@ class DriveMap:
     def use(
         self, rows: IntArray, accepted: BoolArray, by_chance: BoolArray, cameras: Postures, change: Change
     ) -> None:
-        """Use those of some rows (n,) that are accepted, and no others; rebuild their blocks without a test.
+        """Use those of some rows (n,) that are `accepted` (n,), and not the others, as they were judged.
 
-        A row that is out `by_chance` is not tested again by later updates.
+        Later updates do not test again what is left out `by_chance` (n,).
         """
         ledger = self.ledger
         was_used = ledger.fate[rows] == int(Fate.USED)

@@ -12,7 +12,7 @@ from pancam_graph.smoother._closure import Loop, bridge, judged, loops
 from pancam_graph.smoother._covariances import relative_covariance
 from pancam_graph.smoother._engine import Engine, Rounds
 from pancam_graph.smoother._judgement import judged_together, many_are_wrong
-from pancam_graph.smoother._ledger import Fate
+from pancam_graph.smoother._ledger import Fate, left_out
 from pancam_graph.smoother._map import Change, DriveMap
 from pancam_graph.smoother._smoother_options import Closure, SmootherOptions, Update
 from pancam_graph.smoother._station import Postures, Station, copied
@@ -39,13 +39,13 @@ class UpdateRun:
     def take_in(
         self, rows: IntArray, values: gtsam.Values, change: Change, far: IntArray, around: set[int]
     ) -> gtsam.Values:
-        """Assign observations to landmarks and reject outliers; the values to go on from.
+        """Assign observations to landmarks and reject outliers; returns the values to go on from.
 
-        Where too many are outliers for a test that holds the cameras, the stations `around`, given by number,
-        are judged together, and a new station is moved to where that puts it. Rows `far` take no part.
+        Where too many are outliers, the stations `around`, given by number, are judged together, and a new
+        station is put where that has it. Rows `far` take no part.
         """
         drive, options, ledger = self._drive, self._options, self._drive.ledger
-        before = ledger.is_out.copy()
+        before = ledger.fate.copy()
         drive.take_in(rows, Postures(values), change, far)
         if options.outlier_sigma is None or not many_are_wrong(drive, self.rows):
             return values
@@ -60,7 +60,7 @@ class UpdateRun:
             values = gtsam.Values(values)
             values.update(copied(moved, own))
         drive.use(judgement.rows, judgement.accepted, judgement.by_chance, Postures(values), change)
-        change.rejected = int(np.sum(ledger.is_out & ~before))
+        change.rejected = int(np.sum(left_out(ledger.fate) & ~left_out(before)))
         return values
 
     def advance(

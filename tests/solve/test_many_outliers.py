@@ -6,38 +6,13 @@ import numpy as np
 import pytest
 
 from pancam_graph import SimulationOptions, SolveOptions, simulate, solve
-from pancam_graph.base.geometry import FloatArray
-from pancam_graph.data import Solution
 from pancam_graph.rigs import TEMPLATES
-from pancam_graph.simulate import Simulation
-from pancam_graph.solve import prepare
+from pancam_graph.solve import prepare, screen, screened_again
 from pancam_graph.solve._chance_links import chance_links
+from support.truth import require_right
 
 DRIVE = SimulationOptions(stops=2)
 CUTOFF_PX = 4.0 * 0.3
-
-
-def errors_in_sigmas(simulation: Simulation, solution: Solution) -> tuple[FloatArray, FloatArray]:
-    """Errors of pan and tilt (frames, 2), and of the stops that are not held (stops,), in formal sigmas."""
-    angles = (solution.final.pan_tilt_rad - simulation.truth.pan_tilt_rad) / solution.angle_sigma_rad
-    stops = []
-    for pose, true, covariance in zip(
-        solution.final.world_T_mast, simulation.truth.world_T_mast, solution.stop_covariance, strict=True
-    ):
-        if covariance.any():
-            error = true.localCoordinates(pose)
-            stops.append(np.sqrt(error @ np.linalg.solve(covariance, error) / 6))
-    return angles, np.array(stops)
-
-
-def require_right(simulation: Simulation, solution: Solution) -> None:
-    angles, stops = errors_in_sigmas(simulation, solution)
-    wrong = simulation.truth.outlier
-    assert solution.converged
-    assert np.abs(angles).max() < 6
-    assert stops.max(initial=0.0) < 3
-    assert (~solution.used[wrong]).mean() > 0.99
-    assert np.isfinite(solution.rms_final_px)
 
 
 @pytest.mark.parametrize("share", [0.4, 0.6])
@@ -88,3 +63,18 @@ def test_a_link_of_one_track_among_many_that_were_rejected_is_not_believed() -> 
     outside = chance_links(replace(problem, accepted=accepted), CUTOFF_PX)
     assert set(m.landmark[outside]) == {link}
     assert set(frame[outside]) < {a, b}
+
+
+def test_judged_again_from_the_end_nothing_changes_but_what_is_excluded() -> None:
+    """Where few observations would change, none does; excluded ones stay out, whatever else does."""
+    simulation = simulate(TEMPLATES["mer-navcam"](), replace(DRIVE, outliers=0.1), seed=4)
+    screened = screen(prepare(simulation.traverse, SolveOptions()))
+    nothing = np.zeros(len(simulation.truth.outlier), dtype=bool)
+    assert screened_again(screened, nothing) is screened
+    excluded = nothing.copy()
+    excluded[::10] = True
+    problem = screened_again(screened, excluded).problem
+    kept, was_kept = problem.accepted, screened.problem.accepted
+    out = excluded[problem.measurements.row]
+    assert not kept[out].any()
+    assert (kept != was_kept)[~out].mean() < 0.1  # of pairs of which one is excluded the other goes too
