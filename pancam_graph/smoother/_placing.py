@@ -200,7 +200,7 @@ def believed(seen: Seen, views: CameraViews, cutoff_sigma: float | None) -> Seen
     # The noise scale comes from all landmarks of the block: the touched ones may be few, and all wrong.
     judged = count > 2
     scale = float(np.sqrt(np.median(total[judged] / (2 * count[judged] - 3)))) if judged.any() else 1.0
-    scale = robust_scale(scale, m, views, seen.accepted)
+    scale = robust_scale(scale, m, views)
     rows = np.flatnonzero(suspect[m.landmark])
     part = m.part(rows)
     snooping = snoop(

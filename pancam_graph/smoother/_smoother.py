@@ -193,11 +193,12 @@ class TraverseSmoother:
         """Localise a new station, and add its observations."""
         drive, engine = self._drive, self._engine
         known, new = gtsam.Values(engine.estimate), gtsam.Values()
-        start = station.start(guess(station, previous, engine.estimate))
-        for key in start.keys():  # noqa: SIM118  gtsam.Values is not a dictionary
+        said = station.start(guess(station, previous, engine.estimate))
+        for key in said.keys():  # noqa: SIM118  gtsam.Values is not a dictionary
             if not known.exists(key):
-                copied(start, [key], new)
+                copied(said, [key], new)
         known.insert(new)
+        start = gtsam.Values(known)
         around = drive.near(previous.number) | {station.number} if previous is not None else {station.number}
         near, far = by_nearness(drive, run.rows, {station.number: around})
         seen = sample(drive, station, near)
@@ -205,7 +206,7 @@ class TraverseSmoother:
             located = localise(station, known, seen, local_priors(station, previous, known), robust=True)
             known.update(located.values)
         change = Change()
-        known = run.take_in(near, known, change, far, around)
+        known = run.take_in(near, known, change, far, around, start)
         new = copied(known, new.keys())
         first = drive.stations[0].shared_priors() if station.number == 0 else []
         run.advance(change, [*first, *station.factors(firm=False)], new)
@@ -232,7 +233,7 @@ class TraverseSmoother:
             near, far = by_nearness(drive, run.rows, {})
             change = Change()
             around = {n for i in distinct(drive.station_of(run.rows)).tolist() for n in drive.near(i)}
-            run.take_in(near, engine.estimate, change, far, around)
+            run.take_in(near, engine.estimate, change, far, around, engine.estimate)
             run.advance(change)
             run.close_loops(far)
             return run.finished()

@@ -37,19 +37,25 @@ class UpdateRun:
         self._closures: list[Closure] = []
 
     def take_in(
-        self, rows: IntArray, values: gtsam.Values, change: Change, far: IntArray, around: set[int]
+        self,
+        rows: IntArray,
+        values: gtsam.Values,
+        change: Change,
+        far: IntArray,
+        around: set[int],
+        start: gtsam.Values,
     ) -> gtsam.Values:
         """Assign observations to landmarks and reject outliers; returns the values to go on from.
 
-        Where too many are outliers, the stations `around`, given by number, are judged together, and a new
-        station is put where that has it. Rows `far` take no part.
+        Where too many are outliers, the stations `around`, given by number, are judged together, from
+        `start`, and a new station is put where that has it. Rows `far` take no part.
         """
         drive, options, ledger = self._drive, self._options, self._drive.ledger
         before = ledger.fate.copy()
         drive.take_in(rows, Postures(values), change, far)
         if options.outlier_sigma is None or not many_are_wrong(drive, self.rows):
             return values
-        judgement = judged_together(drive, around, values, options, far)
+        judgement = judged_together(drive, around, start, options, far)
         if judgement is None:
             return values
         if self._station is not None:

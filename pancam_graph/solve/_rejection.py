@@ -79,7 +79,7 @@ def snoop(
     while len(which):  # each sweep takes an observation from every landmark that stays in it
         tests.update(which, fresh)
         if scale is None:
-            scale = max(min_scale, robust_scale(tests.median_scale(), measurements, views, accepted))
+            scale = max(min_scale, robust_scale(tests.median_scale(), measurements, views))
         over_landmarks(
             kernel.reject,
             which,
@@ -106,30 +106,28 @@ def snoop(
     )
 
 
-def robust_scale(
-    by_median: float, measurements: Measurements, views: CameraViews, accepted: BoolArray
-) -> float:
+def robust_scale(by_median: float, measurements: Measurements, views: CameraViews) -> float:
     """A noise scale `by_median` of residuals, or `pair_scale` where most of these must be outliers."""
     if by_median <= _SUSPICIOUS:
         return by_median
-    by_pairs = pair_scale(measurements, views, accepted)
+    by_pairs = pair_scale(measurements, views)
     return by_pairs if by_median > _SUSPICIOUS * by_pairs else by_median
 
 
-def pair_scale(measurements: Measurements, views: CameraViews, accepted: BoolArray) -> float:
-    """Noise scale of accepted measurements, in units of their sigmas, with all cameras held.
+def pair_scale(measurements: Measurements, views: CameraViews) -> float:
+    """Noise scale of measurements, in units of their sigmas, with all cameras held.
 
     It is estimated from pairs of measurements that follow each other in a track. A pair is right if both of
     its measurements are, however many others of the track are wrong; of all pairs a tenth must be right
-    (`noise_scale`). 0 if no landmark has two accepted measurements.
+    (`noise_scale`). Rejected ones take part: the rest alone would have lost the tail of its noise, and so
+    seem less noisy than it is. 0 if no landmark has two measurements.
     """
-    rows = np.flatnonzero(accepted)
-    first = np.flatnonzero(np.diff(measurements.landmark[rows]) == 0)
+    first = np.flatnonzero(np.diff(measurements.landmark) == 0)
     if len(first) > _MOST_PAIRS:
         first = first[np.linspace(0, len(first) - 1, _MOST_PAIRS).astype(np.int64)]
     if len(first) == 0:
         return 0.0
-    row = np.column_stack([rows[first], rows[first + 1]]).ravel()
+    row = np.column_stack([first, first + 1]).ravel()
     pairs = Measurements(
         row=row,
         image=measurements.image[row],

@@ -82,9 +82,8 @@ def screened_again(screened: Screened, excluded: BoolArray) -> Screened:
     if prepared.options.loss == "none":
         return screened
     rounds = ScreeningRounds(replace(prepared, problem=screened.problem, is_near=True), excluded)
-    if prepared.rescales_noise or rounds.would_change() > _ABOUT:
-        return rounds.to_the_end()
-    return screened
+    changed = rounds.share_changed()
+    return rounds.to_the_end() if prepared.rescales_noise or changed > _ABOUT else screened
 
 
 class ScreeningRounds:
@@ -126,14 +125,12 @@ class ScreeningRounds:
             if n_changed <= _ABOUT * len(self.problem.accepted):
                 break
 
-    def would_change(self) -> float:
-        """Share of the observations that one test of all of them judges otherwise than they are."""
-        before = self.problem
-        self.problem = replace(before, accepted=~self._banned)
-        self._snoop(self._prepared.options.outlier_sigma)
-        share = float(np.mean(self.problem.accepted != before.accepted))
-        self.problem = before
-        return share
+    def share_changed(self) -> float:
+        """Share of the observations that one test of all of them, with the cameras held, judges otherwise."""
+        before = self.problem.accepted
+        self.problem = replace(self.problem, accepted=~self._banned)
+        self._scale = self._snoop(self._prepared.options.outlier_sigma)
+        return float(np.mean(self.problem.accepted != before))
 
     def to_the_end(self) -> Screened:
         """Second passes until chance explains no link any more."""
