@@ -15,11 +15,12 @@ from pancam_graph.smoother._incremental import solve_incrementally, stops_of
 from pancam_graph.smoother._ledger import Fate
 from support.truth import require_right
 
-DRIVE = SimulationOptions(stops=2)
 
-
-def simulated(share: float, *, seed: int, rig: str = "mer-navcam", **changes: int) -> Simulation:
-    return simulate(TEMPLATES[rig](), replace(DRIVE, outliers=share, **changes), seed=seed)
+def simulated(
+    share: float, *, seed: int, rig: str = "mer-navcam", stops: int = 2, min_views: int = 2
+) -> Simulation:
+    options = SimulationOptions(stops=stops, outliers=share, min_views=min_views)
+    return simulate(TEMPLATES[rig](), options, seed=seed)
 
 
 def with_guessed_sigmas(traverse: Traverse) -> Traverse:
