@@ -3,12 +3,12 @@
 import os
 import sys
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager
+from contextlib import contextmanager
 from functools import cache
-from threading import local
-from typing import TypeVar
+from threading import Lock, Thread, local
+from typing import Any, TypeVar
 
 from threadpoolctl import ThreadpoolController
 
@@ -135,25 +135,84 @@ def in_order(
     return results
 
 
-def blas_on_one_thread() -> AbstractContextManager[object]:
+@contextmanager
+def blas_on_one_thread() -> Iterator[None]:
     """A context in which BLAS uses one thread, and leaves the other cores to the compiled loops.
 
     Matrices here have a few hundred rows. On these, threads of BLAS wait for each other longer than they
-    save: with two cores in use, two took twice the time of one.
+    save: with two cores in use, two took twice the time of one. Most libraries have one number of threads for
+    the whole process: while several threads of it are in such a context, the last that leaves restores it.
     """
     # A controller limits the libraries that are loaded when it is made. SciPy's own BLAS may not be yet.
     import scipy.linalg  # noqa: F401, PLC0415  loaded for the controller
 
-    limited: AbstractContextManager[object] = _controller("cv2" in sys.modules).limit(
-        limits=1, user_api="blas"
-    )
-    return limited
+    with_opencv = "cv2" in sys.modules
+    _LIMIT.enter(with_opencv)
+    try:
+        with _blas(with_opencv, of_thread=True).limit(limits=1):
+            yield
+    finally:
+        _LIMIT.leave()
+
+
+class _Limit:
+    """The limit on libraries with one number of threads for the process, and how many contexts need it."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._users = 0
+        self._limits = dict[bool, Any]()
+        """The limits that are set, by whether OpenCV was loaded, which has a BLAS of its own."""
+
+    def enter(self, with_opencv: bool) -> None:
+        """Set the limit, unless another context has."""
+        with self._lock:
+            self._users += 1
+            if with_opencv not in self._limits:
+                _apart(lambda: self._limit(with_opencv))
+
+    def leave(self) -> None:
+        """Restore what was before, unless another context needs the limit."""
+        with self._lock:
+            self._users -= 1
+            if self._users == 0:
+                _apart(self._restore)
+
+    def _limit(self, with_opencv: bool) -> None:
+        self._limits[with_opencv] = _blas(with_opencv, of_thread=False).limit(limits=1)
+
+    def _restore(self) -> None:
+        while self._limits:  # what was set last, first
+            self._limits.popitem()[1].restore_original_limits()
+
+
+_LIMIT = _Limit()
+
+
+def _apart(work: Callable[[], None]) -> None:
+    """Do a little work in a thread that ends with it.
+
+    threadpoolctl lets only one living thread change limits: whoever sets one would have to restore it.
+    """
+    thread = Thread(target=work, name="pancam-graph-limit")
+    try:
+        thread.start()
+    except RuntimeError:  # no thread can be started, as at the end of the interpreter
+        work()
+    else:
+        thread.join()
 
 
 @cache
-def _controller(with_opencv: bool) -> ThreadpoolController:
-    """The controller of all loaded BLAS libraries; OpenCV, which may be loaded later, has one of its own."""
-    return ThreadpoolController()
+def _blas(with_opencv: bool, *, of_thread: bool) -> ThreadpoolController:
+    """The controller of all loaded BLAS libraries that count threads for each thread, or for the process."""
+    loaded = ThreadpoolController().select(user_api="blas")
+    chosen = [
+        library["filepath"]
+        for library in loaded.info()
+        if (library.get("threading_layer") == "openmp") is of_thread
+    ]
+    return loaded.select(filepath=chosen)
 
 
 @cache

@@ -192,3 +192,58 @@ with blas_on_one_thread():
     numbers = done.stdout.split()
     assert numbers
     assert set(numbers) == {"1"}
+
+
+OVERLAPPING = """
+import threading
+from pancam_graph.base.threads import blas_on_one_thread
+from threadpoolctl import threadpool_info
+import scipy.linalg
+
+def show():
+    blas = [library for library in threadpool_info() if library["user_api"] == "blas"]
+    print(sorted({{library["num_threads"] for library in blas}}))
+
+both, first_has_left, all_done = threading.Barrier(2), threading.Event(), threading.Event()
+
+def leaves_first():
+    with blas_on_one_thread():
+        both.wait()
+    first_has_left.set()
+    all_done.wait(20)  # a thread that lives on
+
+show()
+other = threading.Thread(target=leaves_first)
+if {enters_first}:
+    other.start()
+    while both.n_waiting == 0:
+        pass
+with blas_on_one_thread(), blas_on_one_thread():
+    if not {enters_first}:
+        other.start()
+    both.wait()
+    first_has_left.wait(20)
+    show()
+show()
+try:
+    with blas_on_one_thread():
+        1 // 0
+except ZeroDivisionError:
+    show()
+all_done.set()
+"""
+
+
+@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="BLAS has one thread anyway")
+@pytest.mark.parametrize("enters_first", [True, False])
+def test_blas_has_its_threads_again_when_the_last_of_several_contexts_ends(enters_first: bool) -> None:
+    """Contexts of two threads that overlap: the first that leaves has set the limit, or found it set."""
+    environment = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
+    done = subprocess.run(
+        [sys.executable, "-c", OVERLAPPING.format(enters_first=enters_first)],
+        env={**environment, "OPENBLAS_NUM_THREADS": "2"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.split("\n") == ["[2]", "[1]", "[2]", "[2]", ""]
