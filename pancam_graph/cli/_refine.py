@@ -19,8 +19,8 @@ points.ply, residuals.csv and report.html, and with --mosaic a folder of mosaics
 once the new results are complete. OUT/cache keeps what was found in images: the same command goes on after
 an interrupt, and again only with what has changed.
 
-Exit status: 0 solved, 1 not converged (results are written), 2 bad input or a fault (nothing is written),
-130 interrupted.
+Exit status: 0 solved and passed its tests, 1 not converged or a test failed (results are written, and say
+which), 2 bad input or a fault (nothing is written), 130 interrupted.
 """
 _SHARING_HELP = (
     "what of the rig is estimated, and who shares it, in one or more WORDs: "
@@ -67,6 +67,12 @@ def _add_options(parser: CommandParser) -> None:
         choices=("none", "huber", "cauchy"),
         default="huber",
         help="robust loss while outliers are sought (default huber); none: keep every observation",
+    )
+    add(
+        "--noise",
+        choices=("stated", "estimated"),
+        help="stated: sigmas of the observations count as they are given; estimated: residuals rescale them "
+        "(default: stated for observations of FOLDER, estimated for those found in its images)",
     )
     add(
         "--stop",
@@ -122,6 +128,7 @@ def _work(call: Invocation) -> int:
     arguments, progress = call.arguments, call.progress
     chosen: dict[str, Any] = {n: getattr(arguments, n) for n in ("model", "landmarks", "method", "loss")}
     chosen.update(criteria(arguments.stop))
+    chosen["rescale_noise"] = None if arguments.noise is None else arguments.noise == "estimated"
     sharing = parse_sharing(arguments.sharing)
     # Covariances of terrain points take at most a twentieth of the solve: points.ply always has them.
     options = SolveOptions(**chosen, sharing=sharing, landmark_covariances=True)
@@ -155,7 +162,7 @@ def _work(call: Invocation) -> int:
         results = {"report": arguments.report, "exports": arguments.export, "mosaics": mosaics}
         solution = write_results(solution, arguments.out, **results, progress=progress.counted)
     print_summary(solution, str(arguments.out), quiet=arguments.quiet)
-    return 0 if solution.converged else 1
+    return 0 if solution.passed else 1
 
 
 REFINE = Command(

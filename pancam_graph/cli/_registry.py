@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 
+from pancam_graph.cli._check import CHECK
 from pancam_graph.cli._command import Command
 from pancam_graph.cli._completion import COMPLETION
 from pancam_graph.cli._drive import DRIVE
@@ -11,4 +12,4 @@ from pancam_graph.cli._simulate import SIMULATE
 
 __all__ = ["COMMANDS"]
 
-COMMANDS: Mapping[str, Command] = {c.name: c for c in (REFINE, SIMULATE, RENDER, DRIVE, COMPLETION)}
+COMMANDS: Mapping[str, Command] = {c.name: c for c in (REFINE, CHECK, SIMULATE, RENDER, DRIVE, COMPLETION)}

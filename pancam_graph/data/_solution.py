@@ -13,6 +13,7 @@ from pancam_graph.cameras import CALIBRATION_ENTRIES, Camera, projection_matrix
 from pancam_graph.data._cross_validation import CrossValidation
 from pancam_graph.data._sharing import Quantity
 from pancam_graph.data._traverse import Traverse
+from pancam_graph.data._verdict import Verdict
 from pancam_graph.elimination import JointCovariance, relative_pose_covariance
 from pancam_graph.rigs import Rig
 
@@ -187,8 +188,15 @@ class Solution:
     """Cross-validation of the sigmas; None unless requested."""
     incremental: "Incremental | None" = None
     """Effort of each update, if the solution was made stop by stop; else None."""
+    verdict: Verdict | None = None
+    """Tests that say whether the numbers can be believed; None if the solution was not tested."""
     warnings: tuple[str, ...] = ()
     seconds: Seconds = field(default_factory=Seconds)
+
+    @property
+    def passed(self) -> bool:
+        """Whether the iterations converged, and no test of the verdict failed."""
+        return self.converged and (self.verdict is None or self.verdict.passed)
 
     @property
     def rms_initial_px(self) -> float:

@@ -24,7 +24,7 @@ from pancam_graph.elimination import Covariance, Linkage, Posture
 from pancam_graph.factors import Key
 from pancam_graph.graph._factors import FactorList
 from pancam_graph.graph._given import Seat
-from pancam_graph.graph._keys import Kind, key_of
+from pancam_graph.graph._keys import Kind, index_of, key_of
 from pancam_graph.graph._template import FactorTemplate, diagonal_noise
 from pancam_graph.landmarks import CameraViews
 
@@ -260,6 +260,10 @@ class HardTemplate(FactorTemplate):
     def has_cameras(self) -> bool:
         """No: camera poses follow from masts and angles."""
         return False
+
+    def angle_frames(self, key: int) -> IntArray:
+        """Those frames of a stop that are not held."""
+        return self._frames[index_of(key)]
 
     def angle_seat(self, frame: int) -> Seat:
         """Two entries of its stop's vector of angles; fixed where both sigmas are 0."""

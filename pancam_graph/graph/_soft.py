@@ -24,7 +24,7 @@ from pancam_graph.factors import CircleOffset, Fixed, Key, Slot, circle_factor, 
 from pancam_graph.graph._factors import FactorList
 from pancam_graph.graph._given import Seat
 from pancam_graph.graph._graph_options import Flex, Model
-from pancam_graph.graph._keys import Kind, key_of
+from pancam_graph.graph._keys import Kind, index_of, key_of
 from pancam_graph.graph._template import FactorTemplate, diagonal_noise
 from pancam_graph.landmarks import CameraViews
 
@@ -174,6 +174,10 @@ class SoftTemplate(FactorTemplate):
     def has_cameras(self) -> bool:
         """True: each image has a variable for its camera."""
         return True
+
+    def angle_frames(self, key: int) -> IntArray:
+        """The frame of the variable."""
+        return np.array([index_of(key)])
 
     def angle_seat(self, frame: int) -> Seat:
         """The variable of the frame; fixed where both sigmas are 0."""

@@ -106,6 +106,10 @@ class FactorTemplate(ABC):
         return Seat.same(key, int(self.linkage.dim[self.linkage.row[key]]), held)
 
     @abstractmethod
+    def angle_frames(self, key: int) -> IntArray:
+        """Frames (frames,) whose pan and tilt the variable of a key has, in their order there."""
+
+    @abstractmethod
     def angle_seat(self, frame: int) -> Seat:
         """Seat of a frame's pan and tilt among the variables."""
 

@@ -20,6 +20,7 @@ from pancam_graph.report._shown_terrain import shown_terrain
 from pancam_graph.report._style import STYLE
 from pancam_graph.report._tables import image_table, observation_table, rig_table, stop_table
 from pancam_graph.report._template import NO_VECTORS, PAGE, RIG, SCENE_CONTROLS, VECTOR_CONTROLS
+from pancam_graph.report._verdict import verdict_section
 
 __all__ = ["headline", "lead", "make_page"]
 
@@ -58,6 +59,7 @@ def make_page(solution: Solution, mosaics: WrittenMosaics | None = None) -> str:
         title=escape(title),
         style=STYLE,
         lead=escape(lead(solution)),
+        verdict=verdict_section(solution.verdict),
         warnings=_warnings(solution),
         headline=_headline_list(solution),
         scene=_section("Scene", scene, SCENE_CONTROLS),
@@ -133,9 +135,13 @@ def headline(solution: Solution) -> list[tuple[str, str, str, bool]]:
         ),
         (
             "outcome",
-            "converged" if solution.converged else "not converged",
+            "not converged"
+            if not solution.converged
+            else "converged"
+            if solution.passed
+            else "not to be trusted",
             f"{solution.stop_reason}; {_counted(solution.iterations, 'iteration')}",
-            not solution.converged,
+            not solution.passed,
         ),
         (
             "time",

@@ -18,6 +18,14 @@ section { margin-top: 30px; }
 .warnings { border-left: 5px solid #e69f00; background: #fff7e6; padding: 10px 16px; margin: 12px 0; }
 .warnings h2 { font-size: 16px; color: var(--warn); }
 .warnings ul { margin: 0; padding-left: 20px; max-height: 210px; overflow: auto; overflow-wrap: anywhere; }
+.verdict { border-left: 5px solid #009e73; background: #e9f7f1; padding: 10px 16px; margin: 12px 0; }
+.verdict h2 { font-size: 16px; color: #00543d; margin: 0; }
+.verdict.bad { border-color: #b54300; background: #fdeee6; }
+.verdict.bad h2 { color: #b54300; }
+.verdict ul { margin: 4px 0 0; padding-left: 20px; overflow-wrap: anywhere; }
+.verdict summary { cursor: pointer; margin-top: 4px; }
+.verdict .scroll { margin-top: 8px; background: #ffffff; }
+.verdict td.text:last-child { white-space: normal; min-width: 22em; }
 .figures { display: grid; grid-template-columns: repeat(auto-fit, minmax(200px, 1fr)); gap: 12px; }
 .figures { margin: 14px 0 0; }
 .figures div { background: var(--soft);

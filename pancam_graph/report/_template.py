@@ -27,7 +27,7 @@ images said nothing of the entry.</p>
 """
 PAGE = (
     HEAD
-    + """{warnings}
+    + """{verdict}{warnings}
 <dl class="figures">
 {headline}
 </dl>

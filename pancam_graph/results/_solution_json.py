@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from pancam_graph.base.geometry import FloatArray, IntArray
-from pancam_graph.data import Incremental, Solution
+from pancam_graph.data import Incremental, Solution, Verdict, VerdictTest
 from pancam_graph.io import (
     SOLUTION_FORMAT,
     VERSION,
@@ -113,6 +113,38 @@ class IncrementalEntry(Entry):
         )
 
 
+class VerdictTestEntry(Entry):
+    """One test of the solution."""
+
+    name: str
+    value: float | None
+    """Null where it is not finite, or where there was nothing to test."""
+    limit: float
+    passed: bool
+    says: str
+
+
+class VerdictEntry(Entry):
+    """Whether the numbers can be believed."""
+
+    passed: bool
+    """Whether every test passed."""
+    tests: list[VerdictTestEntry]
+
+    @staticmethod
+    def of(verdict: Verdict) -> "VerdictEntry":
+        """The entry of a verdict."""
+        tests = [
+            VerdictTestEntry(name=t.name, value=t.value, limit=t.limit, passed=t.passed, says=t.says)
+            for t in verdict.tests
+        ]
+        return VerdictEntry(passed=verdict.passed, tests=tests)
+
+    def verdict(self) -> Verdict:
+        """The verdict of the entry."""
+        return Verdict(tests=tuple(VerdictTest(**dict(t)) for t in self.tests))
+
+
 class SolutionFile(Entry):
     """`solution.json`."""
 
@@ -122,6 +154,8 @@ class SolutionFile(Entry):
     landmarks: str
     converged: bool
     stop_reason: str
+    verdict: VerdictEntry | None = None
+    """Where the solution was tested; else the key is missing."""
     iterations: int
     seconds: SecondsEntry
     cost: BeforeAfterEntry
@@ -154,6 +188,7 @@ def solution_json(solution: Solution) -> bytes:
     """A solution as the content of `solution.json`; null in place of what is not finite."""
     missing = {
         "method": solution.method == "joint",
+        "verdict": solution.verdict is None,
         "refined": not solution.refined,
         "cross_validation": solution.cross_validation is None,
         "incremental": solution.incremental is None,
@@ -190,6 +225,7 @@ def solution_file(solution: Solution) -> SolutionFile:
         landmarks=solution.landmarks,
         converged=bool(solution.converged),
         stop_reason=solution.stop_reason,
+        verdict=None if solution.verdict is None else VerdictEntry.of(solution.verdict),
         iterations=int(solution.iterations),
         seconds=SecondsEntry(
             read=float(seconds.read),

@@ -39,6 +39,8 @@ class Uncertainty:
     """Names of directions of the rig that images do not determine, by the entries of which they consist"""
     masts: JointCovariance | None = None
     """Joint covariances of pairs of mast poses; None where unknown"""
+    variables: Covariance | None = None
+    """Covariances of the variables, by groups; None where unknown"""
 
 
 def uncertainty(
@@ -59,6 +61,7 @@ def uncertainty(
     return Uncertainty(
         stop_covariance=template.stop_covariance(covariance),
         masts=template.mast_covariance(reduced.root),
+        variables=covariance,
         angle_sigma_rad=template.angle_sigma_rad(covariance, state),
         landmark_covariance_m2=spread,
         undetermined=undetermined,

@@ -1,4 +1,4 @@
-"""Stage 4, judge: how sure an optimum is, and what speaks against it."""
+"""Stage 4, judge: how sure an optimum is, what speaks against it, and the verdict."""
 
 from dataclasses import dataclass, replace
 
@@ -6,14 +6,17 @@ import numpy as np
 
 from pancam_graph.base.errors import SolveError
 from pancam_graph.base.geometry import BoolArray
-from pancam_graph.data import State
+from pancam_graph.data import State, Verdict
 from pancam_graph.graph import HardTemplate
 from pancam_graph.landmarks import refine
+from pancam_graph.solve._carrying import carried_again
 from pancam_graph.solve._covariance import Uncertainty, uncertainty
 from pancam_graph.solve._diagnose import connection_warnings, listed
 from pancam_graph.solve._fit import Fitted
+from pancam_graph.solve._prepare import triangulated
 from pancam_graph.solve._problem import Problem
 from pancam_graph.solve._reduced import ReducedSystem
+from pancam_graph.solve._verdict import Optimum, verdict
 
 __all__ = ["Judged", "judge", "reduced_of", "regular_problem", "state_of"]
 
@@ -28,6 +31,10 @@ class Judged:
     uncertainty: Uncertainty
     used: BoolArray
     """(observations,) whether each took part in the fit."""
+    first: Problem
+    """The start, with the measurements of the optimum and the landmarks that fit the start best: what is
+    gained from there to the optimum is due to the cameras alone."""
+    verdict: Verdict
     warnings: tuple[str, ...]
     """Warnings of all stages, a sentence each."""
 
@@ -36,14 +43,26 @@ def judge(fitted: Fitted) -> Judged:
     """Covariances at the optimum, and warnings of what a user should know before believing it."""
     prepared, problem = fitted.screened.prepared, fitted.problem
     state = state_of(problem)
-    covariances, warnings = _uncertainty(fitted, state)
+    covariances, regular, reduced, warnings = _uncertainty(fitted, state)
     used = np.zeros(len(prepared.observations), dtype=bool)
     used[problem.measurements.row[problem.kept]] = True
+    first = _first(fitted)
     return Judged(
         fitted=fitted,
         state=state,
         uncertainty=covariances,
         used=used,
+        first=first,
+        verdict=verdict(
+            Optimum(
+                fitted=fitted,
+                problem=regular,
+                reduced=reduced,
+                uncertainty=covariances,
+                used=used,
+                cost_initial=first.cost(),
+            )
+        ),
         warnings=(
             *prepared.warnings,
             *warnings,
@@ -75,16 +94,22 @@ def reduced_of(fitted: Fitted, problem: Problem) -> ReducedSystem:
     return ReducedSystem.of(problem)
 
 
-def _uncertainty(fitted: Fitted, state: State) -> tuple[Uncertainty, list[str]]:
-    """Covariances, NaN where a direction is free; and warnings of what is free or badly known."""
+def _uncertainty(
+    fitted: Fitted, state: State
+) -> tuple[Uncertainty, Problem, ReducedSystem | None, list[str]]:
+    """Covariances, the problem and reduced system that they are of, and warnings of what is badly known.
+
+    Where a direction is free, covariances are NaN and there is no reduced system.
+    """
     prepared, problem = fitted.screened.prepared, regular_problem(fitted)
     t, wanted = prepared.traverse, prepared.options.landmark_covariances
     # Radii of circles are free unasked: what holds them is then no news.
     asked = (prepared.options.sharing or t.sharing) is not None
     try:
-        covariances = uncertainty(problem, state, reduced_of(fitted, problem), landmarks=wanted, unseen=asked)
+        reduced = reduced_of(fitted, problem)
+        covariances = uncertainty(problem, state, reduced, landmarks=wanted, unseen=asked)
     except SolveError as error:
-        return _unknown(fitted), [f"no uncertainties: {error}"]
+        return _unknown(fitted), problem, None, [f"no uncertainties: {error}"]
     warnings = []
     if covariances.unseen:
         warnings.append(
@@ -97,7 +122,19 @@ def _uncertainty(fitted: Fitted, state: State) -> tuple[Uncertainty, list[str]]:
             f"{listed(tracks, 'track')}: their rays leave the place of the point open; "
             "they tell where cameras point, and a weak prior holds the point"
         )
-    return covariances, warnings
+    return covariances, problem, reduced, warnings
+
+
+def _first(fitted: Fitted) -> Problem:
+    """`Judged.first` of a fit."""
+    prepared, problem = fitted.screened.prepared, fitted.problem
+    first, m = prepared.problem, problem.measurements
+    if m is first.measurements and problem.accepted.all():
+        return first
+    first = triangulated(replace(first, measurements=m, accepted=problem.accepted)).placed()
+    if problem.template.rig_variables.distortion_moves:
+        first = carried_again(first, prepared.observations, fitted.noise).placed()
+    return first
 
 
 def _unknown(fitted: Fitted) -> Uncertainty:

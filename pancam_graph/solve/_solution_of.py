@@ -1,15 +1,11 @@
 """Stage 5, solution: an optimum beside what was there before, as data that users read."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.data import PixelNoise, Solution
-from pancam_graph.solve._carrying import carried_again
 from pancam_graph.solve._fit import Fitted
 from pancam_graph.solve._judge import Judged, state_of
-from pancam_graph.solve._prepare import triangulated
 from pancam_graph.solve._problem import Problem
 
 __all__ = ["solution_of"]
@@ -19,7 +15,7 @@ def solution_of(judged: Judged) -> Solution:
     """The solution, without the seconds that it took."""
     fitted, outcome, covariances = judged.fitted, judged.fitted.outcome, judged.uncertainty
     screened, problem = fitted.screened, fitted.problem
-    prepared, first = screened.prepared, _first(fitted)
+    prepared, first = screened.prepared, judged.first
     n, present = len(prepared.observations), problem.present
     return Solution(
         traverse=prepared.traverse,
@@ -47,23 +43,9 @@ def solution_of(judged: Judged) -> Solution:
         mast_covariance=covariances.masts,
         came_back=judged.used & screened.set_aside,
         refined=problem.template.refined(problem.values, covariances.rig_sigmas),
+        verdict=judged.verdict,
         warnings=judged.warnings,
     )
-
-
-def _first(fitted: Fitted) -> Problem:
-    """The start, with the measurements of the optimum and the landmarks that fit the start best.
-
-    What is gained from there to the optimum is due to the cameras alone.
-    """
-    prepared, problem = fitted.screened.prepared, fitted.problem
-    first, m = prepared.problem, problem.measurements
-    if m is first.measurements and problem.accepted.all():
-        return first
-    first = triangulated(replace(first, measurements=m, accepted=problem.accepted)).placed()
-    if problem.template.rig_variables.distortion_moves:
-        first = carried_again(first, prepared.observations, fitted.noise).placed()
-    return first
 
 
 def _reasons(fitted: Fitted) -> tuple[str, ...]:

@@ -1,0 +1,374 @@
+"""The verdict: every test of a solution, each with what it says.
+
+Limits of statistical tests are set so that a right solution exceeds any of them in about one of a thousand
+drives; others say how far the numbers may be off before a user should not rely on them.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from pancam_graph.base.geometry import BoolArray, IntArray
+from pancam_graph.data import Traverse, Verdict, VerdictTest
+from pancam_graph.solve._covariance import Uncertainty
+from pancam_graph.solve._fit import Fitted
+from pancam_graph.solve._noise_tests import Residuals
+from pancam_graph.solve._problem import Problem
+from pancam_graph.solve._reduced import ReducedSystem
+from pancam_graph.solve._rig_score import HeldEntry, held_entries
+from pancam_graph.solve._telemetry_tests import (
+    Correction,
+    corrections,
+    leg_corrections,
+    rms_limit,
+    telemetry_of,
+    total,
+    two_sided_limit,
+)
+
+__all__ = ["Optimum", "verdict"]
+
+_CHANCE = 2e-4
+"""Chance that a right solution fails one statistical test."""
+_AT_OPTIMUM = 0.3
+"""Largest distance to the optimum, in sigmas of the solution."""
+_LEFT_OUT = 0.9
+"""Largest share of the observations that may be left out as outliers."""
+_FAIR_SHARE = 0.25
+"""Part of the usual share of observations in use below which an image, a frame or a stop is suspect."""
+_UNDERSTATED = 1.5
+"""Largest ratio of residuals to the stated noise."""
+_OVERSTATED = 2.0
+"""Ratio of the stated noise to residuals from which it is said."""
+_UNEVEN = 2.0
+"""Largest ratio of an image's, or a camera's, residuals to those of all."""
+_HELD_GAIN = 25.0
+"""Decrease of the cost from which a held number of the rig is named, if it is also this ..."""
+_HELD_SHARE = 0.02
+"""... share of the cost."""
+_IN_USE = 12
+"""Images, frames and stops with fewer observations are not tested alone."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Optimum:
+    """A fit at its end, as the tests look at it."""
+
+    fitted: Fitted
+    problem: Problem
+    """As covariances are taken from it."""
+    reduced: ReducedSystem | None
+    """Its reduced system; None where no covariances could be computed."""
+    uncertainty: Uncertainty
+    used: BoolArray
+    """(observations,) whether each is in use."""
+    cost_initial: float
+    """Cost at the start, over the same observations."""
+
+    @property
+    def traverse(self) -> Traverse:
+        """The input."""
+        return self.fitted.screened.prepared.traverse
+
+
+def verdict(at: Optimum) -> Verdict:
+    """All tests of a fit."""
+    residuals = Residuals.of(at.fitted.problem)
+    tests = [_converged(at), _finite(residuals), _cost(at), _optimum(at), *_in_use(at)]
+    if len(residuals.square):
+        tests += _noise(at, residuals)
+    tests += [_sigmas(at), *_telemetry(at), *_freed(at), *_held(at)]
+    return Verdict(tests=tuple(tests))
+
+
+def _test(name: str, value: float | None, limit: float, good: str, bad: str) -> VerdictTest:
+    """A test that fails beyond its limit; a value that is no number fails too."""
+    passed = value is None or bool(value <= limit)
+    finite = None if value is None or not np.isfinite(value) else float(value)
+    return VerdictTest(
+        name=name, value=finite, limit=float(limit), passed=passed, says=good if passed else bad
+    )
+
+
+def _note(name: str, value: float, limit: float, good: str, advice: str) -> VerdictTest:
+    """A test that never fails, and advises beyond its limit."""
+    says = good if value <= limit else advice
+    return VerdictTest(name=name, value=float(value), limit=float(limit), passed=True, says=says)
+
+
+def _converged(at: Optimum) -> VerdictTest:
+    outcome = at.fitted.outcome
+    return _test(
+        "converged",
+        0.0 if outcome.converged else 1.0,
+        0.0,
+        f"iterations ended: {outcome.reason}",
+        f"iterations ended too early: {outcome.reason}; allow more (--stop max_iterations=1000)",
+    )
+
+
+def _finite(residuals: Residuals) -> VerdictTest:
+    n = residuals.n_not_finite
+    return _test(
+        "finite",
+        float(n) if len(residuals.square) else np.inf,
+        0.0,
+        f"residuals of all {len(residuals.square)} observations in use are finite",
+        f"{n} of {len(residuals.square)} observations in use have no finite residual: "
+        "cameras or points have left the domain of their model",
+    )
+
+
+def _cost(at: Optimum) -> VerdictTest:
+    before, after = at.cost_initial, at.fitted.problem.cost()
+    return _test(
+        "cost",
+        after - before,
+        1e-6 * (1 + abs(before)),
+        f"cost fell from {before:.6g} to {after:.6g} over the same observations",
+        f"cost rose from {before:.6g} to {after:.6g} over the same observations: the solution is worse than "
+        "the start; check matches, rig and telemetry",
+    )
+
+
+def _optimum(at: Optimum) -> VerdictTest:
+    """The step that is left, in the metric of the information: no number is further off in its sigmas."""
+    name, limit = "optimum", _AT_OPTIMUM
+    if at.reduced is None:
+        text = "distance to the optimum is unknown: the system has a free direction"
+        return _test(name, np.nan, limit, text, text)
+    ahead = at.reduced.root.gain() + at.reduced.system.gain_alone
+    costs = at.fitted.outcome.costs
+    gains = -np.diff(costs[-3:])
+    # Gains of a slow crawl shrink by a constant factor: all that are to come add up.
+    crawls = len(gains) == 2 and 0 < gains[1] < gains[0]
+    rate = min(gains[1] / gains[0], 0.999) if crawls and ahead <= gains[1] else 0.0
+    off = float(np.sqrt(2 * ahead) / (1 - np.sqrt(rate)))
+    return _test(
+        name,
+        off,
+        limit,
+        f"at the optimum to {off:.2g} sigma",
+        f"{off:.2g} sigma from the optimum: the last steps still moved it; "
+        "go on further (--stop relative_decrease=1e-12 max_iterations=1000)",
+    )
+
+
+def _in_use(at: Optimum) -> Iterator[VerdictTest]:
+    """Shares of the measurements that are left out: of all, and of the worst image, frame and stop."""
+    problem, t = at.fitted.problem, at.traverse
+    image, kept = problem.measurements.image, problem.kept
+    share = float(np.mean(kept)) if len(kept) else 0.0
+    yield _test(
+        "observations",
+        1 - share,
+        _LEFT_OUT,
+        f"{share:.0%} of {len(kept)} observations are in use",
+        f"only {share:.0%} of {len(kept)} observations are in use, too few to tell right ones from wrong "
+        "ones; check matches and rig",
+    )
+    for name, owner, ids in (
+        ("image", np.arange(len(t.images)), [i.id for i in t.images]),
+        ("frame", t.image_frame, [f.id for f in t.frames]),
+        ("stop", t.image_stop, [s.id for s in t.stops]),
+    ):
+        yield _fair_share(name, owner[image], kept, share, ids)
+
+
+def _fair_share(name: str, owner: IntArray, kept: BoolArray, usual: float, ids: Sequence[str]) -> VerdictTest:
+    n = np.bincount(owner, minlength=len(ids))
+    used = np.bincount(owner, kept, minlength=len(ids))
+    share = used / n.clip(1)
+    # A chance of less than this, if its observations were as good as all others.
+    chance = scipy.special.bdtr(used, n, usual)
+    suspect = (n >= _IN_USE) & (chance < _CHANCE / len(ids))
+    candidates = np.flatnonzero(suspect if suspect.any() else n >= _IN_USE)
+    limit = 1 - _FAIR_SHARE * usual
+    if not len(candidates):
+        return _test(f"{name} share", None, limit, f"too few observations to test a {name} alone", "")
+    worst = int(candidates[np.argmin(share[candidates])])
+    says = f"of {name} {ids[worst]} {int(used[worst])} of {int(n[worst])} observations are in use"
+    value = 1 - float(share[worst])
+    return _test(
+        f"{name} share",
+        value if suspect.any() else min(value, limit),
+        limit,
+        says,
+        f"{says}, of all {usual:.0%}: its pointing, its file or its matches are probably wrong; "
+        "leave it out, or widen the sigmas of its pointing",
+    )
+
+
+def _noise(at: Optimum, residuals: Residuals) -> Iterator[VerdictTest]:
+    prepared, t = at.fitted.screened.prepared, at.traverse
+    ratio = residuals.ratio
+    if prepared.rescales_noise:
+        sigma = float(np.median(at.fitted.noise.sigma_px[at.used])) if at.used.any() else np.nan
+        yield _test("noise", None, _UNDERSTATED, f"noise was estimated: {sigma:.3g} px (median)", "")
+    else:
+        fits = f"residuals are {ratio:.3g} times what the stated sigmas make them"
+        advice = "let the residuals decide (--noise estimated), or give other sigmas"
+        yield _test(
+            "noise",
+            ratio,
+            _UNDERSTATED,
+            fits,
+            f"{fits}: sigmas of the observations are {ratio:.3g} times too small, or the rig is wrong, and "
+            f"all formal sigmas with them; {advice}",
+        )
+        inverse = 1 / max(ratio, 1e-9)
+        yield _note(
+            "noise overstated",
+            inverse,
+            _OVERSTATED,
+            fits,
+            f"{fits}: sigmas of the observations are {inverse:.3g} times too large, so that telemetry counts "
+            f"for too much and formal sigmas are too large; {advice}",
+        )
+    eyes = [eye.name for eye in t.rig.eyes]
+    yield _uneven("camera", residuals, t.image_eye, eyes)
+    yield _uneven("image", residuals, np.arange(len(t.images)), [i.id for i in t.images])
+
+
+def _uneven(name: str, residuals: Residuals, owner: IntArray, ids: Sequence[str]) -> VerdictTest:
+    """The owner whose residuals exceed those of all by most, less what chance may add."""
+    ratio, freedom = residuals.by(owner, len(ids))
+    ratio = ratio / max(residuals.ratio, 1e-300)
+    allowed = np.array([rms_limit(f, _CHANCE / len(ids)) for f in freedom])
+    sure = np.where(freedom >= 1, ratio / allowed, 0.0)
+    worst = int(np.argmax(sure))
+    says = f"residuals of {name} {ids[worst]} are {ratio[worst]:.3g} times those of all"
+    return _test(
+        f"{name} noise",
+        float(sure[worst]),
+        _UNEVEN,
+        says,
+        f"{says}: its calibration, its mount or its pixels are probably wrong; try it free (--sharing "
+        f"mounts=eye calibration=eye), or leave it out",
+    )
+
+
+def _sigmas(at: Optimum) -> VerdictTest:
+    """Every sigma is known, and the least known position of a stop is named."""
+    u, t = at.uncertainty, at.traverse
+    unknown = int(np.isnan(u.angle_sigma_rad).any(axis=1).sum() + np.isnan(u.stop_covariance[:, 0, 0]).sum())
+    good = "every stop and frame has its sigmas"
+    if unknown == 0:
+        values, vectors = np.linalg.eigh(u.stop_covariance[:, 3:, 3:])
+        worst = int(np.argmax(values[:, -1]))
+        if values[worst, -1] > 0:
+            x, y, z = vectors[worst, :, -1]
+            good += (
+                f"; least known is the position of {t.stops[worst].id}: {1e3 * values[worst, -1] ** 0.5:.3g} "
+                f"mm along ({x:.2f}, {y:.2f}, {z:.2f}) of its mast"
+            )
+    return _test(
+        "sigmas",
+        float(unknown),
+        0.0,
+        good,
+        f"{unknown} stops and frames have no sigmas, since nothing holds a direction of the solution; "
+        "give telemetry a sigma, or hold a stop",
+    )
+
+
+def _telemetry(at: Optimum) -> Iterator[VerdictTest]:
+    """Corrections over their sigmas: all together, of angles, and of stops."""
+    u = at.uncertainty
+    if u.variables is None or u.masts is None:
+        return
+    telemetry = telemetry_of(at.problem, u.variables)
+    rms, freedom = total(telemetry)
+    if freedom > 0:
+        says = f"corrections of telemetry are {rms:.3g} times what its sigmas and the images allow (RMS)"
+        yield _test(
+            "telemetry",
+            rms,
+            rms_limit(freedom, _CHANCE),
+            says,
+            f"{says}: give telemetry larger sigmas, or look for a wrong rig or wrong matches",
+        )
+    single = list(corrections(telemetry))
+    angles = [c for c in single if c.entry in {"pan", "tilt"}]
+    stops = [c for c in single if c.entry not in {"pan", "tilt"}]
+    stops += leg_corrections(at.problem, u.masts)
+    for name, some, widen in (
+        ("pointing", angles, "widen sigma_pan_rad and sigma_tilt_rad there"),
+        ("stops", stops, "widen sigma_translation_m and sigma_rotation_rad there"),
+    ):
+        if some:
+            worst = max(some, key=lambda c: c.sigmas)
+            says = _describe(worst, at.traverse)
+            yield _test(
+                name,
+                worst.sigmas,
+                two_sided_limit(len(some), _CHANCE),
+                f"largest correction: {says}",
+                f"{says}: this telemetry, or what the images say of it, is wrong; {widen}, or check the rig",
+            )
+
+
+def _describe(c: Correction, t: Traverse) -> str:
+    """A correction as people read it."""
+    stop = t.stops[c.stop].id
+    turn = f"{np.degrees(c.size):+.3g} degrees"
+    by = f"by {c.sigmas:.3g} times what its sigma allows"
+    if c.entry.startswith("leg"):
+        before = t.stops[c.stop - 1].id
+        return f"{c.entry.removeprefix('leg ')} from {before} to {stop} moved by {c.size:+.3g} m, {by}"
+    if c.frame is not None:
+        return f"{c.entry} of {t.frames[c.frame].id} moved by {turn}, {by}"
+    if c.is_common:
+        return f"every {c.entry} at {stop} moved by {turn} in common, {by}"
+    size = f"{c.size:+.3g} m" if c.entry in {"x", "y", "z"} else turn
+    return f"{c.entry} of {stop} moved by {size}, {by}"
+
+
+def _freed(at: Optimum) -> Iterator[VerdictTest]:
+    """Entries of the rig that were free, against their priors."""
+    refined = at.problem.template.refined(at.problem.values, at.uncertainty.rig_sigmas)
+    some = []
+    for r in refined:
+        told = r.prior_sigma**2 - r.sigma**2
+        if np.isfinite(told) and told > 1e-6 * r.prior_sigma**2:
+            some.append((abs(r.change) / np.sqrt(told), r))
+    if some:
+        worst, r = max(some, key=lambda pair: pair[0])
+        says = f"largest correction of the rig: {r.entry} of {r.quantity} by {r.change:+.3g}"
+        yield _test(
+            "rig",
+            float(worst),
+            two_sided_limit(len(some), _CHANCE),
+            says,
+            f"{says}, {worst:.3g} times what its prior allows: the rig is probably another one, or needs "
+            "more of its numbers free",
+        )
+
+
+def _held(at: Optimum) -> Iterator[VerdictTest]:
+    """The held number of the rig whose freedom would lower the cost by most."""
+    if at.reduced is None or not at.fitted.outcome.converged:
+        return
+    held = held_entries(at.fitted.problem)
+    if held:
+        cost = at.fitted.problem.cost()
+        best = max(held, key=lambda e: e.gain)
+        yield _note(
+            "held rig",
+            best.gain,
+            max(_HELD_GAIN, _HELD_SHARE * cost),
+            "no held number of the rig would lower the cost by much",
+            _advice(best, cost),
+        )
+
+
+def _advice(entry: HeldEntry, cost: float) -> str:
+    whose = f" of {entry.camera}" if entry.camera else ""
+    left = max(cost - entry.gain, 0.0)
+    return (
+        f"freeing {entry.entry} of {entry.quantity}{whose} would lower the cost from {cost:.4g} to about "
+        f"{left:.4g} ({entry.change:+.3g}): the rig is wrong by more than pixels tell, and formal sigmas are "
+        f"too small; try --sharing {entry.quantity}={entry.scope}:{entry.entry}"
+    )
