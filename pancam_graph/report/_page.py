@@ -135,11 +135,7 @@ def headline(solution: Solution) -> list[tuple[str, str, str, bool]]:
         ),
         (
             "outcome",
-            "not converged"
-            if not solution.converged
-            else "converged"
-            if solution.passed
-            else "not to be trusted",
+            _outcome(solution),
             f"{solution.stop_reason}; {_counted(solution.iterations, 'iteration')}",
             not solution.passed,
         ),
@@ -150,6 +146,12 @@ def headline(solution: Solution) -> list[tuple[str, str, str, bool]]:
             False,
         ),
     ]
+
+
+def _outcome(solution: Solution) -> str:
+    if not solution.converged:
+        return "not converged"
+    return "converged" if solution.passed else "converged, failed its tests"
 
 
 def _headline_list(solution: Solution) -> str:
