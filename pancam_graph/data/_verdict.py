@@ -1,5 +1,6 @@
 """The verdict on a solution: tests that say whether its numbers can be believed."""
 
+import math
 from dataclasses import dataclass
 
 __all__ = ["Verdict", "VerdictTest"]
@@ -18,6 +19,24 @@ class VerdictTest:
     passed: bool
     says: str
     """What was found, in a sentence; of a failure also what is likely wrong, and what would tell."""
+
+    @staticmethod
+    def of(name: str, value: float | None, limit: float, good: str, bad: str) -> "VerdictTest":
+        """A test that says `good` up to its limit, and fails with `bad` beyond it.
+
+        It fails too where the value is no finite number, which is then None.
+        """
+        passed = value is None or bool(value <= limit)
+        number = None if value is None or not math.isfinite(value) else float(value)
+        return VerdictTest(
+            name=name, value=number, limit=float(limit), passed=passed, says=good if passed else bad
+        )
+
+    @staticmethod
+    def note(name: str, value: float, limit: float, good: str, advice: str) -> "VerdictTest":
+        """A test that never fails: it says `good` up to its limit, and `advice` beyond it."""
+        says = good if value <= limit else advice
+        return VerdictTest(name=name, value=float(value), limit=float(limit), passed=True, says=says)
 
     @property
     def is_note(self) -> bool:

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-import scipy
 
 from pancam_graph.base.geometry import FloatArray, IntArray, pose_arrays
 from pancam_graph.elimination import Covariance, JointCovariance
@@ -23,10 +22,8 @@ __all__ = [
     "StopTelemetry",
     "corrections",
     "leg_corrections",
-    "rms_limit",
     "telemetry_of",
     "total",
-    "two_sided_limit",
 ]
 
 MAST_ENTRIES = ("roll", "pitch", "heading", "x", "y", "z")
@@ -224,13 +221,3 @@ def _positions(problem: Problem, masts: JointCovariance) -> tuple[FloatArray, Fl
     for i in free:
         D[i, :, i] += np.eye(3)
     return e.ravel(), D.reshape(3 * n, 3 * n), world_R
-
-
-def two_sided_limit(n: int, chance: float) -> float:
-    """Size that the largest of n standard normal numbers exceeds with at most this chance, either side."""
-    return float(scipy.special.ndtri(1 - chance / (2 * max(n, 1))))
-
-
-def rms_limit(freedom: float, chance: float) -> float:
-    """RMS that the root of chi-square over its degrees of freedom exceeds with this chance."""
-    return float(np.sqrt(scipy.special.chdtri(max(freedom, 1e-3), chance) / max(freedom, 1e-3)))

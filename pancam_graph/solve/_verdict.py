@@ -8,36 +8,29 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 
 from pancam_graph.base.geometry import BoolArray, IntArray
 from pancam_graph.data import Traverse, Verdict, VerdictTest
+from pancam_graph.solve._chances import CHANCE, rms_limit, two_sided_limit
 from pancam_graph.solve._covariance import Uncertainty
 from pancam_graph.solve._fit import Fitted
 from pancam_graph.solve._noise_tests import Residuals
 from pancam_graph.solve._problem import Problem
 from pancam_graph.solve._reduced import ReducedSystem
 from pancam_graph.solve._rig_score import HeldEntry, held_entries
+from pancam_graph.solve._share_tests import shares_in_use
 from pancam_graph.solve._telemetry_tests import (
     Correction,
     corrections,
     leg_corrections,
-    rms_limit,
     telemetry_of,
     total,
-    two_sided_limit,
 )
 
 __all__ = ["Optimum", "verdict"]
 
-_CHANCE = 2e-4
-"""Chance that a right solution fails one statistical test."""
 _AT_OPTIMUM = 0.3
 """Largest distance to the optimum, in sigmas of the solution."""
-_LEFT_OUT = 0.9
-"""Largest share of the observations that may be left out as outliers."""
-_FAIR_SHARE = 0.25
-"""Part of the usual share of observations in use below which an image, a frame or a stop is suspect."""
 _UNDERSTATED = 1.5
 """Largest ratio of residuals to the stated noise."""
 _OVERSTATED = 2.0
@@ -48,8 +41,6 @@ _HELD_GAIN = 25.0
 """Decrease of the cost from which a held number of the rig is named, if it is also this ..."""
 _HELD_SHARE = 0.02
 """... share of the cost."""
-_IN_USE = 12
-"""Images, frames and stops with fewer observations are not tested alone."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,31 +67,16 @@ class Optimum:
 def verdict(at: Optimum) -> Verdict:
     """All tests of a fit."""
     residuals = Residuals.of(at.fitted.problem)
-    tests = [_converged(at), _finite(residuals), _cost(at), _optimum(at), *_in_use(at)]
+    tests = [_converged(at), _finite(residuals), _cost(at), _optimum(at), *shares_in_use(at.fitted.problem)]
     if len(residuals.square):
         tests += _noise(at, residuals)
     tests += [_sigmas(at), *_telemetry(at), *_freed(at), *_held(at)]
     return Verdict(tests=tuple(tests))
 
 
-def _test(name: str, value: float | None, limit: float, good: str, bad: str) -> VerdictTest:
-    """A test that fails beyond its limit; a value that is no number fails too."""
-    passed = value is None or bool(value <= limit)
-    finite = None if value is None or not np.isfinite(value) else float(value)
-    return VerdictTest(
-        name=name, value=finite, limit=float(limit), passed=passed, says=good if passed else bad
-    )
-
-
-def _note(name: str, value: float, limit: float, good: str, advice: str) -> VerdictTest:
-    """A test that never fails, and advises beyond its limit."""
-    says = good if value <= limit else advice
-    return VerdictTest(name=name, value=float(value), limit=float(limit), passed=True, says=says)
-
-
 def _converged(at: Optimum) -> VerdictTest:
     outcome = at.fitted.outcome
-    return _test(
+    return VerdictTest.of(
         "converged",
         0.0 if outcome.converged else 1.0,
         0.0,
@@ -111,7 +87,7 @@ def _converged(at: Optimum) -> VerdictTest:
 
 def _finite(residuals: Residuals) -> VerdictTest:
     n = residuals.n_not_finite
-    return _test(
+    return VerdictTest.of(
         "finite",
         float(n) if len(residuals.square) else np.inf,
         0.0,
@@ -123,7 +99,7 @@ def _finite(residuals: Residuals) -> VerdictTest:
 
 def _cost(at: Optimum) -> VerdictTest:
     before, after = at.cost_initial, at.fitted.problem.cost()
-    return _test(
+    return VerdictTest.of(
         "cost",
         after - before,
         1e-6 * (1 + abs(before)),
@@ -138,7 +114,7 @@ def _optimum(at: Optimum) -> VerdictTest:
     name, limit = "optimum", _AT_OPTIMUM
     if at.reduced is None:
         text = "distance to the optimum is unknown: the system has a free direction"
-        return _test(name, np.nan, limit, text, text)
+        return VerdictTest.of(name, np.nan, limit, text, text)
     ahead = at.reduced.root.gain() + at.reduced.system.gain_alone
     costs = at.fitted.outcome.costs
     gains = -np.diff(costs[-3:])
@@ -146,7 +122,7 @@ def _optimum(at: Optimum) -> VerdictTest:
     crawls = len(gains) == 2 and 0 < gains[1] < gains[0]
     rate = min(gains[1] / gains[0], 0.999) if crawls and ahead <= gains[1] else 0.0
     off = float(np.sqrt(2 * ahead) / (1 - np.sqrt(rate)))
-    return _test(
+    return VerdictTest.of(
         name,
         off,
         limit,
@@ -156,61 +132,16 @@ def _optimum(at: Optimum) -> VerdictTest:
     )
 
 
-def _in_use(at: Optimum) -> Iterator[VerdictTest]:
-    """Shares of the measurements that are left out: of all, and of the worst image, frame and stop."""
-    problem, t = at.fitted.problem, at.traverse
-    image, kept = problem.measurements.image, problem.kept
-    share = float(np.mean(kept)) if len(kept) else 0.0
-    yield _test(
-        "observations",
-        1 - share,
-        _LEFT_OUT,
-        f"{share:.0%} of {len(kept)} observations are in use",
-        f"only {share:.0%} of {len(kept)} observations are in use, too few to tell right ones from wrong "
-        "ones; check matches and rig",
-    )
-    for name, owner, ids in (
-        ("image", np.arange(len(t.images)), [i.id for i in t.images]),
-        ("frame", t.image_frame, [f.id for f in t.frames]),
-        ("stop", t.image_stop, [s.id for s in t.stops]),
-    ):
-        yield _fair_share(name, owner[image], kept, share, ids)
-
-
-def _fair_share(name: str, owner: IntArray, kept: BoolArray, usual: float, ids: Sequence[str]) -> VerdictTest:
-    n = np.bincount(owner, minlength=len(ids))
-    used = np.bincount(owner, kept, minlength=len(ids))
-    share = used / n.clip(1)
-    # A chance of less than this, if its observations were as good as all others.
-    chance = scipy.special.bdtr(used, n, usual)
-    suspect = (n >= _IN_USE) & (chance < _CHANCE / len(ids))
-    candidates = np.flatnonzero(suspect if suspect.any() else n >= _IN_USE)
-    limit = 1 - _FAIR_SHARE * usual
-    if not len(candidates):
-        return _test(f"{name} share", None, limit, f"too few observations to test a {name} alone", "")
-    worst = int(candidates[np.argmin(share[candidates])])
-    says = f"of {name} {ids[worst]} {int(used[worst])} of {int(n[worst])} observations are in use"
-    value = 1 - float(share[worst])
-    return _test(
-        f"{name} share",
-        value if suspect.any() else min(value, limit),
-        limit,
-        says,
-        f"{says}, of all {usual:.0%}: its pointing, its file or its matches are probably wrong; "
-        "leave it out, or widen the sigmas of its pointing",
-    )
-
-
 def _noise(at: Optimum, residuals: Residuals) -> Iterator[VerdictTest]:
     prepared, t = at.fitted.screened.prepared, at.traverse
     ratio = residuals.ratio
     if prepared.rescales_noise:
         sigma = float(np.median(at.fitted.noise.sigma_px[at.used])) if at.used.any() else np.nan
-        yield _test("noise", None, _UNDERSTATED, f"noise was estimated: {sigma:.3g} px (median)", "")
+        yield VerdictTest.of("noise", None, _UNDERSTATED, f"noise was estimated: {sigma:.3g} px (median)", "")
     else:
         fits = f"residuals are {ratio:.3g} times what the stated sigmas make them"
         advice = "let the residuals decide (--noise estimated), or give other sigmas"
-        yield _test(
+        yield VerdictTest.of(
             "noise",
             ratio,
             _UNDERSTATED,
@@ -219,7 +150,7 @@ def _noise(at: Optimum, residuals: Residuals) -> Iterator[VerdictTest]:
             f"all formal sigmas with them; {advice}",
         )
         inverse = 1 / max(ratio, 1e-9)
-        yield _note(
+        yield VerdictTest.note(
             "noise overstated",
             inverse,
             _OVERSTATED,
@@ -236,11 +167,11 @@ def _uneven(name: str, residuals: Residuals, owner: IntArray, ids: Sequence[str]
     """The owner whose residuals exceed those of all by most, less what chance may add."""
     ratio, freedom = residuals.by(owner, len(ids))
     ratio = ratio / max(residuals.ratio, 1e-300)
-    allowed = np.array([rms_limit(f, _CHANCE / len(ids)) for f in freedom])
+    allowed = np.array([rms_limit(f, CHANCE / len(ids)) for f in freedom])
     sure = np.where(freedom >= 1, ratio / allowed, 0.0)
     worst = int(np.argmax(sure))
     says = f"residuals of {name} {ids[worst]} are {ratio[worst]:.3g} times those of all"
-    return _test(
+    return VerdictTest.of(
         f"{name} noise",
         float(sure[worst]),
         _UNEVEN,
@@ -264,7 +195,7 @@ def _sigmas(at: Optimum) -> VerdictTest:
                 f"; least known is the position of {t.stops[worst].id}: {1e3 * values[worst, -1] ** 0.5:.3g} "
                 f"mm along ({x:.2f}, {y:.2f}, {z:.2f}) of its mast"
             )
-    return _test(
+    return VerdictTest.of(
         "sigmas",
         float(unknown),
         0.0,
@@ -283,10 +214,10 @@ def _telemetry(at: Optimum) -> Iterator[VerdictTest]:
     rms, freedom = total(telemetry)
     if freedom > 0:
         says = f"corrections of telemetry are {rms:.3g} times what its sigmas and the images allow (RMS)"
-        yield _test(
+        yield VerdictTest.of(
             "telemetry",
             rms,
-            rms_limit(freedom, _CHANCE),
+            rms_limit(freedom, CHANCE),
             says,
             f"{says}: give telemetry larger sigmas, or look for a wrong rig or wrong matches",
         )
@@ -301,10 +232,10 @@ def _telemetry(at: Optimum) -> Iterator[VerdictTest]:
         if some:
             worst = max(some, key=lambda c: c.sigmas)
             says = _describe(worst, at.traverse)
-            yield _test(
+            yield VerdictTest.of(
                 name,
                 worst.sigmas,
-                two_sided_limit(len(some), _CHANCE),
+                two_sided_limit(len(some), CHANCE),
                 f"largest correction: {says}",
                 f"{says}: this telemetry, or what the images say of it, is wrong; {widen}, or check the rig",
             )
@@ -337,10 +268,10 @@ def _freed(at: Optimum) -> Iterator[VerdictTest]:
     if some:
         worst, r = max(some, key=lambda pair: pair[0])
         says = f"largest correction of the rig: {r.entry} of {r.quantity} by {r.change:+.3g}"
-        yield _test(
+        yield VerdictTest.of(
             "rig",
             float(worst),
-            two_sided_limit(len(some), _CHANCE),
+            two_sided_limit(len(some), CHANCE),
             says,
             f"{says}, {worst:.3g} times what its prior allows: the rig is probably another one, or needs "
             "more of its numbers free",
@@ -355,7 +286,7 @@ def _held(at: Optimum) -> Iterator[VerdictTest]:
     if held:
         cost = at.fitted.problem.cost()
         best = max(held, key=lambda e: e.gain)
-        yield _note(
+        yield VerdictTest.note(
             "held rig",
             best.gain,
             max(_HELD_GAIN, _HELD_SHARE * cost),

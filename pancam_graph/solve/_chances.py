@@ -1,0 +1,19 @@
+"""Limits that right solutions exceed only by a small chance."""
+
+import numpy as np
+import scipy
+
+__all__ = ["CHANCE", "rms_limit", "two_sided_limit"]
+
+CHANCE = 2e-4
+"""Chance that a right solution fails one statistical test."""
+
+
+def two_sided_limit(n: int, chance: float) -> float:
+    """Size that the largest of n standard normal numbers exceeds with at most this chance, either side."""
+    return float(scipy.special.ndtri(1 - chance / (2 * max(n, 1))))
+
+
+def rms_limit(freedom: float, chance: float) -> float:
+    """RMS that the root of chi-square over its degrees of freedom exceeds with this chance."""
+    return float(np.sqrt(scipy.special.chdtri(max(freedom, 1e-3), chance) / max(freedom, 1e-3)))

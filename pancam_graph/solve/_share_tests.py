@@ -1,0 +1,104 @@
+"""Shares of the observations in use: of all, and of the image, frame and stop that has the smallest."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from pancam_graph.base.geometry import BoolArray, IntArray
+from pancam_graph.data import VerdictTest
+from pancam_graph.solve._chances import CHANCE
+from pancam_graph.solve._problem import Problem
+
+__all__ = ["shares_in_use"]
+
+_LEFT_OUT = 0.9
+"""Largest share of the observations that may be left out as outliers."""
+_FAIR = 0.25
+"""Part of the usual share below which an image, a frame or a stop is suspect."""
+_OBSERVATIONS = 12
+"""Images, frames and stops with fewer observations are not tested alone ..."""
+_LINKS = 4
+"""... nor are frames and stops that share fewer points with others."""
+
+
+def shares_in_use(problem: Problem) -> Iterator[VerdictTest]:
+    """Tests of how much is in use of what was measured, and of what joins frames and stops."""
+    t = problem.template.traverse
+    image, kept = problem.measurements.image, problem.kept
+    share = float(np.mean(kept)) if len(kept) else 0.0
+    yield VerdictTest.of(
+        "observations",
+        1 - share,
+        _LEFT_OUT,
+        f"{share:.0%} of {len(kept)} observations are in use",
+        f"only {share:.0%} of {len(kept)} observations are in use, too few to tell right ones from wrong "
+        "ones; check matches and rig",
+    )
+    images = ("image", np.arange(len(t.images)), [i.id for i in t.images])
+    frames = ("frame", t.image_frame, [f.id for f in t.frames])
+    stops = ("stop", t.image_stop, [s.id for s in t.stops])
+    for name, owner, ids in (images, frames, stops):
+        test = _Fairness(name=f"{name} share", owner=name, what="observations", least=_OBSERVATIONS, ids=ids)
+        yield test.of(owner[image], kept)
+    for name, owner, ids in (frames, stops):
+        what = f"points shared with another {name}"
+        test = _Fairness(name=f"{name} links", owner=name, what=what, least=_LINKS, ids=ids)
+        yield test.of(*_links(problem, owner))
+
+
+def _links(problem: Problem, owner: IntArray) -> tuple[IntArray, BoolArray]:
+    """Each owner of each landmark that two owners or more see (n,), and whether it still joins them (n,).
+
+    `owner` (images,) is the frame or the stop of each image.
+    """
+    m = problem.measurements
+    n_owners = int(owner.max()) + 1
+    pair, of = np.unique(m.landmark * n_owners + owner[m.image], return_inverse=True)
+    landmark, seen_by = pair // n_owners, pair % n_owners
+    in_use = np.bincount(of, problem.kept, minlength=len(pair)) > 0
+    joins = np.bincount(landmark, minlength=m.n_landmarks) >= 2
+    joined = np.bincount(landmark, in_use, minlength=m.n_landmarks) >= 2
+    rows = joins[landmark]
+    return seen_by[rows], (in_use & joined[landmark])[rows]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Fairness:
+    """A test that no owner has much less in use than all others together."""
+
+    name: str
+    owner: str
+    """What owns: image, frame or stop."""
+    what: str
+    """What is owned, in words."""
+    least: int
+    """Owners of fewer are not tested alone."""
+    ids: Sequence[str]
+
+    def of(self, owner: IntArray, kept: BoolArray) -> VerdictTest:
+        """The test, given the owner of each thing (n,) and whether it is in use (n,)."""
+        usual = float(np.mean(kept)) if len(kept) else 1.0
+        n = np.bincount(owner, minlength=len(self.ids))
+        used = np.bincount(owner, kept, minlength=len(self.ids))
+        share, limit = used / n.clip(1), 1 - _FAIR * usual
+        # Few are in use by chance too, where few are owned.
+        is_sure = scipy.special.bdtr(used, n, usual) < CHANCE / len(self.ids)
+        suspect = (n >= self.least) & is_sure & (share < _FAIR * usual)
+        tested = np.flatnonzero(suspect if suspect.any() else n >= self.least)
+        if not len(tested):
+            good = f"too few {self.what} to test a {self.owner} alone"
+            return VerdictTest.of(self.name, None, limit, good, "")
+        worst = int(tested[np.argmin(share[tested])])
+        counts = f"{int(used[worst])} of {int(n[worst])}"
+        says = f"of {self.owner} {self.ids[worst]} {counts} {self.what} are in use"
+        value = 1 - float(share[worst])
+        return VerdictTest.of(
+            self.name,
+            value if suspect.any() else min(value, limit),
+            limit,
+            says,
+            f"{says}, of all {usual:.0%}: its pointing, its file or its matches are probably wrong; "
+            "leave it out, or widen the sigmas of its telemetry",
+        )

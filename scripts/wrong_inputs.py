@@ -1,0 +1,253 @@
+"""Give drives with known truth one wrong input at a time, and print what solutions and verdicts make of it.
+
+For each fault a line: runs, how many failed their tests, the largest error in formal sigmas among those that
+passed, how many of these are silent failures (beyond 6 sigma), and the tests that failed most often. The
+same options give the same numbers.
+
+Exit status: 0 no silent failure, 1 some, 2 bad input.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pancam_graph import Solution, SolveOptions, Traverse, simulate, solve
+from pancam_graph.base.errors import InputError, PancamGraphError
+from pancam_graph.base.geometry import FloatArray
+from pancam_graph.cli import Progress, ScriptParser, run
+from pancam_graph.rigs import rig_template
+from pancam_graph.simulate import Simulation, SimulationOptions
+from pancam_graph.smoother._incremental import solve_incrementally
+
+_SILENT = 6.0
+"""Error in formal sigmas from which a solution that passed its tests is a silent failure."""
+
+Fault = Callable[[Simulation, np.random.Generator], Traverse]
+"""A traverse with something wrong, of a simulation that is right."""
+
+
+def _right(s: Simulation, rng: np.random.Generator) -> Traverse:
+    return s.traverse
+
+
+def _frame_pan(degrees: float) -> Fault:
+    """The pan of one frame is wrong."""
+
+    def fault(s: Simulation, rng: np.random.Generator) -> Traverse:
+        frames = list(s.traverse.frames)
+        i = int(rng.integers(len(frames)))
+        frames[i] = replace(frames[i], pan_rad=frames[i].pan_rad + float(np.deg2rad(degrees)))
+        return replace(s.traverse, frames=tuple(frames))
+
+    return fault
+
+
+def _stop_pans(degrees: float, stated_degrees: float) -> Fault:
+    """All pans of the last stop are wrong in common, and said to be good."""
+
+    def fault(s: Simulation, rng: np.random.Generator) -> Traverse:
+        t, sigma = s.traverse, float(np.deg2rad(stated_degrees))
+        truth = s.truth.pan_tilt_rad
+        frames = []
+        for i, frame in enumerate(t.frames):
+            pan, tilt = truth[i] + sigma * rng.standard_normal(2)
+            off = float(np.deg2rad(degrees)) if frame.stop == t.stops[-1].id else 0.0
+            frames.append(
+                replace(
+                    frame,
+                    pan_rad=float(pan + off),
+                    tilt_rad=float(tilt),
+                    sigma_pan_rad=sigma,
+                    sigma_tilt_rad=sigma,
+                )
+            )
+        return replace(t, frames=tuple(frames))
+
+    return fault
+
+
+def _leg(sigmas: float) -> Fault:
+    """Odometry of one leg is wrong: all later stops are shifted."""
+
+    def fault(s: Simulation, rng: np.random.Generator) -> Traverse:
+        stops = list(s.traverse.stops)
+        first = int(rng.integers(1, len(stops)))
+        turn = rng.uniform(0, 2 * np.pi)
+        for i in range(first, len(stops)):
+            pose, size = stops[i].world_T_mast, sigmas * stops[i].sigma_translation_m
+            shift = size * np.array([np.cos(turn), np.sin(turn), 0.0])
+            moved = type(pose)(pose.rotation(), pose.translation() + shift)
+            stops[i] = replace(stops[i], world_T_mast=moved)
+        return replace(s.traverse, stops=tuple(stops))
+
+    return fault
+
+
+def _shifted_image(px: float, *, both_eyes: bool) -> Fault:
+    """All observations of one image, or of one frame, are shifted."""
+
+    def fault(s: Simulation, rng: np.random.Generator) -> Traverse:
+        t = s.traverse
+        assert t.observations is not None  # simulated
+        o = t.observations
+        image = int(rng.integers(len(t.images)))
+        of = t.image_frame[o.image] == t.image_frame[image] if both_eyes else o.image == image
+        uv = o.uv_px.copy()
+        uv[of, 0] += px
+        return t.with_observations(replace(o, uv_px=uv))
+
+    return fault
+
+
+def _neighbouring_rock(share: float, distance_m: float) -> Fault:
+    """From some image on, a share of the tracks is of another point near by."""
+
+    def fault(s: Simulation, rng: np.random.Generator) -> Traverse:
+        t = s.traverse
+        assert t.observations is not None  # simulated
+        o = t.observations
+        tracks = np.unique(o.track)
+        wrong = np.isin(o.track, rng.choice(tracks, int(share * len(tracks)), replace=False))
+        # The later half of the images of each track sees the other rock.
+        later = np.zeros(len(o), dtype=bool)
+        for track in np.unique(o.track[wrong]):
+            rows = np.flatnonzero(o.track == track)
+            frames = np.unique(t.image_frame[o.image[rows]])
+            later[rows] = t.image_frame[o.image[rows]] >= frames[len(frames) // 2]
+        moved = wrong & later
+        offset = rng.standard_normal((len(s.truth.landmarks_m), 3))
+        offset *= distance_m / np.linalg.norm(offset, axis=1)[:, None]
+        point = s.truth.landmarks_m[o.track]
+        R, centre = t.camera_poses(s.truth.world_T_mast, s.truth.pan_tilt_rad)
+        uv = o.uv_px.copy()
+        for i in np.unique(o.image[moved]):
+            rows = np.flatnonzero(moved & (o.image == i))
+            camera = s.truth.rig.eyes[int(t.image_eye[i])].camera
+            beside = point[rows] + offset[o.track[rows]]
+            there, here = (camera.project((at - centre[i]) @ R[i])[0] for at in (beside, point[rows]))
+            uv[rows] += there - here
+        return t.with_observations(replace(o, uv_px=uv))
+
+    return fault
+
+
+def _stated_noise(factor: float) -> Fault:
+    """Observations state their sigmas too large or too small."""
+
+    def fault(s: Simulation, rng: np.random.Generator) -> Traverse:
+        o = s.traverse.observations
+        assert o is not None  # simulated
+        return s.traverse.with_observations(replace(o, sigma_px=o.sigma_px * factor))
+
+    return fault
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """A fault, and the drives that get it."""
+
+    fault: Fault = _right
+    drive: Mapping[str, object] = field(default_factory=dict)
+    """Options of the simulation beside the usual ones."""
+
+
+CASES: dict[str, Case] = {
+    "right": Case(),
+    "3 % outliers": Case(drive={"outliers": 0.03}),
+    "10 % outliers": Case(drive={"outliers": 0.1}),
+    **{f"{100 * share:.0f} % outliers": Case(drive={"outliers": share}) for share in (0.33, 0.4, 0.5, 0.6)},
+    **{f"sigmas stated {1 / f:g} times too small": Case(fault=_stated_noise(f)) for f in (0.1, 0.3)},
+    **{f"sigmas stated {f:g} times too large": Case(fault=_stated_noise(f)) for f in (3.0, 10.0)},
+    **{f"pan of a frame off by {d:g} degrees": Case(fault=_frame_pan(d)) for d in (0.5, 1.0, 3.0, 10.0)},
+    "pans of a stop off by 1 degree, told 0.077": Case(
+        fault=_stop_pans(1.0, 0.077), drive={"sigma_stop_rad": 1e-3}
+    ),
+    "the same, headings known to 0.6 degrees only": Case(fault=_stop_pans(1.0, 0.077)),
+    "a leg off by 5 sigma": Case(fault=_leg(5.0), drive={"stops": 4}),
+    "an image shifted by 2 px": Case(fault=_shifted_image(2.0, both_eyes=False)),
+    "an image shifted by 20 px": Case(fault=_shifted_image(20.0, both_eyes=False)),
+    "a frame shifted by 20 px": Case(fault=_shifted_image(20.0, both_eyes=True)),
+    "a tenth of the tracks on a rock 0.1 m away": Case(fault=_neighbouring_rock(0.1, 0.1)),
+    "focal length off by 0.2 %": Case(drive={"focal_error": 2e-3}),
+    "mounts off by 0.5 mrad": Case(drive={"mount_error_rad": 5e-4}),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What became of one run."""
+
+    passed: bool
+    error: float
+    """Largest error of a pan, a tilt or a component of a stop's pose, in formal sigmas."""
+    failed: tuple[str, ...]
+    """Names of the tests that failed; the error itself where nothing was solved."""
+
+
+def measure(case: Case, rig: str, seed: int, *, incremental: bool) -> Outcome:
+    """Simulate, spoil, solve, compare with the truth."""
+    options = SimulationOptions(**({"stops": 2} | dict(case.drive)))  # type: ignore[arg-type]  # by name
+    simulation = simulate(rig_template(rig), options, seed=seed)
+    traverse = case.fault(simulation, np.random.default_rng(seed))
+    try:
+        solution = (solve_incrementally if incremental else solve)(traverse, SolveOptions())
+    except PancamGraphError as error:
+        return Outcome(passed=False, error=np.nan, failed=(str(error)[:40],))
+    verdict = solution.verdict
+    assert verdict is not None  # every solve is tested
+    return Outcome(
+        passed=solution.passed,
+        error=float(np.max(errors_in_sigmas(solution, simulation))),
+        failed=tuple(test.name for test in verdict.failures),
+    )
+
+
+def errors_in_sigmas(solution: Solution, simulation: Simulation) -> FloatArray:
+    """Absolute errors (n,) of all pans, tilts and components of stops' poses over their formal sigmas."""
+    truth, final = simulation.truth, solution.final
+    angles = (final.pan_tilt_rad - truth.pan_tilt_rad).ravel()
+    stops = [t.localCoordinates(f) for t, f in zip(truth.world_T_mast, final.world_T_mast, strict=True)]
+    error = np.concatenate([(angles + np.pi) % (2 * np.pi) - np.pi, *stops])
+    variance = [np.diag(c) for c in solution.stop_covariance]
+    sigma = np.concatenate([solution.angle_sigma_rad.ravel(), *np.sqrt(variance)])
+    return np.asarray(np.abs(error[sigma > 0]) / sigma[sigma > 0])
+
+
+def main() -> int:
+    """Run all cases, print a line for each."""
+    parser = ScriptParser(__doc__ or "")
+    add = parser.add_argument
+    add("--seeds", type=int, default=20, help="runs of each case and rig (%(default)s)")
+    add("--first-seed", type=int, default=1000, help="(%(default)s)")
+    add("--rigs", nargs="+", default=["mer-navcam", "exomars-pancam"], metavar="RIG")
+    add("--only", nargs="+", metavar="TEXT", help="cases whose names contain one of these")
+    add("--incremental", action="store_true", help="stop by stop")
+    a = parser.parse_args()
+    if a.seeds < 1:
+        raise InputError(f"--seeds: expected 1 or more, found {a.seeds}")
+    silent = 0
+    progress = Progress()
+    chosen = {n: c for n, c in CASES.items() if not a.only or any(text in n for text in a.only)}
+    print(f"{'case':<45} {'runs':>5} {'failed':>7} {'worst passed':>13} {'silent':>7}  tests that failed")
+    for name, case in chosen.items():
+        with progress.shown(name):
+            outcomes = [
+                measure(case, rig, a.first_seed + i, incremental=a.incremental)
+                for i in range(a.seeds)
+                for rig in a.rigs
+            ]
+        passed = [o.error for o in outcomes if o.passed]
+        n_silent = sum(not error <= _SILENT for error in passed)
+        silent += n_silent
+        often = Counter(test for o in outcomes for test in o.failed).most_common(3)
+        said = ", ".join(f"{test} {n}" for test, n in often)
+        worst = f"{max(passed):.1f}" if passed else "-"
+        counts = f"{len(outcomes):>5} {len(outcomes) - len(passed):>7} {worst:>13} {n_silent:>7}"
+        print(f"{name:<45} {counts}  {said}", flush=True)
+    return 1 if silent else 0
+
+
+if __name__ == "__main__":
+    run(main)

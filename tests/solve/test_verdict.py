@@ -1,0 +1,188 @@
+"""The verdict: right drives pass it, each kind of wrong input fails the test that it should."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from pancam_graph import Freedom, Sharing, SimulationOptions, SolveOptions, Traverse, simulate, solve
+from pancam_graph.data import Solution, VerdictTest
+from pancam_graph.rigs import TEMPLATES
+from pancam_graph.simulate import Simulation
+from pancam_graph.smoother._incremental import solve_incrementally
+from pancam_graph.solve import judge
+from pancam_graph.solve._rig_score import held_entries
+from pancam_graph.solve._telemetry_tests import corrections, leg_corrections, telemetry_of, total
+from support.solving import fitted
+
+SMALL = SimulationOptions(stops=2, pans=9, points_per_image=20)
+
+
+def drive(seed: int = 3, rig: str = "mer-navcam", **options: object) -> Simulation:
+    return simulate(TEMPLATES[rig](), replace(SMALL, **options), seed=seed)  # type: ignore[arg-type]  # by name
+
+
+def named(solution: Solution) -> dict[str, VerdictTest]:
+    assert solution.verdict is not None
+    return {test.name: test for test in solution.verdict.tests}
+
+
+def failed(solution: Solution) -> set[str]:
+    assert solution.verdict is not None
+    return {test.name for test in solution.verdict.failures}
+
+
+def with_frames(traverse: Traverse, rows: Sequence[int], pan_rad: float) -> Traverse:
+    """The traverse with the pans of some frames off."""
+    frames = list(traverse.frames)
+    for i in rows:
+        frames[i] = replace(frames[i], pan_rad=frames[i].pan_rad + pan_rad)
+    return replace(traverse, frames=tuple(frames))
+
+
+def with_sigmas(traverse: Traverse, factor: float) -> Traverse:
+    observations = traverse.observations
+    assert observations is not None
+    return traverse.with_observations(replace(observations, sigma_px=observations.sigma_px * factor))
+
+
+@pytest.mark.parametrize("rig", ["mer-navcam", "exomars-pancam", "ladybug3"])
+@pytest.mark.parametrize("outliers", [0.0, 0.1])
+def test_a_right_drive_passes(rig: str, outliers: float) -> None:
+    solution = solve(drive(rig=rig, outliers=outliers).traverse)
+    assert solution.passed, failed(solution)
+    assert solution.verdict is not None
+    assert not solution.verdict.notes
+
+
+@pytest.mark.parametrize("model", ["circle", "free", "projective"])
+def test_a_right_drive_passes_in_other_models(model: str) -> None:
+    traverse = drive(stops=1, pans=5, points_per_image=12).traverse
+    assert failed(solve(traverse, SolveOptions(model=model))) == set()  # type: ignore[arg-type]  # by name
+
+
+def test_a_drive_that_was_solved_stop_by_stop_has_a_verdict() -> None:
+    assert solve_incrementally(drive().traverse).passed
+    wrong = with_frames(drive().traverse, [4], 0.05)
+    assert "pointing" in failed(solve_incrementally(wrong))
+
+
+@pytest.mark.parametrize("factor", [0.1, 0.3])
+def test_sigmas_that_are_too_small_are_said_with_the_factor(factor: float) -> None:
+    solution = solve(with_sigmas(drive().traverse, factor))
+    noise = named(solution)["noise"]
+    assert not noise.passed
+    assert noise.value == pytest.approx(1 / factor, rel=0.1)
+    assert "--noise estimated" in noise.says
+
+
+def test_sigmas_that_are_too_large_are_said_with_the_factor_and_pass() -> None:
+    solution = solve(with_sigmas(drive().traverse, 10.0))
+    note = named(solution)["noise overstated"]
+    assert solution.passed
+    assert note.is_note
+    assert note.value == pytest.approx(10.0, rel=0.1)
+
+
+def test_estimated_noise_needs_no_sigmas() -> None:
+    wrong = with_sigmas(drive().traverse, 0.1)
+    solution = solve(wrong, SolveOptions(rescale_noise=True))
+    assert solution.passed
+    assert np.median(solution.sigma_px) == pytest.approx(0.3, rel=0.1)
+
+
+def test_a_pan_that_is_wrong_is_named() -> None:
+    solution = solve(with_frames(drive().traverse, [4], np.deg2rad(1.0)))
+    pointing = named(solution)["pointing"]
+    assert not pointing.passed
+    assert "frame00004" in pointing.says
+
+
+def test_pans_that_are_wrong_in_common_are_said() -> None:
+    traverse = drive(sigma_stop_rad=1e-4).traverse
+    of_second = np.flatnonzero(traverse.frame_stop == 1).tolist()
+    solution = solve(with_frames(traverse, of_second, np.deg2rad(1.0)))
+    pointing = named(solution)["pointing"]
+    assert not pointing.passed
+    assert "every pan at stop0001" in pointing.says
+
+
+def test_a_leg_that_is_wrong_is_said() -> None:
+    traverse = drive(stops=4, pans=6, sigma_stop_m=0.02).traverse
+    stops = list(traverse.stops)
+    for i in (2, 3):
+        pose = stops[i].world_T_mast
+        moved = gtsam.Pose3(pose.rotation(), pose.translation() + np.array([0.0, 0.2, 0.0]))
+        stops[i] = replace(stops[i], world_T_mast=moved)
+    solution = solve(replace(traverse, stops=tuple(stops)))
+    test = named(solution)["stops"]
+    assert not test.passed
+    assert "y from stop0001 to stop0002" in test.says
+
+
+def test_an_image_that_does_not_fit_is_named() -> None:
+    traverse = drive().traverse
+    observations = traverse.observations
+    assert observations is not None
+    uv_px = observations.uv_px.copy()
+    uv_px[observations.image == 6] += [20.0, 0.0]
+    solution = solve(traverse.with_observations(replace(observations, uv_px=uv_px)))
+    share = named(solution)["image share"]
+    assert not share.passed
+    assert traverse.images[6].id in share.says
+
+
+def test_iterations_that_end_early_are_no_success() -> None:
+    solution = solve(drive().traverse, SolveOptions(loss="none", max_iterations=1))
+    assert not solution.passed
+    assert {"converged", "optimum"} <= failed(solution)
+
+
+def test_corrections_over_their_sigmas_are_standard_normal() -> None:
+    """Over seeds: variance 1 of single and of common corrections and of legs, and of all in sum."""
+    single, common, legs, sums = list[float](), list[float](), list[float](), list[float]()
+    for seed in range(100, 110):
+        fit = fitted(drive(seed, stops=3, pans=5).traverse, SolveOptions())
+        uncertainty = judge(fit).uncertainty
+        assert uncertainty.variables is not None
+        assert uncertainty.masts is not None
+        telemetry = telemetry_of(fit.problem, uncertainty.variables)
+        for one in corrections(telemetry):
+            (common if one.is_common else single).append(one.sigmas)
+        legs += [c.sigmas for c in leg_corrections(fit.problem, uncertainty.masts)]
+        rms, freedom = total(telemetry)
+        sums.append((rms**2 - 1) * np.sqrt(freedom / 2))
+    for sizes, slack in ((single, 0.12), (common, 0.35), (legs, 0.5)):
+        assert np.mean(np.square(sizes)) == pytest.approx(1.0, abs=slack)
+    assert np.mean(sums) == pytest.approx(0.0, abs=0.8)
+    assert np.std(sums) == pytest.approx(1.0, abs=0.5)
+
+
+def test_the_score_of_a_held_number_is_what_freeing_it_gains() -> None:
+    traverse = drive(focal_error=2e-3).traverse
+    options = SolveOptions(loss="none")
+    held = {(e.camera, e.entry): e for e in held_entries(fitted(traverse, options).problem)}
+    sharing = Sharing(calibration=Freedom(scope="eye", free=("focal",)))
+    freed = fitted(traverse, replace(options, sharing=sharing))
+    gain = fitted(traverse, options).problem.cost() - freed.problem.cost()
+    one = held["left", "focal"]
+    assert gain > 30
+    assert one.gain <= 1.1 * gain  # both eyes are free there
+    assert max(e.gain for e in held.values()) > 0.4 * gain
+
+
+def test_a_rig_that_is_wrong_is_advised_of() -> None:
+    note = named(solve(drive(focal_error=4e-3).traverse))["held rig"]
+    assert note.passed
+    assert note.is_note
+    assert "--sharing calibration=eye:focal" in note.says
+
+
+def test_a_frame_that_lost_its_links_is_named() -> None:
+    """Its matches with other frames look like outliers, and those between its own eyes still agree."""
+    solution = solve(with_frames(drive(stops=1, points_per_image=8).traverse, [4], np.deg2rad(3.0)))
+    links = named(solution)["frame links"]
+    assert not links.passed
+    assert "frame00004" in links.says
