@@ -16,7 +16,10 @@ __all__ = ["shares_in_use"]
 _LEFT_OUT = 0.9
 """Largest share of the observations that may be left out as outliers."""
 _FAIR = 0.25
-"""Part of the usual share below which an image, a frame or a stop is suspect."""
+"""Part of the usual share of observations below which an image, a frame or a stop is suspect ..."""
+_FAIR_LINKS = 0.6
+"""... and of points that join it to others: a pose that is wrong keeps some of these, as two rays meet
+wherever they lie in one plane."""
 _OBSERVATIONS = 12
 """Images, frames and stops with fewer observations are not tested alone ..."""
 _LINKS = 4
@@ -40,11 +43,13 @@ def shares_in_use(problem: Problem) -> Iterator[VerdictTest]:
     frames = ("frame", t.image_frame, [f.id for f in t.frames])
     stops = ("stop", t.image_stop, [s.id for s in t.stops])
     for name, owner, ids in (images, frames, stops):
-        test = _Fairness(name=f"{name} share", owner=name, what="observations", least=_OBSERVATIONS, ids=ids)
+        test = _Fairness(
+            name=f"{name} share", owner=name, what="observations", least=_OBSERVATIONS, fair=_FAIR, ids=ids
+        )
         yield test.of(owner[image], kept)
     for name, owner, ids in (frames, stops):
         what = f"points shared with another {name}"
-        test = _Fairness(name=f"{name} links", owner=name, what=what, least=_LINKS, ids=ids)
+        test = _Fairness(name=f"{name} links", owner=name, what=what, least=_LINKS, fair=_FAIR_LINKS, ids=ids)
         yield test.of(*_links(problem, owner))
 
 
@@ -75,6 +80,8 @@ class _Fairness:
     """What is owned, in words."""
     least: int
     """Owners of fewer are not tested alone."""
+    fair: float
+    """Part of the usual share in use that each must have."""
     ids: Sequence[str]
 
     def of(self, owner: IntArray, kept: BoolArray) -> VerdictTest:
@@ -82,10 +89,10 @@ class _Fairness:
         usual = float(np.mean(kept)) if len(kept) else 1.0
         n = np.bincount(owner, minlength=len(self.ids))
         used = np.bincount(owner, kept, minlength=len(self.ids))
-        share, limit = used / n.clip(1), 1 - _FAIR * usual
+        share, limit = used / n.clip(1), 1 - self.fair * usual
         # Few are in use by chance too, where few are owned.
         is_sure = scipy.special.bdtr(used, n, usual) < CHANCE / len(self.ids)
-        suspect = (n >= self.least) & is_sure & (share < _FAIR * usual)
+        suspect = (n >= self.least) & is_sure & (share < self.fair * usual)
         tested = np.flatnonzero(suspect if suspect.any() else n >= self.least)
         if not len(tested):
             good = f"too few {self.what} to test a {self.owner} alone"

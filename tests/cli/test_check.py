@@ -30,7 +30,7 @@ def wrong(tmp_path_factory: pytest.TempPathFactory) -> Path:
     options = SimulationOptions(stops=1, pans=7, points_per_image=15)
     traverse = simulate(mer_navcam(), options, seed=2).traverse
     frames = list(traverse.frames)
-    frames[3] = replace(frames[3], tilt_rad=frames[3].tilt_rad + np.deg2rad(0.7))
+    frames[3] = replace(frames[3], tilt_rad=frames[3].tilt_rad + np.deg2rad(2.0))
     write_traverse(replace(traverse, frames=tuple(frames)), folder / "in")
     assert main(["refine", str(folder / "in"), "--out", str(folder / "out"), "--no-report"]) == 1
     return folder / "out"
@@ -48,7 +48,7 @@ def test_a_wrong_solution_is_written_and_fails(wrong: Path, capsys: Captured) ->
     assert main(["check", str(wrong)]) == 1
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("FAILED ")
-    assert any(line.startswith("FAILED  pointing") and "frame00003" in line for line in lines)
+    assert any(line.startswith("FAILED  frame links") and "frame00003" in line for line in lines)
 
 
 def test_json_is_that_of_the_file(wrong: Path, capsys: Captured) -> None:
@@ -70,7 +70,7 @@ def test_refine_says_what_failed(wrong: Path, tmp_path: Path, capsys: Captured) 
     assert main(words) == 1
     printed = capsys.readouterr()
     assert "converged, but FAILED its tests" in printed.out
-    assert "failed test: pointing: tilt of frame00003" in printed.err
+    assert "failed test: frame links: of frame frame00003" in printed.err
 
 
 @pytest.mark.parametrize("content", [None, "", "{}", '{"format": "pancam-graph/solution", "version": 1}'])
