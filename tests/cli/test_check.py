@@ -32,7 +32,7 @@ def wrong(tmp_path_factory: pytest.TempPathFactory) -> Path:
     frames = list(traverse.frames)
     frames[3] = replace(frames[3], tilt_rad=frames[3].tilt_rad + np.deg2rad(2.0))
     write_traverse(replace(traverse, frames=tuple(frames)), folder / "in")
-    assert main(["refine", str(folder / "in"), "--out", str(folder / "out"), "--no-report"]) == 1
+    assert main(["refine", str(folder / "in"), "--out", str(folder / "out"), "--no-report", "--quiet"]) == 1
     return folder / "out"
 
 
