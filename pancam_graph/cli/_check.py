@@ -33,11 +33,9 @@ def _work(call: Invocation) -> int:
     file = read_solution_json(path)
     if file.verdict is None:
         raise InputError(f"{path}: verdict: expected the tests of a solution, found none: refine it again")
-    if call.arguments.json:
-        call.say(json.dumps(file.verdict.model_dump(), indent=1, allow_nan=False, ensure_ascii=False))
-    else:
-        for line in verdict_lines(file.verdict.verdict()):
-            call.say(line)
+    text = json.dumps(file.verdict.model_dump(), indent=1, allow_nan=False, ensure_ascii=True)
+    for line in text.splitlines() if call.arguments.json else verdict_lines(file.verdict.verdict()):
+        call.say(line)
     return 0 if file.converged and file.verdict.verdict().passed else 1
 
 
