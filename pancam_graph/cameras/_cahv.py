@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 import scipy
 
+from pancam_graph.base.arrays import float_array
 from pancam_graph.base.errors import CameraError
 from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.cameras._camera import Camera, Pinhole, Rays, require_finite
@@ -44,7 +45,7 @@ class CAHV(Camera):
         """Turn the vectors to arrays and check them."""
         super().__post_init__()
         for name in self._vector_names():
-            value = np.array(getattr(self, name), dtype=float)
+            value = float_array(name, getattr(self, name), CameraError).copy()
             if value.shape != (3,):
                 raise CameraError(f"{name}: expected 3 numbers, found {value.tolist()}")
             value.flags.writeable = False

@@ -238,4 +238,4 @@ def require_finite(where: str, **numbers: float | FloatArray) -> None:
     """Raise CameraError naming the first entry that has a number which is not finite."""
     for name, value in numbers.items():
         if not np.all(np.isfinite(value)):
-            raise CameraError(f"{where}: {name} must be finite, found {value}")
+            raise CameraError(f"{where}: {name}: expected finite numbers, found {value}")

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pancam_graph.base.arrays import float_array
 from pancam_graph.base.errors import CameraError
 from pancam_graph.base.geometry import FloatArray
 
@@ -38,10 +39,7 @@ def decompose_projection(projection: ArrayLike) -> tuple[FloatArray, FloatArray,
     Raises CameraError for another shape, entries that are not finite, a left block of rank below 3 (a camera
     at infinity has no centre), or a zero third row.
     """
-    try:
-        p = np.asarray(projection, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise CameraError(f"projection matrix: expected 3 x 4 numbers, found {projection!r}") from error
+    p = float_array("projection matrix", projection, CameraError)
     if p.shape != (3, 4):
         raise CameraError(f"projection matrix: expected 3 x 4 numbers, found shape {p.shape}")
     if not np.all(np.isfinite(p)):

@@ -15,6 +15,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pancam_graph.base.arrays import float_array, int_array
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, compose, pose_arrays
 from pancam_graph.data._matching import Matching
@@ -99,6 +100,19 @@ class Observations:
     """(n, 2, 2) covariance of (u, v), symmetric and positive definite; None means sigma_px^2 I."""
     origin: Literal["given", "images"] = "given"
     """"images" if this package measured the pixels: their sigmas are guesses, which a solve rescales."""
+
+    def __post_init__(self) -> None:
+        """Turn the columns to int64 and float64. Raises InputError for what is no number, or masked."""
+        for name, turned in (
+            ("image", int_array),
+            ("track", int_array),
+            ("uv_px", float_array),
+            ("sigma_px", float_array),
+            ("covariance_px2", float_array),
+        ):
+            column = getattr(self, name)
+            if column is not None or name != "covariance_px2":
+                object.__setattr__(self, name, turned(f"observations: {name}", column))
 
     def __len__(self) -> int:
         """Number of observations."""
@@ -256,18 +270,18 @@ def _require_unique(kind: str, ids: Sequence[str]) -> None:
 
 def _require_numbers(where: str, **numbers: Sequence[float]) -> None:
     for name, values in numbers.items():
-        if not np.all(np.isfinite(values)):
+        if not np.all(np.isfinite(float_array(f"{where}: {name}", values))):
             raise InputError(f"{where}: {name}: expected finite numbers, found {list(values)}")
 
 
 def _require_sigmas(where: str, **sigmas: float) -> None:
     for name, sigma in sigmas.items():
-        if not (np.isfinite(sigma) and sigma >= 0):
+        if not (np.isfinite(float_array(f"{where}: {name}", sigma)) and sigma >= 0):
             raise InputError(f"{where}: {name}: expected 0 (held) or a positive number, found {sigma}")
 
 
 def _require_observations(obs: Observations, n_images: int) -> None:
-    n = len(obs.image)
+    n = obs.image.size  # of a single value too, which has no length
     for name, column, shape in (
         ("image", obs.image, (n,)),
         ("track", obs.track, (n,)),

@@ -3,8 +3,8 @@
 import hashlib
 import json
 import logging
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -18,8 +18,11 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from pancam_graph.base.errors import InputError
+from pancam_graph.base.regular_files import is_missing
 from pancam_graph.base.whole_files import whole_file
 from pancam_graph.images._cache_folder import begin_cache
+from pancam_graph.io import NpzFile, prefixed
 
 __all__ = ["Cache", "digest"]
 
@@ -35,8 +38,8 @@ class Cache:
 
     Nothing in the cache can therefore be out of date: after a change of an image, of the rig, of an option,
     of a module that makes the arrays, of a library's version or of the kind of processor, they are asked for
-    by another key. Files that cannot be read are logged and made anew. Several threads may ask at once, each
-    for other keys.
+    by another key. With the arrays a file keeps a digest of them: files that cannot be read, or have other
+    content than was written, are logged and made anew. Several threads may ask at once, each for other keys.
     """
 
     def __init__(self, folder: Path | None) -> None:
@@ -63,12 +66,13 @@ class Cache:
         if self._folder is not None and self._folder.is_dir():
             for path in self._folder.glob(f"*-*{_SUFFIX}"):
                 if path not in self._used:
-                    path.unlink(missing_ok=True)
+                    with suppress(OSError):  # a folder of such a name, or no right to delete
+                        path.unlink()
 
     def _write(self, path: Path, key: str, arrays: Arrays) -> None:
         assert self._folder is not None  # `recall` returns before
         content = BytesIO()
-        np.savez(content, **{_KEY: np.array(key)}, **arrays)  # type: ignore[arg-type]  # names of ours, none of its options
+        np.savez(content, **{_KEY: np.array(_mark(key, arrays))}, **arrays)  # type: ignore[arg-type]  # names of ours, none of its options
         try:
             with self._beginning:
                 if not self._begun:
@@ -80,19 +84,27 @@ class Cache:
 
 
 def _read(path: Path, key: str) -> Arrays | None:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except FileNotFoundError:
+    if is_missing(path):
         return None
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, NotImplementedError) as error:
-        _LOG.warning("%s: cannot be read and is made anew: %s", path, error)
+    try:
+        file = NpzFile(path)
+        with prefixed(path):
+            arrays = {name: file.array(name) for name in file.names}
+    except InputError as error:
+        _LOG.warning("made anew, as it cannot be read: %s", error)
         return None
     stored = arrays.pop(_KEY, None)
-    if stored is None or str(stored) != key:
-        _LOG.warning("%s: belongs to something else and is made anew", path)
+    if stored is None or str(stored) != _mark(key, arrays):
+        _LOG.warning("%s: belongs to something else, or was changed, and is made anew", path)
         return None
     return arrays
+
+
+def _mark(key: str, arrays: Mapping[str, NDArray[Any]]) -> str:
+    """What a file keeps beside its arrays: their key, and a digest of them."""
+    running = hashlib.sha256()
+    _feed(running, arrays)
+    return f"{key} {running.hexdigest()}"
 
 
 def digest(*parts: Any) -> str:

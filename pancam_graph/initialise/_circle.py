@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pancam_graph.base.arrays import float_array
 from pancam_graph.base.errors import GeometryError
 from pancam_graph.base.geometry import FloatArray
 
@@ -49,7 +50,7 @@ def fit_circle(centres_m: FloatArray, up: FloatArray | None = None) -> CircleFit
     Raises GeometryError for fewer than three centres, for centres that coincide, and for collinear ones or
     those that a line fits as well as any circle, where no circle is determined.
     """
-    points = np.asarray(centres_m, dtype=float)
+    points = float_array("circle", centres_m, GeometryError)
     n = len(points)
     if points.shape != (n, 3) or n < 3:
         raise GeometryError(f"circle: expected at least 3 centres, found {n}")

@@ -13,6 +13,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pancam_graph.base.arrays import float_array
 from pancam_graph.base.errors import CameraError, GeometryError, InputError
 from pancam_graph.base.geometry import FloatArray, IntArray, compose, pose_arrays
 from pancam_graph.cameras import decompose_projection, projection_matrix
@@ -121,10 +122,7 @@ def extract_free(projections: ArrayLike, names: Sequence[str] | None = None) -> 
     Errors call the cameras by `names`. Raises CameraError for a matrix that is no camera: not finite, a zero
     third row, a left block of rank below 3; InputError for another shape.
     """
-    try:
-        matrices = np.asarray(projections, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"camera matrices: expected n x 3 x 4 numbers ({error})") from error
+    matrices = float_array("camera matrices", projections)
     if matrices.ndim != 3 or matrices.shape[1:] != (3, 4) or len(matrices) == 0:
         raise InputError(f"camera matrices: expected shape (n, 3, 4), found {matrices.shape}")
     called = names if names is not None else [f"camera {i}" for i in range(len(matrices))]
@@ -150,7 +148,7 @@ def extract_circle(projections: ArrayLike, up: FloatArray | None = None) -> Circ
     determine no circle: fewer than three, coincident or collinear ones.
     """
     cameras = extract_free(projections)
-    above = -cameras.world_R_camera[:, :, 1].sum(axis=0) if up is None else np.asarray(up, dtype=float)
+    above = -cameras.world_R_camera[:, :, 1].sum(axis=0) if up is None else float_array("up", up)
     return CircleCameras(
         calibration=cameras.calibration,
         world_R_camera=cameras.world_R_camera,

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from pancam_graph.base.arrays import float_array
 from pancam_graph.base.errors import GeometryError, InputError
 from pancam_graph.base.geometry import FloatArray, IntArray, pose_arrays, wrap_angle
 from pancam_graph.data import Traverse
@@ -31,6 +32,10 @@ class Start:
     calibration, and `projective`. None, and in the other models: cameras follow from masts and angles."""
     warnings: tuple[str, ...] = ()
     """Sentences for the user."""
+
+    def __post_init__(self) -> None:
+        """Turn the angles to float64. Raises InputError for what is no number."""
+        object.__setattr__(self, "pan_tilt_rad", float_array("start: pan_tilt_rad", self.pan_tilt_rad))
 
 
 def start_from_telemetry(traverse: Traverse) -> Start:

@@ -13,6 +13,7 @@ from pancam_graph.io._entries import PoseEntry as PoseEntry
 from pancam_graph.io._image_files import GreyImage as GreyImage
 from pancam_graph.io._image_files import read_image as read_image
 from pancam_graph.io._inputs import read_input as read_input
+from pancam_graph.io._json import json_object as json_object
 from pancam_graph.io._json import prefixed as prefixed
 from pancam_graph.io._json import read_bytes as read_bytes
 from pancam_graph.io._json import read_json as read_json
@@ -21,6 +22,7 @@ from pancam_graph.io._json import short as short
 from pancam_graph.io._json import validated as validated
 from pancam_graph.io._mask_files import mask_file as mask_file
 from pancam_graph.io._mask_files import read_mask as read_mask
+from pancam_graph.io._npz import NpzFile as NpzFile
 from pancam_graph.io._pds import read_pds as read_pds
 from pancam_graph.io._pictures import left_out as left_out
 from pancam_graph.io._pictures import picture_file as picture_file

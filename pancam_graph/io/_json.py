@@ -12,7 +12,16 @@ import pydantic
 from pancam_graph.base.errors import InputError, PancamGraphError
 from pancam_graph.base.regular_files import instead_of_file
 
-__all__ = ["entry_name", "prefixed", "read_bytes", "read_json", "refused_by_schema", "short", "validated"]
+__all__ = [
+    "entry_name",
+    "json_object",
+    "prefixed",
+    "read_bytes",
+    "read_json",
+    "refused_by_schema",
+    "short",
+    "validated",
+]
 
 _MAX_QUOTED = 60
 _EXPECTED = {
@@ -98,12 +107,20 @@ def _doubled_key(value: object, doubled: dict[int, str], location: tuple[int | s
 
 
 def read_json(path: Path, format_name: str, version: int) -> dict[str, Any]:
-    """The object in a JSON file of one of our formats.
+    """The object in a JSON file of one of our formats; see `json_object`.
+
+    Raises InputError for a file that cannot be read, and as `json_object` does.
+    """
+    return json_object(read_bytes(path), path, format_name, version)
+
+
+def json_object(content: bytes, path: Path, format_name: str, version: int) -> dict[str, Any]:
+    """The object in JSON text of one of our formats; `path` is the file that errors name.
 
     NaN and infinite numbers are let through: the schema refuses them and names the entry.
 
-    Raises InputError for a file that cannot be read or is not JSON, for anything else than an object, for a
-    key that stands twice, and for another format or version.
+    Raises InputError for what is not JSON, for anything else than an object, for a key that stands twice, and
+    for another format or version.
     """
     doubled: dict[int, str] = {}
     kept: list[
@@ -118,7 +135,6 @@ def read_json(path: Path, format_name: str, version: int) -> dict[str, Any]:
             kept.append(value)
         return value
 
-    content = read_bytes(path)
     if not content.strip():
         raise InputError(f"{path}: expected a JSON object, found an empty file")
     try:

@@ -14,9 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pancam_graph.base.arrays import float_array, int_array
 from pancam_graph.base.errors import InputError
 from pancam_graph.data import Observations, mean_sigma_px
 from pancam_graph.io._json import prefixed, read_bytes, short
+from pancam_graph.io._npz import NpzFile
 
 __all__ = ["observations_npz", "read_observations"]
 
@@ -49,24 +51,18 @@ def observations_npz(observations: Observations) -> bytes:
 
 
 def _read_npz(path: Path) -> Observations:
-    content = io.BytesIO(read_bytes(path))
-    try:
-        archive: Any = np.load(content, allow_pickle=False)
-    except Exception as error:  # zipfile and NumPy raise many types at bytes that are no archive
-        raise InputError(f"{path}: expected an .npz archive of arrays, found something else") from error
-    if not isinstance(archive, np.lib.npyio.NpzFile):
-        raise InputError(f"{path}: expected an .npz archive of arrays, found a single array")
-    with archive, prefixed(path):
+    archive = NpzFile(path)
+    with prefixed(path):
         columns: dict[str, NDArray[Any]] = {
-            "image": _integers("image", _array(archive, "image")),
-            "track": _integers("track", _array(archive, "track")),
-            "uv_px": _numbers("uv_px", _array(archive, "uv_px")),
+            "image": int_array("image", _array(archive, "image")),
+            "track": int_array("track", _array(archive, "track")),
+            "uv_px": float_array("uv_px", _array(archive, "uv_px")),
         }
-        has_covariance = "covariance_px2" in archive.files
+        has_covariance = "covariance_px2" in archive.names
         if has_covariance:
-            columns["covariance_px2"] = _numbers("covariance_px2", _array(archive, "covariance_px2"))
-        if "sigma_px" in archive.files or not has_covariance:
-            columns["sigma_px"] = _numbers("sigma_px", _array(archive, "sigma_px"))
+            columns["covariance_px2"] = float_array("covariance_px2", _array(archive, "covariance_px2"))
+        if "sigma_px" in archive.names or not has_covariance:
+            columns["sigma_px"] = float_array("sigma_px", _array(archive, "sigma_px"))
         if len({len(c) for c in columns.values()}) > 1:
             found = ", ".join(f"{name} {c.shape}" for name, c in columns.items())
             raise InputError(f"columns: expected one length, found the shapes {found}")
@@ -91,37 +87,11 @@ def _observations(columns: dict[str, NDArray[Any]]) -> Observations:
     )
 
 
-def _array(archive: Any, name: str) -> NDArray[Any]:
-    if name not in archive.files:
-        found = ", ".join(archive.files) or "an empty archive"
-        raise InputError(f"{name}: expected an array of this name, found {found}")
-    try:
-        value = archive[name]
-    except Exception as error:  # a damaged member, or one that would have to be unpickled
-        if "allow_pickle" in str(error):
-            raise InputError(
-                f"{name}: expected numbers, found pickled objects (never loaded: they can run code)"
-            ) from error
-        raise InputError(f"{name}: expected a whole array, found a damaged one ({error})") from error
-    if not isinstance(value, np.ndarray):
-        raise InputError(f"{name}: expected an array, found other bytes")
-    if value.ndim == 0:
+def _array(archive: NpzFile, name: str) -> NDArray[Any]:
+    column = archive.array(name)
+    if column.ndim == 0:
         raise InputError(f"{name}: expected a column, found a single value")
-    return value
-
-
-def _integers(name: str, column: NDArray[Any]) -> NDArray[np.int64]:
-    if column.dtype.kind not in "iu":
-        raise InputError(f"{name}: expected integers, found {column.dtype}")
-    if column.dtype.kind == "u" and column.size and column.max() > np.iinfo(np.int64).max:
-        raise InputError(f"{name}: expected integers below 2^63, found {column.max()}")
-    return column.astype(np.int64)
-
-
-def _numbers(name: str, column: NDArray[Any]) -> NDArray[np.float64]:
-    if column.dtype.kind not in "fiu":
-        raise InputError(f"{name}: expected numbers, found {column.dtype}")
-    return column.astype(np.float64)
+    return column
 
 
 def _read_csv(path: Path) -> Observations:

@@ -2,22 +2,26 @@
 
 import io
 import json
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
+from pancam_graph.base.arrays import float_array, int_array
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.whole_files import whole_file
 from pancam_graph.data import Observations
 from pancam_graph.io import (
+    Entry,
+    NpzFile,
     SharingEntry,
     TraverseFile,
+    json_object,
     prefixed,
-    read_bytes,
-    short,
     traverse_entries,
     traverse_of,
     validated,
@@ -28,7 +32,13 @@ from pancam_graph.smoother._state import SmootherState
 __all__ = ["load_smoother", "save_smoother"]
 
 _FORMAT, _VERSION = "pancam-graph/smoother", 1
-_ARRAYS = ("after", "fate", "track", "home", "vector", "origin_m", "key", "width", "value")
+_ARRAYS: dict[str, Callable[[str, Any], NDArray[Any]]] = {
+    **dict.fromkeys(("after", "fate", "track", "home"), int_array),
+    **dict.fromkeys(("vector", "origin_m"), float_array),
+    **dict.fromkeys(("key", "width"), int_array),
+    "value": float_array,
+}
+"""Arrays of a state, in the order of the file, and what each is turned into."""
 _COLUMNS = ("image", "track", "uv_px", "sigma_px", "covariance_px2")
 
 
@@ -63,44 +73,59 @@ def save_smoother(state: SmootherState, path: Path) -> None:
 
 
 def load_smoother(path: Path) -> SmootherState:
-    """Read a state. Raises InputError for another format or version, and for a damaged file."""
-    content = read_bytes(path)
-    try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-            arrays = {name: np.asarray(archive[name]) for name in archive.files}
-        header = json.loads(arrays["header"].tobytes())
-    except Exception as error:  # zipfile, NumPy and JSON raise many kinds
-        raise InputError(f"{path}: expected a saved smoother, found a damaged or other file") from error
-    if not isinstance(header, dict) or header.get("format") != _FORMAT:
-        raise InputError(f"{path}: format: expected {short(_FORMAT)}, found {short(_of(header, 'format'))}")
-    if header.get("version") != _VERSION:
-        raise InputError(f"{path}: version: expected {_VERSION}, found {short(_of(header, 'version'))}")
-    try:
-        with prefixed(path):
-            return _state(path, header, arrays)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: expected a whole saved smoother, found a damaged one ({error})") from error
+    """Read a state. Raises InputError naming file and entry for another format or version, or a damaged file.
+
+    Types and shapes are checked here; that entries fit together, by `TraverseSmoother.of`.
+    """
+    archive = NpzFile(path)
+    with prefixed(path):
+        text = archive.array("header").tobytes()
+    entries = validated(_Header, json_object(text, path, _FORMAT, _VERSION), path)
+    with prefixed(path):
+        return _state(entries, archive, path.parent)
 
 
-def _of(header: object, key: str) -> object:
-    return header.get(key) if isinstance(header, dict) else header
+class _Options(Entry):
+    """`SmootherOptions`, entry by entry."""
+
+    telemetry: Literal["absolute", "odometry"]
+    sharing: SharingEntry | None
+    relinearise_rad: float
+    relinearise_m: float
+    relinearise_rig: float
+    outlier_sigma: float | None
+    closure_probability: float
+    max_rounds: int
+
+    def options(self) -> SmootherOptions:
+        """The options. Raises InputError for one that is out of its range."""
+        values = {name: getattr(self, name) for name in type(self).model_fields}
+        sharing = None if self.sharing is None else self.sharing.sharing()
+        return SmootherOptions(**{**values, "sharing": sharing})
 
 
-def _state(path: Path, header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> SmootherState:
-    options, sharing = header["options"], header["options"].pop("sharing")
-    if sharing is not None:
-        options["sharing"] = SharingEntry.model_validate(sharing).sharing()
-    traverse = traverse_of(validated(TraverseFile, header["traverse"], path), path.parent)
-    if "observations_image" in arrays:
-        columns: dict[str, Any] = {name: arrays[f"observations_{name}"] for name in _COLUMNS[:-1]}
-        columns |= {"covariance_px2": arrays.get("observations_covariance_px2")}
-        columns |= {"origin": "images" if header.get("origin") == "images" else "given"}
-        traverse = traverse.with_observations(Observations(**columns))
-        if len(arrays["fate"]) != len(arrays["observations_image"]):
-            raise ValueError("fate: another length than the observations")
-    return SmootherState(
-        traverse=traverse,
-        options=SmootherOptions(**options),
-        n_given=int(header.get("n_given", 0)),
-        **{name: arrays[name] for name in _ARRAYS},
-    )
+class _Header(Entry):
+    """The file's JSON."""
+
+    format: Literal["pancam-graph/smoother"]
+    version: Literal[1]
+    options: _Options
+    n_given: Annotated[int, Field(ge=0)] = 0
+    origin: Literal["given", "images"] = "given"
+    traverse: TraverseFile
+
+
+def _state(header: _Header, archive: NpzFile, folder: Path) -> SmootherState:
+    with prefixed("options"):
+        options = header.options.options()
+    with prefixed("traverse"), np.errstate(all="ignore"):  # numbers that overflow are refused as such
+        traverse = traverse_of(header.traverse, folder)
+    if "observations_image" in archive.names:
+        columns: dict[str, Any] = {name: archive.array(f"observations_{name}") for name in _COLUMNS[:-1]}
+        columns["origin"] = header.origin
+        if "observations_covariance_px2" in archive.names:
+            columns["covariance_px2"] = archive.array("observations_covariance_px2")
+        with np.errstate(all="ignore"):
+            traverse = traverse.with_observations(Observations(**columns))
+    arrays: dict[str, Any] = {name: turned(name, archive.array(name)) for name, turned in _ARRAYS.items()}
+    return SmootherState(traverse=traverse, options=options, n_given=header.n_given, **arrays)

@@ -6,6 +6,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.data import Observations
 
@@ -162,6 +163,15 @@ class Ledger:
     def all_with(self, fate: Fate) -> IntArray:
         """All rows that have this fate."""
         return np.flatnonzero(self.fate == int(fate))
+
+    def take_over(self, fate: IntArray) -> None:
+        """Set all fates (n,) to kept ones. Raises InputError for a use outside a camera's domain."""
+        wrong = np.flatnonzero((self.fate == int(Fate.OUTSIDE)) & (fate == int(Fate.USED)))
+        if len(wrong):
+            raise InputError(
+                f"fate, row {wrong[0]}: expected no use of a pixel outside the camera's domain, found one"
+            )
+        self.fate[:] = fate
 
     def set_fate(self, rows: IntArray, fate: Fate) -> None:
         """Set the fate of some rows."""

@@ -6,17 +6,19 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from pancam_graph.base.errors import InputError
+from pancam_graph.base.errors import InputError, SolveError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.base.threads import blas_on_one_thread
 from pancam_graph.cameras import carry_to_pinhole
 from pancam_graph.data import Frame, Image, Observations, Sharing, Stop, Traverse
 from pancam_graph.graph import GraphKeys, HardTemplate, UserFactors
+from pancam_graph.io import prefixed
 from pancam_graph.landmarks import Landmarks
 from pancam_graph.rigs import Rig
 from pancam_graph.smoother._batch import whole_template, whole_traverse
 from pancam_graph.smoother._covariances import joint_covariance, relative_covariance
 from pancam_graph.smoother._engine import Engine
+from pancam_graph.smoother._file import load_smoother, save_smoother
 from pancam_graph.smoother._ledger import Fate
 from pancam_graph.smoother._localise import localise
 from pancam_graph.smoother._map import Change, DriveMap
@@ -25,6 +27,7 @@ from pancam_graph.smoother._odometry import guess, join, local_priors
 from pancam_graph.smoother._sets import distinct
 from pancam_graph.smoother._smoother_options import Estimate, SmootherOptions, Update
 from pancam_graph.smoother._state import SmootherState, state_of
+from pancam_graph.smoother._state_checks import require_consistent
 from pancam_graph.smoother._station import Postures, Station, copied
 from pancam_graph.smoother._update_run import UpdateRun
 
@@ -319,8 +322,9 @@ class TraverseSmoother:
         """A smoother that continues from a state, linearised at its estimate.
 
         `factors` are those that the caller had added: a state cannot keep them. Raises InputError for another
-        number of them.
+        number of them, and for a state whose entries are out of range or contradict each other.
         """
+        require_consistent(state)
         t = state.traverse
         smoother = TraverseSmoother(t.rig, state.options)
         drive = smoother._drive
@@ -335,7 +339,7 @@ class TraverseSmoother:
                 smoother._enter(station, None)
             if t.observations is not None:
                 smoother._append(t.observations, t.observations.image)
-                drive.ledger.fate[:] = state.fate
+                drive.ledger.take_over(state.fate)
             drive.restore(state.track, state.home, Landmarks(vector=state.vector, origin_m=state.origin_m))
             values = state.values()
             drive.take_factors(smoother._template, factors, values)
@@ -345,6 +349,8 @@ class TraverseSmoother:
                     f"found {len(drive.given)}"
                 )
             smoother._engine.restart(values)
+        if not np.isfinite(smoother.cost):
+            raise InputError(f"state: expected a finite cost, found {smoother.cost}")
         return smoother
 
     def save(self, path: Path | str) -> None:
@@ -352,8 +358,6 @@ class TraverseSmoother:
 
         Raises InputError where no stop was added or the file cannot be written.
         """
-        from pancam_graph.smoother._file import save_smoother  # noqa: PLC0415  io imports this module
-
         save_smoother(self.state(), Path(path))
 
     @staticmethod
@@ -362,6 +366,17 @@ class TraverseSmoother:
 
         Raises InputError for a file of another version or a damaged one.
         """
-        from pancam_graph.smoother._file import load_smoother  # noqa: PLC0415  io imports this module
-
-        return TraverseSmoother.of(load_smoother(Path(path)), factors)
+        path = Path(path)
+        state = load_smoother(path)
+        with prefixed(path), np.errstate(all="ignore"):  # a cost that overflows is refused as such
+            try:
+                return TraverseSmoother.of(state, factors)
+            except (
+                SolveError,
+                RuntimeError,
+                np.linalg.LinAlgError,
+            ) as error:  # also GTSAM's of singular systems
+                why = " ".join(str(error).split()) or type(error).__name__
+                raise InputError(
+                    f"expected a drive that can be solved, found one that cannot: {why}"
+                ) from error

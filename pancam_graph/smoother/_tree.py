@@ -74,7 +74,8 @@ class Tree:
         try:
             result = self._isam.update(graph, values, parameters)
         except RuntimeError as error:
-            raise SolveError(f"nothing holds a direction of the drive: {str(error).split('.')[0]}") from error
+            why = " ".join(str(error).split(".")[0].split())  # GTSAM's text has several lines
+            raise SolveError(f"nothing holds a direction of the drive: {why}") from error
         self.theta, self.estimate = self._isam.getLinearizationPoint(), self._isam.calculateEstimate()
         delta = self._isam.getDelta()
         self._delta = {key: delta.at(key) for key in self.theta.keys()}  # noqa: SIM118  gtsam.Values

@@ -1,6 +1,7 @@
 """What the front end keeps: the same to the last bit with and without, and whatever becomes of the files."""
 
 import logging
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -278,3 +279,36 @@ def test_the_cache_moves_into_new_results_or_stays_with_the_old(
     assert sorted(p.name for p in out.iterdir()) == ["cache", "old.txt" if fails else "new.txt"]
     assert is_cache(cache_folder(out))
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_entries_of_a_right_key_and_other_content_and_pipes_are_made_anew(tmp_path: Path) -> None:
+    made = {"a": np.arange(3.0)}
+    key = "k" * 64
+    Cache(tmp_path).recall("kind", key, lambda: made)
+    (path,) = tmp_path.glob("kind-*.npz")
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    for other in (
+        {"a": np.zeros(3)},
+        {"a": made["a"].astype(">f8")},
+        {"a": made["a"][:2]},
+        {"b": made["a"]},
+        {},
+    ):
+        np.savez(path, key=arrays["key"], **other)
+        kept = Cache(tmp_path).recall("kind", key, lambda: made)
+        assert kept.keys() == made.keys()
+        np.testing.assert_array_equal(kept["a"], made["a"])
+    path.unlink()
+    os.mkfifo(path)
+    np.testing.assert_array_equal(Cache(tmp_path).recall("kind", key, lambda: made)["a"], made["a"])
+    assert path.is_file()
+
+
+def test_a_folder_in_place_of_an_entry_is_worked_around(tmp_path: Path) -> None:
+    key = "k" * 64
+    (tmp_path / f"kind-{key[:40]}.npz").mkdir()
+    (tmp_path / "kind-other.npz").mkdir()
+    cache = Cache(tmp_path)
+    assert list(cache.recall("kind", key, lambda: {"a": np.zeros(1)})) == ["a"]
+    cache.forget_others()

@@ -187,8 +187,8 @@ def spoilt(**entries: object) -> FloatArray:
         (np.zeros((4, 4)), InputError, r"expected shape \(n, 3, 4\), found \(4, 4\)"),
         (np.zeros((2, 3, 3)), InputError, r"expected shape \(n, 3, 4\), found \(2, 3, 3\)"),
         (np.zeros((0, 3, 4)), InputError, r"expected shape \(n, 3, 4\), found \(0, 3, 4\)"),
-        ([[1, 2], [3]], InputError, "expected n x 3 x 4 numbers"),
-        ("P", InputError, "expected n x 3 x 4 numbers"),
+        ([[1, 2], [3]], InputError, "camera matrices: expected numbers, found"),
+        ("P", InputError, "camera matrices: expected numbers, found"),
     ],
 )
 def test_matrices_that_are_no_cameras_are_refused(

@@ -7,6 +7,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from pancam_graph.base.arrays import float_array
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray, IntArray, correction_twists, pose_arrays
 from pancam_graph.base.threads import blas_on_one_thread
@@ -197,7 +198,7 @@ def _require(fits: bool, entry: str, expected: str, found: str) -> None:
 
 
 def _checked_angles(pan_tilt_rad: FloatArray, n: int) -> FloatArray:
-    angles = np.asarray(pan_tilt_rad, dtype=float)
+    angles = float_array("pan_tilt_rad", pan_tilt_rad)
     _require(angles.shape == (n, 2), "pan_tilt_rad", f"shape ({n}, 2)", str(angles.shape))
     bad = np.flatnonzero(~np.isfinite(angles).all(axis=1))
     if len(bad):

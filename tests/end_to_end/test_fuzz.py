@@ -1,0 +1,334 @@
+"""Files that are damaged or hostile end in a result or in one sentence that names them, whatever they are.
+
+Each case is a seed: what fails is found again by it. The slow part draws thousands. A reader of a new format
+has a place here. What this does not prove: that a result which was read is solved.
+"""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from pancam_graph import SimulationOptions, Traverse, TraverseSmoother, simulate, write_traverse
+from pancam_graph.data import Freedom, Sharing
+from pancam_graph.images._cache import Cache
+from pancam_graph.io import read_image, read_input, read_mask, read_pds, read_traverse
+from pancam_graph.rigs import mer_navcam
+from pancam_graph.smoother import SmootherOptions
+from pancam_graph.smoother._incremental import stops_of
+from support import io_samples
+from support.fuzzing import (
+    claiming,
+    dumped,
+    mutated_arrays,
+    mutated_bytes,
+    mutated_text,
+    mutated_tree,
+    outcome,
+    packed,
+)
+from support.pds_files import pds_file
+from support.rover_labels import (
+    MARS2020_NAVCAM,
+    POINTINGS,
+    Shot,
+    label_text,
+    mars2020_mast,
+    msl_mast,
+    navcam_b_head,
+)
+
+Case = Callable[[np.random.Generator], str]
+"""Writes a mutated file, reads it, and says what it was refused with; "" for a result."""
+
+_FAST, _SLOW = 15, 1500
+"""Cases of each kind."""
+
+CASES: dict[str, Callable[[Path], Case]] = {}
+
+
+def kind_of_case(make: Callable[[Path], Case]) -> Callable[[Path], Case]:
+    """Register a kind: a function that makes, in a folder, the case of a seed."""
+    CASES[make.__name__] = make
+    return make
+
+
+def run(name: str, folder: Path, count: int) -> None:
+    """Cases of a kind. Some of them must be refused: else nothing was tried."""
+    case, refused = CASES[name](folder), 0
+
+    @settings(
+        max_examples=count,
+        deadline=None,
+        derandomize=True,
+        database=None,
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(st.integers(0, 2**32 - 1))
+    def drawn(seed: int) -> None:
+        nonlocal refused
+        refused += bool(case(np.random.default_rng(seed)))
+
+    with np.errstate(all="ignore"):
+        drawn()
+    if not name.startswith("cache"):
+        assert refused
+
+
+# --- traverse folders ---
+
+
+@kind_of_case
+def traverse_json_entries(folder: Path) -> Case:
+    write_traverse(sharing_traverse(), folder)
+    path = folder / "traverse.json"
+    tree = json.loads(path.read_text())
+
+    def case(rng: np.random.Generator) -> str:
+        path.write_bytes(dumped(mutated_tree(rng, tree)))
+        return outcome(lambda: read_input(folder), folder)
+
+    return case
+
+
+@kind_of_case
+def traverse_json_bytes(folder: Path) -> Case:
+    write_traverse(sharing_traverse(), folder)
+    path = folder / "traverse.json"
+    good = path.read_bytes()
+
+    def case(rng: np.random.Generator) -> str:
+        path.write_bytes(
+            mutated_bytes(rng, good) if rng.random() < 0.5 else mutated_text(rng, good.decode()).encode()
+        )
+        return outcome(lambda: read_input(folder), folder)
+
+    return case
+
+
+@kind_of_case
+def observations_npz_arrays(folder: Path) -> Case:
+    return observations_npz(folder, lambda rng, arrays, _: packed(mutated_arrays(rng, arrays)))
+
+
+@kind_of_case
+def observations_npz_bytes(folder: Path) -> Case:
+    return observations_npz(folder, lambda rng, _, good: mutated_bytes(rng, good))
+
+
+@kind_of_case
+def observations_npz_counts(folder: Path) -> Case:
+    return observations_npz(folder, lambda rng, arrays, _: claimed(rng, arrays))
+
+
+def observations_npz(folder: Path, change: Callable[[np.random.Generator, Any, bytes], bytes]) -> Case:
+    sample = io_samples.traverse()
+    assert sample.observations is not None
+    observed = sample.observations.with_covariance(io_samples.covariances(len(sample.observations)))
+    write_traverse(replace(sample, observations=observed), folder)
+    path = folder / "observations.npz"
+    good = path.read_bytes()
+    with np.load(path) as archive:
+        arrays = dict(archive)
+
+    def case(rng: np.random.Generator) -> str:
+        path.write_bytes(change(rng, arrays, good))
+        return outcome(lambda: read_input(folder), folder)
+
+    return case
+
+
+def claimed(rng: np.random.Generator, arrays: Any) -> bytes:
+    """An archive whose header of one array says another shape than it has."""
+    name = str(rng.choice(list(arrays)))
+    sides = [0, 1, 5, 2**31, 2**40, 2**62, 10**30, -1]
+    shape = tuple(int(sides[int(i)]) for i in rng.integers(0, len(sides), int(rng.integers(0, 4))))
+    return claiming(arrays, name, shape)
+
+
+@kind_of_case
+def observations_csv(folder: Path) -> Case:
+    write_traverse(io_samples.traverse(), folder)
+    sample = read_traverse(folder).observations
+    assert sample is not None
+    rows = zip(sample.image, sample.track, sample.uv_px, sample.sigma_px, strict=True)
+    lines = [f"{i},{t},{uv[0]!r},{uv[1]!r},{s}" for i, t, uv, s in rows]
+    text = "image,track,u_px,v_px,sigma_px\n" + "\n".join(lines) + "\n"
+    path = folder / "traverse.json"
+    path.write_text(path.read_text().replace("observations.npz", "observations.csv"))
+
+    def case(rng: np.random.Generator) -> str:
+        changed = mutated_text(rng, text).encode()
+        (folder / "observations.csv").write_bytes(
+            mutated_bytes(rng, changed) if rng.random() < 0.3 else changed
+        )
+        return outcome(lambda: read_input(folder), folder)
+
+    return case
+
+
+def sharing_traverse() -> Traverse:
+    """A traverse with all lenses, two stops, covariances and a sharing."""
+    sharing = Sharing(
+        calibration=Freedom(scope="eye", free=("fx_px",), sigma={"fx_px": 2.0}), mounts=Freedom(scope="eye")
+    )
+    return replace(io_samples.traverse(), sharing=sharing)
+
+
+# --- labels ---
+
+
+@kind_of_case
+def labels_of_curiosity(folder: Path) -> Case:
+    return labels(folder, label_text(Shot(head=navcam_b_head(), joints=POINTINGS[0]), msl_mast()))
+
+
+@kind_of_case
+def labels_of_perseverance(folder: Path) -> Case:
+    shot = Shot(head=MARS2020_NAVCAM, joints=POINTINGS[0], instrument="NAVCAM_LEFT")
+    return labels(folder, label_text(shot, mars2020_mast(as_designed=True), host="M20"))
+
+
+def labels(folder: Path, text: str) -> Case:
+    """Labels alone in their folder, so that what is wrong is said, and images read through them."""
+
+    def case(rng: np.random.Generator) -> str:
+        label = mutated_text(rng, text).encode("utf-8", "replace")
+        if rng.random() < 0.3:
+            label = mutated_bytes(rng, label)
+        file = folder / "NRB_0.IMG"
+        file.write_bytes(label.ljust(8192) + bytes(48))
+        said = outcome(lambda: read_pds(folder), folder)
+        return said or outcome(lambda: read_image(file), folder)
+
+    return case
+
+
+@kind_of_case
+def samples_of_labels(folder: Path) -> Case:
+    file = pds_file(folder / "a.IMG", bytes(range(24)), extra="  BANDS = 1\r\n  MISSING_CONSTANT = 3\r\n")
+    text = file.read_bytes()[:1024].rstrip().decode()
+
+    def case(rng: np.random.Generator) -> str:
+        label = mutated_text(rng, text).encode("utf-8", "replace")
+        file.write_bytes(label.ljust(1024) + bytes(range(24)))
+        return outcome(lambda: read_image(file), folder)
+
+    return case
+
+
+# --- pictures and masks ---
+
+
+@kind_of_case
+def pictures(folder: Path) -> Case:
+    suffixes = (".png", ".jpg", ".tif", ".bmp", ".webp", ".jp2", ".pgm", ".ppm")
+    made = []
+    for seed, suffix in enumerate((*suffixes, ".png", ".tif")):
+        deep = seed >= len(suffixes)
+        shape = (48, 64, 3) if suffix == ".ppm" else (48, 64)
+        rng = np.random.default_rng(seed)
+        samples = (
+            rng.integers(0, 60_000, shape).astype(np.uint16)
+            if deep
+            else rng.integers(0, 256, shape).astype(np.uint8)
+        )
+        made.append((suffix, cv2.imencode(suffix, samples)[1].tobytes()))
+
+    def case(rng: np.random.Generator) -> str:
+        suffix, good = made[int(rng.integers(0, len(made)))]
+        file = folder / f"a{suffix}"
+        file.write_bytes(mutated_bytes(rng, good, reach=200 if rng.random() < 0.7 else None))
+        said = outcome(lambda: read_mask(file, 64, 48, "b.png"), folder)
+        return said or outcome(lambda: read_image(file), folder)
+
+    return case
+
+
+# --- what the package has written itself ---
+
+
+@kind_of_case
+def smoother_arrays(folder: Path) -> Case:
+    return smoothers(folder, lambda rng, arrays, _: packed(mutated_arrays(rng, arrays)))
+
+
+@kind_of_case
+def smoother_bytes(folder: Path) -> Case:
+    return smoothers(folder, lambda rng, _, good: mutated_bytes(rng, good))
+
+
+@kind_of_case
+def smoother_counts(folder: Path) -> Case:
+    return smoothers(folder, lambda rng, arrays, _: claimed(rng, arrays))
+
+
+@kind_of_case
+def smoother_headers(folder: Path) -> Case:
+    def change(rng: np.random.Generator, arrays: Any, _: bytes) -> bytes:
+        header = dumped(mutated_tree(rng, json.loads(arrays["header"].tobytes())))
+        return packed({**arrays, "header": np.frombuffer(header, dtype=np.uint8)})
+
+    return smoothers(folder, change)
+
+
+def smoothers(folder: Path, change: Callable[[np.random.Generator, Any, bytes], bytes]) -> Case:
+    options = SimulationOptions(
+        stops=3, spacing_m=3.0, pans=2, tilts_rad=(-0.2,), sweep_rad=0.8, points_per_image=12, noise_px=0.3
+    )
+    traverse = simulate(mer_navcam(), options).traverse
+    smoother = TraverseSmoother(traverse.rig, SmootherOptions(telemetry="odometry"))
+    for part in stops_of(traverse):
+        smoother.add_stop(*part)
+    path = folder / "drive.npz"
+    smoother.save(path)
+    good = path.read_bytes()
+    with np.load(path) as archive:
+        arrays = dict(archive)
+
+    def case(rng: np.random.Generator) -> str:
+        path.write_bytes(change(rng, arrays, good))
+        return outcome(lambda: TraverseSmoother.load(path), folder)
+
+    return case
+
+
+@kind_of_case
+def cache_entries(folder: Path) -> Case:
+    made = {"uv_px": np.arange(12.0).reshape(6, 2), "good": np.arange(6) > 2}
+    key = "k" * 64
+    Cache(folder).recall("refined", key, lambda: made)
+    (path,) = folder.glob("refined-*.npz")
+    good = path.read_bytes()
+    with np.load(path) as archive:
+        arrays = dict(archive)
+
+    def case(rng: np.random.Generator) -> str:
+        path.write_bytes(
+            packed(mutated_arrays(rng, arrays)) if rng.random() < 0.6 else mutated_bytes(rng, good)
+        )
+        kept = Cache(folder).recall("refined", key, lambda: made)
+        assert kept.keys() == made.keys()
+        assert all(kept[name].dtype == made[name].dtype for name in made)
+        assert all(np.array_equal(kept[name], made[name]) for name in made)
+        return ""
+
+    return case
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_every_damaged_file_ends_in_a_result_or_one_sentence(name: str, tmp_path: Path) -> None:
+    run(name, tmp_path, _FAST)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_thousands_of_damaged_files_end_in_a_result_or_one_sentence(name: str, tmp_path: Path) -> None:
+    run(name, tmp_path, _SLOW)
