@@ -79,8 +79,10 @@ def whole_file(path: Path, content: bytes) -> None:
             file.truncate()
             file.write(content)
         partial.replace(path)
-    except BaseException:  # an interrupt from the keyboard too
+    except BaseException as error:  # an interrupt from the keyboard too
         partial.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename is None:  # a full disk does not say whose
+            error.filename = str(path)
         raise
     finally:
         os.close(descriptor)

@@ -4,7 +4,7 @@ import logging
 import shlex
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +45,23 @@ class _Warnings(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Write a message."""
         write("stderr", f"warning: {record.getMessage()}")
+
+
+class _File(logging.FileHandler):
+    """Messages in a file; where it can take no more, one warning says so, and the work goes on."""
+
+    _is_full = False
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Say once that the log is not whole."""
+        if not self._is_full:
+            self._is_full = True
+            write("stderr", f"warning: {self.baseFilename}: the log is not whole: {sys.exc_info()[1]}")
+
+    def close(self) -> None:
+        """Close the file; what it could not take before it cannot take now."""
+        with suppress(OSError):
+            super().close()
 
 
 @contextmanager
@@ -118,7 +135,7 @@ def _in_file(file: Path) -> logging.Handler:
                     raise InputError(f"{expected}, found something else in it")
         else:
             file.write_text(f"{_FIRST_LINE}\n", encoding="utf-8")
-        handler = logging.FileHandler(file, mode="a", encoding="utf-8")
+        handler = _File(file, mode="a", encoding="utf-8")
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise InputError(f"{expected}, found a place that cannot be written to ({reason})") from error

@@ -1,10 +1,12 @@
 """A process that is killed at each step of what it does to the file system, one step after the other.
 
 Run as a program of its own, which has one thread and may fork: `kills.py WORK SIGNAL FOLDER`. Each child does
-the work in a folder of its own and gets the signal before or after its n-th call of `STEPS`; the last comes
-to its end. Then the parent starts as the next run does, and prints what is there, a line of JSON for each.
+the work in a folder of its own and gets the signal before or after its n-th call of `STEPS`, or finds the
+disk full there if the signal is 0; the last comes to its end. Then the parent starts as the next run does,
+and prints what is there, a line of JSON for each.
 """
 
+import errno
 import io
 import itertools
 import json
@@ -19,7 +21,7 @@ from typing import Any, NoReturn
 
 from pancam_graph.base.whole_files import recover, whole_file, whole_folder
 
-__all__ = ["Left", "killed_at_every_step"]
+__all__ = ["BYSTANDERS", "FULL", "KEPT", "NEW", "OLD", "Left", "killed_at_every_step"]
 
 STEPS = {os: ("rename", "replace", "mkdir", "unlink", "rmdir", "open", "close"), io: ("open",)}
 """Functions by module; a write without its renaming is what "after open" leaves."""
@@ -38,7 +40,7 @@ class Left:
     """What a process left, once the next has begun."""
 
     status: int
-    """How it ended: 0 at its end, 130 interrupted, below 0 killed."""
+    """How it ended: below 0 killed, 130 after a signal or a full disk, 0 if it met none."""
     out: dict[str, str]
     """Files at the place where it writes."""
     beside: dict[str, str]
@@ -47,7 +49,11 @@ class Left:
     """Files at the place after the next has done the same."""
 
 
-def killed_at_every_step(work: str, sent: signal.Signals, folder: Path) -> list[Left]:
+FULL = 0
+"""In place of a signal: the step fails, as on a full disk."""
+
+
+def killed_at_every_step(work: str, sent: int, folder: Path) -> list[Left]:
     """What is left by a process that does some work of `WORK` and gets a signal, for each of its steps."""
     program = [sys.executable, __file__, work, str(int(sent)), str(folder)]
     done = subprocess.run(program, stdout=subprocess.PIPE, text=True, check=True)
@@ -101,17 +107,26 @@ def _files(folder: Path) -> dict[str, str]:
     return {p.relative_to(folder).as_posix(): p.read_text() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
-def _patch(waiting: int, sent: int) -> None:
-    """Send this process a signal at its step of the number `waiting`."""
-    steps = itertools.count()
+def _patch(waiting: int, sent: int) -> list[bool]:
+    """Send this process a signal, or fail, at its step of the number `waiting`.
+
+    The list that is returned gets an entry then.
+    """
+    steps, struck = itertools.count(), list[bool]()
+
+    def hit() -> None:
+        struck.append(True)
+        if sent == FULL:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        os.kill(os.getpid(), sent)
 
     def watched(call: Callable[..., Any]) -> Callable[..., Any]:
         def with_steps(*args: Any, **others: Any) -> Any:
             if next(steps) == waiting:
-                os.kill(os.getpid(), sent)
+                hit()
             result = call(*args, **others)
             if next(steps) == waiting:
-                os.kill(os.getpid(), sent)
+                hit()
             return result
 
         return with_steps
@@ -119,6 +134,7 @@ def _patch(waiting: int, sent: int) -> None:
     for module, names in STEPS.items():
         for name in names:
             setattr(module, name, watched(getattr(module, name)))
+    return struck
 
 
 def _interrupt(*_: object) -> NoReturn:
@@ -129,8 +145,9 @@ def _child(work: Callable[[Path], None], out: Path, waiting: int, sent: int) -> 
     status = 0
     try:
         signal.signal(signal.SIGTERM, _interrupt)  # as the command does
-        _patch(waiting, sent)
+        struck = _patch(waiting, sent)
         work(out)
+        status = 130 if struck else 0
     except (KeyboardInterrupt, OSError):  # an interrupt in rmtree may make it close a file twice
         status = 130
     finally:
