@@ -11,7 +11,7 @@ _COLUMNS = (
     ("test", "text"),
     ("value", "number"),
     ("limit", "number"),
-    ("", "text"),
+    ("outcome", "text"),
     ("what it says", "text"),
 )
 
