@@ -16,3 +16,6 @@ from pancam_graph.landmarks._losses import SQUARED as SQUARED
 from pancam_graph.landmarks._losses import Loss as Loss
 from pancam_graph.landmarks._losses import LossName as LossName
 from pancam_graph.landmarks._losses import loss_of as loss_of
+from pancam_graph.landmarks._ranges import InverseRanges as InverseRanges
+from pancam_graph.landmarks._ranges import at_inverse_ranges as at_inverse_ranges
+from pancam_graph.landmarks._ranges import inverse_ranges as inverse_ranges

@@ -8,8 +8,9 @@ import scipy
 from pancam_graph.base.errors import SolveError
 from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.data import State
-from pancam_graph.elimination import Covariance, FreeDirectionError, JointCovariance, Root
+from pancam_graph.elimination import Covariance, FreeDirectionError, JointCovariance, LandmarkSystem, Root
 from pancam_graph.graph import FactorTemplate, Kind, index_of, kind_of
+from pancam_graph.landmarks import Landmarks
 from pancam_graph.solve._problem import Problem
 from pancam_graph.solve._reduced import ReducedSystem, held_columns, loosened_root
 
@@ -44,20 +45,21 @@ class Uncertainty:
 
 
 def uncertainty(
-    problem: Problem, state: State, reduced: ReducedSystem, *, landmarks: bool, unseen: bool
+    problem: Problem, state: State, reduced: ReducedSystem, *, landmarks: Landmarks | None, unseen: bool
 ) -> Uncertainty:
     """Marginal covariances at a problem's values, from its reduced system.
 
-    `landmarks` and `unseen`: whether these are computed. Raises SolveError where a direction is undetermined.
+    `landmarks` are the places whose covariances are computed; None: of none. `unseen`: whether that is
+    computed. Raises SolveError where a direction is undetermined.
     """
     template, m, system, rows = problem.template, problem.measurements, reduced.system, reduced.rows
     covariance = covariance_of(template, reduced)
     undetermined = np.zeros(m.n_landmarks, dtype=bool)
     undetermined[rows] = system.undetermined
     spread = None
-    if landmarks:
+    if landmarks is not None:
         spread = np.full((m.n_landmarks, 3, 3), np.nan)
-        spread[rows] = system.landmark_covariance_m2(covariance)
+        spread[rows] = _linearised_at(problem, reduced, landmarks).landmark_covariance_m2(covariance)
     return Uncertainty(
         stop_covariance=template.stop_covariance(covariance),
         masts=template.mast_covariance(reduced.root),
@@ -68,6 +70,13 @@ def uncertainty(
         rig_sigmas=template.rig_sigmas(covariance, problem.values),
         unseen=_unseen(problem, reduced, covariance) if unseen and template.rig_variables.variables else (),
     )
+
+
+def _linearised_at(problem: Problem, reduced: ReducedSystem, landmarks: Landmarks) -> LandmarkSystem:
+    """A problem's landmark system linearised at these landmarks; the reduced one's where they are its own."""
+    if problem.landmarks is landmarks:
+        return reduced.system
+    return ReducedSystem.of(problem.at(problem.values, landmarks)).system
 
 
 def _unseen(problem: Problem, reduced: ReducedSystem, covariance: Covariance) -> tuple[str, ...]:

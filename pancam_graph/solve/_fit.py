@@ -7,14 +7,17 @@ import numpy as np
 
 from pancam_graph.base.geometry import BoolArray
 from pancam_graph.data import PixelNoise
+from pancam_graph.graph import HardTemplate
+from pancam_graph.landmarks import Landmarks
 from pancam_graph.solve._carrying import carried_again, is_carried_anew
 from pancam_graph.solve._eliminated import EliminatedSolver, Ended
+from pancam_graph.solve._far_terrain import FarTerrain, far_terrain
 from pancam_graph.solve._optimise import Outcome
-from pancam_graph.solve._prepare import solver_for
+from pancam_graph.solve._prepare import Prepared, solver_for
 from pancam_graph.solve._problem import Problem
 from pancam_graph.solve._screen import Screened
 
-__all__ = ["Fitted", "fit", "fitted_elsewhere", "refitted"]
+__all__ = ["Fitted", "fit", "fitted_elsewhere", "refitted", "regular"]
 
 _ROUNDS = 6
 
@@ -34,6 +37,8 @@ class Fitted:
     """(observations,) whether each was given up because its landmark came to lie behind the camera."""
     ended: Ended | None
     """The solver's own record of where it ended; None where landmarks are explicit, or no fit was made."""
+    expected: Landmarks | None = None
+    """Landmarks at the inverse ranges where covariances are linearised; None: at those fitted."""
 
 
 def fit(screened: Screened) -> Fitted:
@@ -61,13 +66,15 @@ def fit(screened: Screened) -> Fitted:
             moved |= abs(factor - 1) > 1e-3
         if not (moved and outcome.converged):
             break
-    return Fitted(
-        screened=screened,
-        problem=problem,
-        outcome=replace(outcome, costs=tuple(costs)),
-        noise=noise,
-        behind=behind,
-        ended=solver.last if isinstance(solver, EliminatedSolver) else None,
+    return _without_range_bias(
+        Fitted(
+            screened=screened,
+            problem=problem,
+            outcome=replace(outcome, costs=tuple(costs)),
+            noise=noise,
+            behind=behind,
+            ended=solver.last if isinstance(solver, EliminatedSolver) else None,
+        )
     )
 
 
@@ -89,14 +96,55 @@ def fitted_elsewhere(
             fitted,
             outcome=replace(outcome, reason=f"{reason}; {outcome.reason}", costs=(*costs, *outcome.costs)),
         )
-    return Fitted(
-        screened=screened,
-        problem=problem,
-        outcome=Outcome(values=problem.values, converged=True, reason=reason, costs=tuple(costs)),
-        noise=prepared.noise,
-        behind=np.zeros(len(prepared.observations), dtype=bool),
-        ended=None,
+    return _without_range_bias(
+        Fitted(
+            screened=screened,
+            problem=problem,
+            outcome=Outcome(values=problem.values, converged=True, reason=reason, costs=tuple(costs)),
+            noise=prepared.noise,
+            behind=np.zeros(len(prepared.observations), dtype=bool),
+            ended=None,
+        )
     )
+
+
+def _without_range_bias(fitted: Fitted) -> Fitted:
+    """The fit where far terrain's ranges, which are fitted to noise, do not bias it; most often the same."""
+    problem, outcome = fitted.problem, fitted.outcome
+    if not problem.kept.any():
+        return fitted
+    far = far_terrain(regular(fitted.screened.prepared, problem))
+    if far is None:
+        return fitted
+    moved = _back(far, problem)
+    reason = outcome.reason if far.converged else "far terrain: corrections of the solution do not settle"
+    return replace(
+        fitted,
+        problem=moved,
+        outcome=replace(
+            outcome,
+            values=moved.values,
+            converged=far.converged,
+            reason=reason,
+            costs=(*outcome.costs, moved.cost()),
+        ),
+        ended=None,
+        expected=far.expected,
+    )
+
+
+def _back(far: FarTerrain, problem: Problem) -> Problem:
+    """The corrected problem on the template of the problem that was to be corrected."""
+    moved = far.problem
+    return moved if moved.template is problem.template else moved.on(problem.template).placed()
+
+
+def regular(prepared: Prepared, problem: Problem) -> Problem:
+    """A problem as its normal equations are taken from it: without a tie so firm that digits are lost."""
+    if prepared.options.firm_tie == "hard" and problem.template.has_cameras:
+        # The inverse of a system with a tie of 1e-8 would have lost half its digits.
+        return problem.on(HardTemplate(prepared.traverse, prepared.sharing))
+    return problem
 
 
 def refitted(fitted: Fitted, landmarks: BoolArray) -> tuple[Problem, Outcome]:
@@ -111,7 +159,10 @@ def refitted(fitted: Fitted, landmarks: BoolArray) -> tuple[Problem, Outcome]:
         problem, outcome = solver_for(prepared.options, is_near=is_near).adjust(part, prepared.options)
         if outcome.converged:
             break
-    return problem, outcome
+    far = far_terrain(regular(prepared, problem)) if fitted.expected is not None else None
+    if far is None:
+        return problem, outcome
+    return _back(far, problem), replace(outcome, converged=far.converged)
 
 
 def noise_factor(problem: Problem) -> float:

@@ -7,12 +7,11 @@ import numpy as np
 from pancam_graph.base.errors import SolveError
 from pancam_graph.base.geometry import BoolArray
 from pancam_graph.data import State, Verdict
-from pancam_graph.graph import HardTemplate
 from pancam_graph.landmarks import refine
 from pancam_graph.solve._carrying import carried_again
 from pancam_graph.solve._covariance import Uncertainty, uncertainty
 from pancam_graph.solve._diagnose import connection_warnings, listed
-from pancam_graph.solve._fit import Fitted
+from pancam_graph.solve._fit import Fitted, regular
 from pancam_graph.solve._prepare import triangulated
 from pancam_graph.solve._problem import Problem
 from pancam_graph.solve._reduced import ReducedSystem
@@ -80,11 +79,8 @@ def state_of(problem: Problem) -> State:
 
 def regular_problem(fitted: Fitted) -> Problem:
     """The problem as covariances are taken from it."""
-    prepared, problem = fitted.screened.prepared, fitted.problem
-    if prepared.options.firm_tie == "hard" and problem.template.has_cameras:
-        # The inverse of a system with a tie of 1e-8 would have lost half its digits.
-        return problem.on(HardTemplate(prepared.traverse, prepared.sharing))
-    return problem
+    problem = regular(fitted.screened.prepared, fitted.problem)
+    return problem if fitted.expected is None else problem.at(problem.values, fitted.expected)
 
 
 def reduced_of(fitted: Fitted, problem: Problem) -> ReducedSystem:
@@ -103,11 +99,12 @@ def _uncertainty(
     """
     prepared, problem = fitted.screened.prepared, regular_problem(fitted)
     t, wanted = prepared.traverse, prepared.options.landmark_covariances
+    places = fitted.problem.landmarks if wanted else None
     # Radii of circles are free unasked: what holds them is then no news.
     asked = (prepared.options.sharing or t.sharing) is not None
     try:
         reduced = reduced_of(fitted, problem)
-        covariances = uncertainty(problem, state, reduced, landmarks=wanted, unseen=asked)
+        covariances = uncertainty(problem, state, reduced, landmarks=places, unseen=asked)
     except SolveError as error:
         return _unknown(fitted), problem, None, [f"no uncertainties: {error}"]
     warnings = []

@@ -11,7 +11,15 @@ from pancam_graph.elimination import LandmarkSystem, Linkage, Panels, Root
 from pancam_graph.graph import Factors, FactorTemplate, graph_of
 from pancam_graph.solve._problem import Problem, system_of
 
-__all__ = ["ReducedSystem", "add_factors", "held_columns", "joint_panels", "joint_root", "loosened_root"]
+__all__ = [
+    "ReducedSystem",
+    "add_factors",
+    "held_columns",
+    "joint_panels",
+    "joint_root",
+    "loosened_root",
+    "panels_of",
+]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,9 +40,20 @@ class ReducedSystem:
         Raises SolveError where no observation takes part.
         """
         system, rows = arranged or system_of(problem)
-        panels = system.linearise(problem.template.posture(problem.values))
-        root = joint_root(problem.template, problem.factors, problem.values, panels)
-        return ReducedSystem(system=system, rows=rows, root=root)
+        return ReducedSystem(system=system, rows=rows, root=_panels_of(problem, system).root())
+
+
+def panels_of(problem: Problem) -> Panels:
+    """The system in the variables of cameras at a problem's values, all factors included.
+
+    Raises SolveError where no observation takes part.
+    """
+    return _panels_of(problem, system_of(problem)[0])
+
+
+def _panels_of(problem: Problem, system: LandmarkSystem) -> Panels:
+    panels = system.linearise(problem.template.posture(problem.values))
+    return joint_panels(problem.template, problem.factors, problem.values, panels)
 
 
 def joint_root(template: FactorTemplate, factors: Factors, values: gtsam.Values, panels: Panels) -> Root:

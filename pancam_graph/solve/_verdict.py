@@ -115,7 +115,9 @@ def _optimum(at: Optimum) -> VerdictTest:
     if at.reduced is None:
         text = "distance to the optimum is unknown: the system has a free direction"
         return VerdictTest.of(name, np.nan, limit, text, text)
-    ahead = at.reduced.root.gain() + at.reduced.system.gain_alone
+    # Landmarks at expected ranges are not where they fit best: only those fitted have a step of their own.
+    alone = at.reduced.system.gain_alone if at.fitted.expected is None else 0.0
+    ahead = at.reduced.root.gain() + alone
     costs = at.fitted.outcome.costs
     gains = -np.diff(costs[-3:])
     # Gains of a slow crawl shrink by a constant factor: all that are to come add up.
