@@ -33,13 +33,14 @@ _MORE = 0.05
 """Feigned information, summed over directions in units of the true one of each, from which on it counts."""
 _LEAST = 10
 """Least landmarks with a broad range."""
-_ROUNDS = 40
-_SETTLED = 0.02
+_ROUNDS = 60
+_SETTLED = 0.05
 """Step in sigmas that ends the rounds."""
 _NEAR = 0.3
 """Step in sigmas below which the distribution of ranges may depend on direction."""
-_FULL_STEPS = 10
-"""Rounds with whole steps; later ones take half of each, lest two states alternate."""
+_FIRST_ROUNDS = 10
+"""Rounds after which it may depend on direction however large the step is, and after which a step that is no
+shorter than the one before is taken by half, lest two states alternate."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -81,16 +82,18 @@ def _solved(
     """Rounds of: step to where the gradient vanishes, ranges fitted there, and expected ranges again."""
     link = problem.template.linkage
     held = all_columns(link, held_columns(problem.template))
+    before = np.inf
     for number in range(_ROUNDS):
         length = float(np.sqrt(2 * reduced.root.gain()))
         _LOG.debug("far terrain: round %d, step %.3g sigma", number, length)
-        if not prior.is_divided and (length < _NEAR or number >= _FULL_STEPS):
+        if not prior.is_divided and (length < _NEAR or number >= _FIRST_ROUNDS):
             # Not before: at the biased optimum, ranges follow the directions that the bias gives them.
             prior.is_divided = True
         elif length < _SETTLED:
             return FarTerrain(problem=problem, expected=expected, converged=True)
-        step = reduced.root.step() * (1.0 if number < _FULL_STEPS else 0.5)
-        step[held] = 0.0
+        alternates = number >= _FIRST_ROUNDS and length > 0.9 * before
+        step = reduced.root.step() * (0.5 if alternates else 1.0)
+        step[held], before = 0.0, length
         problem = problem.at(retracted(link, problem.values, step), problem.landmarks).placed()
         expected = _expected(problem, broad, prior)
         reduced = ReducedSystem.of(problem.at(problem.values, expected))

@@ -284,7 +284,7 @@ def _held(at: Optimum) -> Iterator[VerdictTest]:
     """The held number of the rig whose freedom would lower the cost by most."""
     if at.reduced is None or not at.fitted.outcome.converged:
         return
-    held = held_entries(at.fitted.problem)
+    held = held_entries(at.fitted.problem if at.fitted.expected is None else at.problem)
     if held:
         cost = at.fitted.problem.cost()
         best = max(held, key=lambda e: e.gain)
