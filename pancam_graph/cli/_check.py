@@ -26,9 +26,10 @@ def _work(call: Invocation) -> int:
     """Read the solution, print its verdict."""
     from pancam_graph.base.errors import InputError
     from pancam_graph.cli._summary import verdict_lines
-    from pancam_graph.results import read_solution_json
+    from pancam_graph.results import read_solution_json, recover_results
 
     path: Path = call.arguments.out
+    recover_results(path)
     path = path / "solution.json" if path.is_dir() else path
     file = read_solution_json(path)
     if file.verdict is None:

@@ -18,7 +18,7 @@ from pancam_graph.results._outputs import OUTPUTS, SOLUTION, check_exports
 if TYPE_CHECKING:
     from pancam_graph.mosaic import MosaicOptions
 
-__all__ = ["check_out", "write_results"]
+__all__ = ["check_out", "recover_results", "write_results"]
 
 
 def check_out(out: Path | str) -> None:
@@ -32,7 +32,7 @@ def check_out(out: Path | str) -> None:
     expected = f"{out}: expected a new folder or one of older results"
     try:
         target = out.resolve()
-        recover(target, keep=CACHE)
+        recover_results(target)
         if out.is_symlink() and not out.exists():
             raise InputError(f"{expected}, found a link that leads nowhere")
         if not out.exists():
@@ -55,6 +55,14 @@ def check_out(out: Path | str) -> None:
         raise InputError(f"{expected}, found a file in its place: {parent}")
     if not os.access(parent, os.W_OK | os.X_OK):
         raise InputError(f"{expected}, found no permission to write in {parent}")
+
+
+def recover_results(out: Path | str) -> None:
+    """Bring back the results that a run had moved aside from `out` when it was killed, and delete its own.
+
+    Does nothing for a folder that no killed run wrote to.
+    """
+    recover(Path(out), keep=CACHE)
 
 
 def write_results(

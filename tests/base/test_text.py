@@ -80,3 +80,10 @@ def test_a_name_that_a_spreadsheet_would_compute_gets_an_apostrophe(name: str) -
 @pytest.mark.parametrize("name", ["", "a=b", "1-2", "s0f0 left", "é"])
 def test_other_names_stay(name: str) -> None:
     assert table_cell(name) == name
+
+
+@given(ANY)
+def test_no_cell_begins_a_formula(name: str) -> None:
+    cell = table_cell(name)
+    assert not cell.lstrip().startswith(("=", "+", "-", "@"))
+    assert cell.removeprefix("'") == visible(name).removeprefix("'")

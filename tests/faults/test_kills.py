@@ -1,12 +1,16 @@
 """A writer that is killed at any step: what it wrote to is whole, and nothing stays beside it."""
 
+import json
 import signal
 from pathlib import Path
 
 import pytest
 
 from pancam_graph.base.whole_files import recover, whole_folder
-from support.kills import BYSTANDERS, KEPT, NEW, OLD, killed_at_every_step
+from pancam_graph.cli import main
+from pancam_graph.results import write_results
+from support.kills import BYSTANDERS, CACHE, FULL, KEPT, NEW, OLD, killed_at_every_step
+from support.made_solutions import fabricate
 
 SENT = [signal.SIGKILL, signal.SIGTERM]
 
@@ -46,6 +50,42 @@ def test_a_recovery_that_is_killed_is_done_by_the_next(tmp_path: Path) -> None:
     assert len(runs) > 20
     assert all(run.out == {**OLD, **KEPT} for run in runs)
     assert all(run.beside == BYSTANDERS for run in runs)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sent", [*SENT, FULL])
+def test_results_are_whole_old_or_whole_new_whenever_their_writer_is_killed(
+    sent: int, tmp_path: Path
+) -> None:
+    """A folder of results with an export and a cache, which stays in any case."""
+    runs = killed_at_every_step("results", sent, tmp_path)
+    assert len(runs) > 40
+    assert runs[-1].status == 0
+    older, newer = runs[0].out, runs[-1].out
+    assert older["residuals.csv"] != newer["residuals.csv"]
+    assert sorted(newer) == sorted([*older, *(name for name in newer if name.startswith("cahvor/"))])
+    for run in runs:
+        whole = older if run.out["residuals.csv"] == older["residuals.csv"] else newer
+        assert sorted(run.out) == sorted(whole)
+        assert {k: v for k, v in run.out.items() if k in CACHE} == CACHE
+        assert json.loads(run.out["solution.json"])["format"] == "pancam-graph/solution"
+        assert {k: v for k, v in run.out.items() if k.endswith((".csv", ".ply", ".cahvor"))} == {
+            k: v for k, v in whole.items() if k.endswith((".csv", ".ply", ".cahvor"))
+        }
+        assert run.beside == BYSTANDERS
+        assert sorted(run.again) == sorted(newer)
+
+
+def test_check_restores_what_a_killed_run_moved_aside(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    write_results(fabricate(points=40, pans=2), out, report=False)
+    out.rename(tmp_path / ".out.01234567.older")
+    (tmp_path / ".out.01234567.partial").mkdir()
+    assert main(["check", str(out)]) == 2  # results without a verdict
+    assert "verdict: expected the tests of a solution" in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
 
 def test_what_a_living_writer_writes_stays(tmp_path: Path) -> None:

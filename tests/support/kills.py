@@ -14,6 +14,7 @@ import os
 import signal
 import subprocess
 import sys
+import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,11 +22,12 @@ from typing import Any, NoReturn
 
 from pancam_graph.base.whole_files import recover, whole_file, whole_folder
 
-__all__ = ["BYSTANDERS", "FULL", "KEPT", "NEW", "OLD", "Left", "killed_at_every_step"]
+__all__ = ["BYSTANDERS", "CACHE", "FULL", "KEPT", "NEW", "OLD", "Left", "killed_at_every_step"]
 
 STEPS = {os: ("rename", "replace", "mkdir", "unlink", "rmdir", "open", "close"), io: ("open",)}
 """Functions by module; a write without its renaming is what "after open" leaves."""
 NEW, OLD, KEPT = {"a": "new", "b/c": "new"}, {"a": "old", "b/c": "old", "d": "old"}, {"cache/x": "kept"}
+CACHE = {"cache/cache.json": '{"format": "pancam-graph/cache", "version": 1}', "cache/x": "kept"}
 BYSTANDERS = {
     "thesis.tex": "mine",
     ".out.partial/x": "mine",
@@ -56,7 +58,13 @@ FULL = 0
 def killed_at_every_step(work: str, sent: int, folder: Path) -> list[Left]:
     """What is left by a process that does some work of `WORK` and gets a signal, for each of its steps."""
     program = [sys.executable, __file__, work, str(int(sent)), str(folder)]
-    done = subprocess.run(program, stdout=subprocess.PIPE, text=True, check=True)
+    done = subprocess.run(
+        program,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    )
     return [Left(**json.loads(line)) for line in done.stdout.splitlines()]
 
 
@@ -71,6 +79,21 @@ def _write_file(out: Path) -> None:
 
 def _recover(out: Path) -> None:
     recover(out, keep="cache")
+
+
+def _write_results(out: Path) -> None:
+    from pancam_graph.results import write_results
+    from support.made_solutions import fabricate
+
+    write_results(fabricate(points=40, pans=2), out, report=False, exports=("cahvor",))
+
+
+def _prepare_results(out: Path) -> None:
+    from pancam_graph.results import write_results
+    from support.made_solutions import fabricate
+
+    write_results(fabricate(points=40, pans=2, seed=1), out, report=False)
+    _fill(out, CACHE)
 
 
 def _prepare_older(out: Path) -> None:
@@ -93,6 +116,7 @@ WORK: dict[str, tuple[Callable[[Path], None], Callable[[Path], None]]] = {
     "new folder": (_prepare_new, _write_folder),
     "file": (_prepare_older, _write_file),
     "recovery": (_prepare_killed, _recover),
+    "results": (_prepare_results, _write_results),
 }
 """What is there before, and what is done."""
 
@@ -104,7 +128,8 @@ def _fill(folder: Path, files: dict[str, str]) -> None:
 
 
 def _files(folder: Path) -> dict[str, str]:
-    return {p.relative_to(folder).as_posix(): p.read_text() for p in sorted(folder.rglob("*")) if p.is_file()}
+    files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
+    return {path.relative_to(folder).as_posix(): path.read_text(encoding="latin-1") for path in files}
 
 
 def _patch(waiting: int, sent: int) -> list[bool]:
@@ -142,16 +167,17 @@ def _interrupt(*_: object) -> NoReturn:
 
 
 def _child(work: Callable[[Path], None], out: Path, waiting: int, sent: int) -> NoReturn:
+    signal.signal(signal.SIGTERM, _interrupt)  # as the command does
+    struck = _patch(waiting, sent)
     status = 0
     try:
-        signal.signal(signal.SIGTERM, _interrupt)  # as the command does
-        struck = _patch(waiting, sent)
         work(out)
-        status = 130 if struck else 0
-    except (KeyboardInterrupt, OSError):  # an interrupt in rmtree may make it close a file twice
-        status = 130
+    except BaseException:
+        if not struck:
+            traceback.print_exc()
+            status = 1
     finally:
-        os._exit(status)
+        os._exit(130 if struck else status)
 
 
 def _runs(work: str, sent: int, folder: Path) -> Iterator[Left]:
@@ -169,7 +195,7 @@ def _runs(work: str, sent: int, folder: Path) -> Iterator[Left]:
         do(out)
         rest = {k: v for k, v in beside.items() if not k.startswith("out/")}
         yield Left(status=status, out=left, beside=rest, again=_files(out))
-        if status == 0:
+        if status in {0, 1}:
             return
 
 
