@@ -10,7 +10,7 @@ from typing import Any
 
 from pancam_graph import __version__
 from pancam_graph.base.errors import InputError
-from pancam_graph.base.text import visible
+from pancam_graph.base.text import shortened, visible
 from pancam_graph.cli._streams import is_terminal, write
 
 __all__ = ["check_log_outside", "logged", "show_log"]
@@ -44,7 +44,7 @@ class _Warnings(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write a message."""
-        write("stderr", f"warning: {record.getMessage()}")
+        write("stderr", shortened(f"warning: {record.getMessage()}"))
 
 
 class _File(logging.FileHandler):

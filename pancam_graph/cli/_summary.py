@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from pancam_graph.base.text import shortened
 from pancam_graph.cli._streams import is_terminal, write
 from pancam_graph.data import CrossValidation, Solution, Verdict, VerdictTest
 
@@ -34,9 +35,9 @@ def print_summary(solution: Solution, where: str, *, quiet: bool = False) -> Non
         for line in _lines_below(solution):
             write("stdout", line)
     for failure in failures:
-        write("stderr", f"failed test: {failure}")
+        write("stderr", shortened(f"failed test: {failure}"))
     for warning in warnings:
-        write("stderr", f"warning: {warning}")
+        write("stderr", shortened(f"warning: {warning}"))
 
 
 def verdict_lines(verdict: Verdict) -> Iterator[str]:
@@ -93,8 +94,8 @@ def _print_table(
         table,
         words(state, f": {solution.stop_reason}; {solution.seconds.solve:.1f} s"),
         *_lines_below(solution),
-        *(words(("failed test", "bold red"), f" {failure}") for failure in failures),
-        *(words(("warning", "yellow"), f" {warning}") for warning in warnings),
+        *(words(("failed test", "bold red"), f" {shortened(failure)}") for failure in failures),
+        *(words(("warning", "yellow"), f" {shortened(warning)}") for warning in warnings),
         words("results in ", (where, "bold")),
     )
 

@@ -6,6 +6,7 @@ import gtsam
 import numpy as np
 
 from pancam_graph.base.errors import CameraError, InputError
+from pancam_graph.base.text import visible
 from pancam_graph.cameras import CAHV, Camera, as_cahv
 from pancam_graph.data import Solution, Traverse
 from pancam_graph.io import cahvor_text
@@ -44,7 +45,7 @@ def fill_cameras(solution: Solution, folder: Path) -> None:
     listed = []
     for image, name, model in zip(images, names, world_models(solution), strict=True):
         if model is not None:
-            text = cahvor_text(model, [f"pancam_graph, image {image.id.replace('=', '-')}", *_FRAME])
+            text = cahvor_text(model, [f"pancam_graph, image {visible(image.id).replace('=', '-')}", *_FRAME])
             (folder / f"{name}.cahvor").write_text(text, encoding="utf-8", newline="\n")
             listed.append({"id": image.id, "file": f"{name}.cahvor"})
     write_export_json(folder, "cahvor", {"frame": "world", "images": listed})

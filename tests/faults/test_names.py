@@ -14,11 +14,13 @@ from pathlib import Path
 import pytest
 
 from pancam_graph import read_traverse, write_traverse
+from pancam_graph.cameras import CAHV
 from pancam_graph.cli import main
 from pancam_graph.cli._log import logged
 from pancam_graph.cli._progress import Progress, TerminalLine
 from pancam_graph.cli._summary import print_summary
 from pancam_graph.data import Solution, Traverse
+from pancam_graph.io import read_cahvor
 from pancam_graph.results import write_results
 from support.made_solutions import fabricate
 
@@ -101,7 +103,7 @@ def test_logs_and_progress_show_names_as_they_are(name: str, tmp_path: Path) -> 
 @pytest.mark.parametrize("name", [*PRINTING, *(n for n in CONTROLS if n != NO_TEXT)])
 def test_results_hold_any_name_that_is_text(name: str, tmp_path: Path) -> None:
     solution = renamed(name)
-    write_results(solution, tmp_path / "out", report=False)
+    write_results(solution, tmp_path / "out", report=False, exports=("cahvor",))
     with (tmp_path / "out" / "residuals.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == len(solution.used)
@@ -109,6 +111,9 @@ def test_results_hold_any_name_that_is_text(name: str, tmp_path: Path) -> None:
     assert {float(r["final_du_px"]) < 0 for r in rows} == {True, False}  # numbers stay numbers
     written = json.loads((tmp_path / "out" / "solution.json").read_text(encoding="utf-8"))
     assert [s["id"] for s in written["stops"]] == [s.id for s in solution.traverse.stops]
+    cameras = sorted((tmp_path / "out" / "cahvor").glob("*.cahvor"))
+    assert len(cameras) == len(solution.traverse.images)
+    assert all(isinstance(read_cahvor(path), CAHV) for path in cameras)
 
 
 @pytest.mark.skipif(sys.platform == "darwin", reason="its file systems have text names alone")
@@ -132,6 +137,14 @@ def test_a_run_on_a_terminal_ends_well(name: str, tmp_path: Path) -> None:
     with terminals() as (out, _):
         assert main(["refine", str(folder), "--out", str(tmp_path / "out"), "--no-report"]) == 0
     assert f"{name}test traverse" in out.getvalue()
+
+
+def test_a_warning_of_thousands_of_characters_is_shortened(capsys: pytest.CaptureFixture[str]) -> None:
+    print_summary(replace(renamed("x"), warnings=(f"image {'n' * 5000} is left out",)), "out")
+    line = capsys.readouterr().err
+    assert line.startswith("warning: image nnn")
+    assert line.endswith("nnn is left out\n")
+    assert len(line) < 200
 
 
 def test_an_rms_that_is_undefined_at_the_start_is_said_in_words(capsys: pytest.CaptureFixture[str]) -> None:
