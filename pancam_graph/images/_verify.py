@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pancam_graph.base.geometry import FloatArray
+from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.images._front_end_options import FrontEndOptions
 from pancam_graph.images._pairs import FAR_M, PairGeometry, Relative, move_pixels
 
@@ -65,12 +65,15 @@ class _Misfit:
     """(n, 2, 3) derivative of the projection by the point in the frame of b."""
     slope: FloatArray
     """(n, 2) derivative of the residual by the inverse depth."""
+    seen: BoolArray
+    """(n,) whether the point is in front of b and in its camera's domain; the rest means nothing where not."""
 
     @staticmethod
     def of(geometry: PairGeometry, b_T_a: Relative, lines: _Lines, inverse_depth: FloatArray) -> "_Misfit":
-        uv, d_uv, _ = geometry.camera_b.project_with_jacobian(b_T_a.of(lines.points_m(inverse_depth)))
+        uv, d_uv, seen = geometry.camera_b.project_with_jacobian(b_T_a.of(lines.points_m(inverse_depth)))
         d_point = lines.direction @ b_T_a.R.T / np.maximum(inverse_depth, 1 / FAR_M)[:, None] ** 2
-        return _Misfit(residual_px=lines.uv_b - uv, d_uv=d_uv, slope=np.einsum("nij,nj->ni", d_uv, d_point))
+        slope = np.einsum("nij,nj->ni", d_uv, d_point)
+        return _Misfit(residual_px=lines.uv_b - uv, d_uv=d_uv, slope=slope, seen=seen)
 
     def across(self, inverse_depth: FloatArray, nearest: float) -> FloatArray:
         """Projection (n, 2, 2) onto the part of a residual that no change of depth can reduce.
@@ -120,6 +123,9 @@ def fit_pair(
         r = np.einsum("nij,nj->ni", across, misfit.residual_px)
         J = -across @ move_pixels(lines.points_m(inverse_depth), misfit.d_uv, d_b_T_a)
         weight = (scale**2 / (scale**2 + np.sum(r * r, axis=1))) ** 2 / _NOISE_PX**2
+        # A correction of many degrees may turn points behind b, where derivatives are huge and mean nothing:
+        # with them the prior is lost to rounding and the system singular.
+        weight = np.where(misfit.seen, weight, 0.0)
         information = np.eye(columns) + np.einsum("n,nik,nil->kl", weight, J, J)
         gradient = q + np.einsum("n,nik,ni->k", weight, J, r)
         q = q - np.linalg.solve(information, gradient)
@@ -133,14 +139,15 @@ def epipolar_px(
 
     The distance (n,) is that of the pixel in b from the line of sight of the pixel in a, whose depth may
     be anything from `options.min_depth_m` to infinity; it is divided by what one pixel of noise in both
-    images would cause. Inverse depths (n,) are per metre from camera a.
+    images would cause, and infinite for a line of sight that b cannot see. Inverse depths (n,) are per metre
+    from camera a.
     """
     lines = _Lines.of(geometry, uv_a, uv_b)
     b_T_a, nearest = geometry.b_T_a(p), 1 / options.min_depth_m
     inverse_depth = _nearest_candidate(geometry, b_T_a, lines, nearest)
     inverse_depth, misfit = _refine_depths(geometry, b_T_a, lines, inverse_depth, nearest, _FINAL_DEPTH_STEPS)
     missed = np.einsum("nij,nj->ni", misfit.across(inverse_depth, nearest), misfit.residual_px)
-    return np.linalg.norm(missed, axis=1) / lines.noise, inverse_depth
+    return np.where(misfit.seen, np.linalg.norm(missed, axis=1) / lines.noise, np.inf), inverse_depth
 
 
 def _nearest_candidate(geometry: PairGeometry, b_T_a: Relative, lines: _Lines, nearest: float) -> FloatArray:
@@ -168,7 +175,7 @@ def _refine_depths(
     for _ in range(steps):
         slope = misfit.slope
         length2 = np.maximum(np.einsum("ni,ni->n", slope, slope), 1e-12)
-        step = -np.einsum("ni,ni->n", slope, misfit.residual_px) / length2
+        step = np.where(misfit.seen, -np.einsum("ni,ni->n", slope, misfit.residual_px) / length2, 0.0)
         inverse_depth = np.clip(inverse_depth + np.clip(step, -nearest / 3, nearest / 3), 0.0, nearest)
         misfit = _Misfit.of(geometry, b_T_a, lines, inverse_depth)
     return inverse_depth, misfit
