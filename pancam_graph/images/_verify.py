@@ -66,7 +66,7 @@ class _Misfit:
     slope: FloatArray
     """(n, 2) derivative of the residual by the inverse depth."""
     seen: BoolArray
-    """(n,) whether the point is in front of b and in its camera's domain; the rest means nothing where not."""
+    """(n,) whether the point is in front of b and in its camera's domain; else the rest means nothing."""
 
     @staticmethod
     def of(geometry: PairGeometry, b_T_a: Relative, lines: _Lines, inverse_depth: FloatArray) -> "_Misfit":

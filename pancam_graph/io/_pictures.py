@@ -1,15 +1,13 @@
 """Pictures of a traverse: from the row of an image to its samples, and which pictures are the same."""
 
-import hashlib
 from collections.abc import Mapping
 from pathlib import Path
-
-import numpy as np
 
 from pancam_graph.base.errors import ImageError, InputError
 from pancam_graph.data import Traverse
 from pancam_graph.io._file_memory import FileMemory
 from pancam_graph.io._image_files import GreyImage, ImageContent, read_content
+from pancam_graph.io._looks import Look, look_of, same_looks
 from pancam_graph.io._picture_size import WantedSize
 
 __all__ = [
@@ -21,8 +19,8 @@ __all__ = [
 ]
 
 _NAMED = 5
-_KEYS = FileMemory[bytes]()
-"""Keys (`_key`) of files that were decoded, so that equal pictures are told without decoding again."""
+_LOOKS = FileMemory[Look]()
+"""Looks of files that were decoded, so that equal pictures are told without decoding again."""
 
 
 def picture_file(traverse: Traverse, row: int) -> Path | None:
@@ -43,8 +41,8 @@ def read_picture(traverse: Traverse, row: int) -> ImageContent:
     width_px, height_px = eye.camera.width_px, eye.camera.height_px
     words = f"{width_px} x {height_px} pixels as of camera {eye.name} of the rig {traverse.rig.name}"
     content = read_content(path, WantedSize(width_px=width_px, height_px=height_px, words=words))
-    if _KEYS.recall(path) is None:
-        _KEYS.keep(path, _key(content.samples))
+    if _LOOKS.recall(path) is None:
+        _LOOKS.keep(path, look_of(content.samples))
     return content
 
 
@@ -59,38 +57,23 @@ def readable_picture(traverse: Traverse, row: int) -> GreyImage | None:
         return None
 
 
-def _key(samples: GreyImage) -> bytes:
-    """A digest that pictures of one size and depth share if they are alike in every sample.
-
-    Empty for a picture of a single grey, which is the same as no other.
-    """
-    if samples.min() == samples.max():
-        return b""
-    digest = hashlib.sha256(f"{samples.dtype.str} {samples.shape} ".encode())
-    digest.update(np.ascontiguousarray(samples).data)
-    return digest.digest()
-
-
 def same_pictures(traverse: Traverse) -> dict[int, int]:
     """Rows of images whose picture is the same as that of an image before, and the first such row.
 
-    Pictures are the same if they have one size and depth and are alike in every sample: two pictures of one
-    scene differ by their noise. Pictures of a single grey say nothing and are not told to be the same. Files
-    that were decoded before and have not changed are not decoded again; files that cannot be read are the
-    same as no other.
+    See `same_looks` for what is the same. Files that were decoded before and have not changed are not decoded
+    again; files that cannot be read are the same as no other.
     """
-    first: dict[bytes, int] = {}
-    same: dict[int, int] = {}
+    looks: dict[int, Look] = {}
     for row in range(len(traverse.images)):
         path = picture_file(traverse, row)
         if path is None:
             continue
-        key = _KEYS.recall(path)
-        if key is None and readable_picture(traverse, row) is not None:
-            key = _KEYS.recall(path)
-        if key and first.setdefault(key, row) != row:
-            same[row] = first[key]
-    return same
+        look = _LOOKS.recall(path)
+        if look is None and readable_picture(traverse, row) is not None:
+            look = _LOOKS.recall(path)
+        if look is not None:
+            looks[row] = look
+    return same_looks(traverse, looks)
 
 
 def left_out(errors: Mapping[str, InputError]) -> list[str]:

@@ -250,13 +250,6 @@ def test_black_pictures_and_files_that_cannot_be_read_are_the_same_as_no_other(t
     assert same_pictures(pictured(tmp_path, "a.png", "b.png", "c.png", "d.png")) == {}
 
 
-def test_samples_of_another_depth_are_another_picture(tmp_path: Path) -> None:
-    few = grey(1) // 32
-    save(tmp_path / "a.png", few.astype(np.uint8))
-    save(tmp_path / "b.png", few)
-    assert same_pictures(pictured(tmp_path, "a.png", "b.png")) == {}
-
-
 def test_the_label_of_a_file_is_parsed_once_for_as_long_as_it_is_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -274,3 +267,45 @@ def test_the_label_of_a_file_is_parsed_once_for_as_long_as_it_is_the_same(
     pds_file(file, np.arange(8).astype(">i2").tobytes(), size=(2, 4))
     np.testing.assert_array_equal(read_image(file), np.arange(8).reshape(2, 4))
     assert parsed == [file, file]
+
+
+def scene(seed: int) -> NDArray[np.uint8]:
+    """Texture at several scales with shading, 64 x 48."""
+    rng = np.random.default_rng(seed)
+    layers = [cv2.GaussianBlur(rng.normal(size=(48, 64)), (0, 0), s) * s for s in (0.7, 1.5, 4.0)]
+    shaded = 110 + 30 * sum(layers) / np.std(sum(layers)) + np.linspace(-20, 20, 48)[:, None]
+    return np.asarray(np.clip(np.rint(shaded), 1, 255), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("name", ["b.jpg", "b.webp", "b.tif"])
+def test_a_picture_encoded_anew_and_taken_for_another_view_is_the_same(tmp_path: Path, name: str) -> None:
+    save(tmp_path / "a.png", scene(1))
+    copy = scene(1)
+    save(tmp_path / name, copy.astype(np.uint16) * 16 if name == "b.tif" else copy)
+    save(tmp_path / "c.png", scene(2))
+    assert same_pictures(pictured(tmp_path, "a.png", name, "c.png")) == {1: 0}
+
+
+def test_two_exposures_of_one_pointing_are_two_pictures_and_their_copies_are_not(tmp_path: Path) -> None:
+    noise = np.random.default_rng(3).normal(0, 1.5, (48, 64))
+    save(tmp_path / "a.png", scene(1))
+    save(tmp_path / "b.png", np.clip(scene(1) + noise, 1, 255).astype(np.uint8))
+    traverse = pictured(tmp_path, "a.png", "b.png")
+    first = traverse.frames[0]
+    frames = tuple(replace(f, pan_rad=first.pan_rad, tilt_rad=first.tilt_rad) for f in traverse.frames)
+    assert same_pictures(replace(traverse, frames=frames)) == {}
+    assert same_pictures(traverse) == {1: 0}  # where telemetry has them look apart, one of them is misplaced
+    save(tmp_path / "b.png", scene(1))
+    assert same_pictures(replace(traverse, frames=frames)) == {1: 0}
+
+
+def test_pictures_that_share_their_shading_or_their_missing_data_are_others(tmp_path: Path) -> None:
+    for seed, name in enumerate(("a.png", "b.png", "c.png")):
+        picture = scene(seed)
+        picture[:, :20] = 0  # the same border without data
+        save(tmp_path / name, picture)
+    sky = np.linspace(60, 200, 48)[:, None] + np.random.default_rng(9).normal(0, 1, (2, 48, 64))
+    for picture, name in zip(sky, ("d.png", "e.png"), strict=True):
+        save(tmp_path / name, np.rint(picture).astype(np.uint8))
+    assert same_pictures(pictured(tmp_path, "a.png", "b.png", "c.png", "d.png")) == {}
+    assert same_pictures(pictured(tmp_path, "d.png", "e.png")) == {}

@@ -382,7 +382,12 @@ def test_images_that_cannot_be_had_are_warned_of(tmp_path: Path) -> None:
     assert len(saved.warnings) == 4
     for warning, (name, why) in zip(
         sorted(saved.warnings),
-        [("f0", "found none"), ("f1", "that are none"), ("f2", "found 12 x 10"), ("f3", "it has no file")],
+        [
+            ("f0", "found nothing there"),
+            ("f1", "that are none"),
+            ("f2", "found 12 x 10"),
+            ("f3", "it has no file"),
+        ],
         strict=True,
     ):
         assert warning.startswith(f"mosaic: image {name}-left is left out: ")
@@ -396,10 +401,13 @@ def test_images_that_cannot_be_had_are_warned_of(tmp_path: Path) -> None:
 
 def test_a_picture_that_is_there_twice_is_shown_once(tmp_path: Path) -> None:
     solution = solved(Scene(), tmp_path)
-    (tmp_path / "f2-left.png").write_bytes((tmp_path / "f0-left.png").read_bytes())
-    mosaics = make_mosaics(solution, "A/1", "left", NEAR)
-    assert mosaics.images == ("f0-left", "f1-left")
-    (warning,) = mosaics.warnings
+    picture = read_picture(tmp_path / "f0-left.png").astype(float)
+    encoded_anew = cv2.imencode(".jpg", np.rint(255 * picture / picture.max()).astype(np.uint8))[1].tobytes()
+    for copy in ((tmp_path / "f0-left.png").read_bytes(), encoded_anew):
+        (tmp_path / "f2-left.png").write_bytes(copy)
+        mosaics = make_mosaics(solution, "A/1", "left", NEAR)
+        assert mosaics.images == ("f0-left", "f1-left")
+        (warning,) = mosaics.warnings
     assert warning == (
         "mosaic: image f2-left (f2-left.png) is left out: the same picture as image f0-left (f0-left.png)"
     )
