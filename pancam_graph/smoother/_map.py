@@ -174,9 +174,13 @@ class DriveMap:
     ) -> None:
         """Use those of some rows (n,) that are `accepted` (n,), and not the others, as they were judged.
 
-        Later updates do not test again what is left out `by_chance` (n,).
+        Later updates do not test again what is left out `by_chance` (n,). Rows of tracks that other stations
+        use too, which had no part in the judgement, are tested against what these see.
         """
         ledger = self.ledger
+        used = ledger.all_with(Fate.USED)
+        others = used[~np.isin(self.station_of(used), distinct(self.station_of(rows)))]
+        elsewhere = distinct(ledger.track[others])
         was_used = ledger.fate[rows] == int(Fate.USED)
         new, lost = rows[accepted & ~was_used], rows[~accepted & was_used]
         ledger.set_fate(rows[~accepted], Fate.OUTLIER)
@@ -184,9 +188,14 @@ class DriveMap:
         ledger.set_fate(new, Fate.WAITING)
         new = distinct(new, self.idle(ledger.track[new], Fate.WAITING))
         of_new, of_lost = self._home_or_first(new), self.home(ledger.track[lost])
-        names = distinct(of_new[of_new >= 0], of_lost)
-        parts = [(name, new[of_new == name], lost[of_lost == name]) for name in names.tolist()]
-        self._rebuild(parts, cameras, change, tested=True)
+        names = distinct(of_new[of_new >= 0], of_lost).tolist()
+        new_elsewhere = np.isin(ledger.track[new], elsewhere)
+        lost_elsewhere = np.isin(ledger.track[lost], elsewhere)
+        for tested in (True, False):
+            mine, gone = new_elsewhere != tested, lost_elsewhere != tested
+            parts = [(b, new[mine & (of_new == b)], lost[gone & (of_lost == b)]) for b in names]
+            parts = [part for part in parts if len(part[1]) or len(part[2])]
+            self._rebuild(parts, cameras, change, tested=tested)
 
     def give_up(self, rows: IntArray, cameras: Postures, change: Change) -> None:
         """Rebuild blocks without these rows, whose fate is set already.
