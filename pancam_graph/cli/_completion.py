@@ -27,7 +27,7 @@ def _work(call: Invocation) -> int:
 
     program = call.make_program()
     _look_choices_up(program)
-    must_write(shtab.complete(program, call.arguments.shell))
+    must_write(f"{shtab.complete(program, call.arguments.shell)}\n")
     return 0
 
 

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 
 from pancam_graph.base.choices import nearest
 from pancam_graph.base.text import shortened, visible
-from pancam_graph.cli._streams import must_write, write
+from pancam_graph.cli._streams import must_write, write_rendered
 
 __all__ = [
     "COMMON_OPTIONS",
@@ -108,15 +108,15 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print one line and end with status 2."""
-        complaint = shortened(visible(" ".join(message.split())))
-        self.exit(BAD_INPUT, f"{self.prog}: {complaint} (--help explains)\n")
+        complaint = shortened(visible(f"{self.prog}: {' '.join(message.split())}"))
+        self.exit(BAD_INPUT, f"{complaint} (--help explains)\n")
 
     def _print_message(self, message: str, file: object = None) -> None:
         """Print help or version on standard output, which are all that was asked for, or a complaint."""
         if file is sys.stdout:
-            must_write(message.removesuffix("\n"))
+            must_write(message)
         else:
-            write("stderr", message.removesuffix("\n"), lines=True)
+            write_rendered("stderr", message)
 
     def long_options(self) -> dict[str, argparse.Action]:
         """Every option by its long name, without dashes."""

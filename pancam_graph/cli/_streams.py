@@ -16,13 +16,13 @@ Stream = Literal["stdout", "stderr"]
 _STREAMS: tuple[Stream, ...] = ("stdout", "stderr")
 
 
-def write(stream: Stream, text: str, *, lines: bool = False) -> bool:
-    """Write a line, or with `lines` a text of several, made `visible`; False where there is no room for it.
+def write(stream: Stream, text: str) -> bool:
+    """Write a line, made `visible`; False where there is no room for it.
 
     Where nobody reads any more, or there is no room, nothing is written from here on: the work goes on, and
     its results do not depend on who watches.
     """
-    return write_rendered(stream, f"{visible(text, lines=lines)}\n")
+    return write_rendered(stream, f"{visible(text)}\n")
 
 
 def write_rendered(stream: Stream, text: str) -> bool:
@@ -44,8 +44,11 @@ def write_rendered(stream: Stream, text: str) -> bool:
 
 
 def must_write(text: str) -> None:
-    """Write lines that are all that was asked for. Raises InputError where standard output takes none."""
-    if not write("stdout", text, lines=True):
+    """Write lines of this program that are all that was asked for.
+
+    Raises InputError where standard output takes none.
+    """
+    if not write_rendered("stdout", text):
         raise InputError("standard output: expected a place that can be written to, found it closed or full")
 
 
