@@ -13,7 +13,7 @@ from pancam_graph.graph import read_variable
 from pancam_graph.landmarks import loss_of, residuals
 from pancam_graph.smoother._placing import Seen, placed_anew
 from pancam_graph.smoother._station import Postures, Station, copied
-from pancam_graph.solve import InOrder, OnGraph, StopRule, optimise, parameters_of
+from pancam_graph.solve import InOrder, OnGraph, StopRule, optimise
 
 __all__ = ["Located", "localise"]
 
@@ -55,9 +55,8 @@ def localise(
     graph = gtsam.NonlinearFactorGraph()
     for factor in (*priors, *blocks.factors()):
         graph.push_back(factor)
-    parameters = parameters_of(_RULE, InOrder(blocks.ordering()))
     outcome = optimise(
-        lambda: OnGraph(graph, copied(values, station.own_keys), parameters, {}),
+        lambda: OnGraph(graph, copied(values, station.own_keys), _RULE, InOrder(blocks.ordering()), {}),
         _RULE,
         n_observations=len(placed.measurements.row),
     )

@@ -15,7 +15,6 @@ from pancam_graph.solve._optimise import InOrder as InOrder
 from pancam_graph.solve._optimise import Iteration as Iteration
 from pancam_graph.solve._optimise import OnGraph as OnGraph
 from pancam_graph.solve._optimise import optimise as optimise
-from pancam_graph.solve._optimise import parameters_of as parameters_of
 from pancam_graph.solve._prepare import Prepared as Prepared
 from pancam_graph.solve._prepare import prepare as prepare
 from pancam_graph.solve._problem import Problem as Problem

@@ -11,7 +11,7 @@ from pancam_graph.factors import LandmarkBlocks
 from pancam_graph.graph import HardTemplate, read_variable
 from pancam_graph.landmarks import SQUARED, Loss
 from pancam_graph.solve._joint import JointSystem, OnLastGroup
-from pancam_graph.solve._optimise import InOrder, Iteration, OnGraph, Outcome, optimise, parameters_of
+from pancam_graph.solve._optimise import InOrder, Iteration, OnGraph, Outcome, optimise
 from pancam_graph.solve._problem import Problem, Solver, system_of
 from pancam_graph.solve._reduced import ReducedSystem, joint_root
 from pancam_graph.solve._stopping import StopRule
@@ -113,9 +113,8 @@ class EliminatedSolver(Solver):
             joint = joint_root(template, problem.factors, values, blocks.panels(values))
             return joint
 
-        parameters = parameters_of(rule, InOrder(blocks.ordering()))
         outcome = optimise(
-            lambda: OnGraph(graph, problem.values, parameters, template.held_columns()),
+            lambda: OnGraph(graph, problem.values, rule, InOrder(blocks.ordering()), template.held_columns()),
             rule,
             n_observations=int(problem.kept.sum()),
             stage=stage,

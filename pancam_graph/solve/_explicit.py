@@ -10,7 +10,7 @@ from pancam_graph.base.errors import SolveError
 from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.graph import ExplicitLandmarks, SoftTemplate
 from pancam_graph.landmarks import SQUARED, Loss, point_sigma_m, refine
-from pancam_graph.solve._optimise import Elimination, Iteration, OnGraph, Outcome, optimise, parameters_of
+from pancam_graph.solve._optimise import Elimination, Iteration, OnGraph, Outcome, optimise
 from pancam_graph.solve._problem import Problem, Solver
 from pancam_graph.solve._stopping import StopRule
 
@@ -128,9 +128,8 @@ class ExplicitSolver(Solver):
         values = explicit.with_landmarks(problem.values, points, present)
         elimination = Elimination(graph, values, by_qr=bool(weak.stretched.any()))
         held = explicit.calibrations.held(template.held_columns())
-        parameters = parameters_of(rule, elimination)
         outcome = optimise(
-            lambda: OnGraph(graph, values, parameters, held),
+            lambda: OnGraph(graph, values, rule, elimination, held),
             rule,
             n_observations=int(problem.kept.sum()),
             on_iteration=self.on_iteration,

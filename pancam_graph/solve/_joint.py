@@ -129,8 +129,8 @@ class OnLastGroup:
 
     def __init__(self, joint: JointSystem, rule: StopRule) -> None:
         self._joint = joint
-        self._parameters = parameters_of(rule, InOrder([_KEY]))
-        self._damping = float(self._parameters.getlambdaInitial())
+        self._rule, self._elimination = rule, InOrder([_KEY])
+        self._damping = float(parameters_of(rule, self._elimination).getlambdaInitial())
         self._start = gtsam.Values()
         self._start.insert(_KEY, np.zeros(int(joint.template.linkage.group_dim[joint.last]) + 1))
         # No noise model: rows are whitened, and their number depends on the rank.
@@ -165,12 +165,14 @@ class OnLastGroup:
         GTSAM makes one trial at a time, since the elimination of the other groups depends on the damping.
         """
         while True:
-            tried, parameters = self._damping, self._parameters
+            tried, parameters = self._damping, parameters_of(self._rule, self._elimination)
             parameters.setlambdaInitial(tried)
             parameters.setlambdaUpperBound(2 * tried)
             optimizer = gtsam.LevenbergMarquardtOptimizer(self._graph, self._start, parameters)
             optimizer.iterate()
             vector = optimizer.values().atVector(_KEY)
+            if not vector.any() and self._elimination.turns_to_qr(self._graph, self._start, tried):
+                continue
             if vector.any():
                 self._joint.move(vector[:-1], tried)
             self._damping = optimizer.lambda_()

@@ -81,22 +81,35 @@ class Optimiser(Protocol):
 
 
 class OnGraph:
-    """Optimises the variables of a graph as they are."""
+    """Optimises the variables of a graph as they are; by QR once Cholesky has failed without need."""
 
     def __init__(
         self,
         graph: gtsam.NonlinearFactorGraph,
         values: gtsam.Values,
-        parameters: gtsam.LevenbergMarquardtParams,
+        rule: StopRule,
+        elimination: "InOrder",
         held: Mapping[int, IntArray],
     ) -> None:
         """`held` are tangent components, by key, that constraints of the graph hold."""
-        self._graph, self._held = graph, held
-        self._optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
+        self._graph, self._held, self._rule, self._elimination = graph, held, rule, elimination
+        self._optimizer = self._begun(values)
+
+    def _begun(self, values: gtsam.Values) -> gtsam.LevenbergMarquardtOptimizer:
+        parameters = parameters_of(self._rule, self._elimination)
+        return gtsam.LevenbergMarquardtOptimizer(self._graph, values, parameters)
 
     def iterate(self) -> None:
-        """Take the next step that lowers the cost."""
+        """Take the next step that lowers the cost.
+
+        Where Cholesky fails, GTSAM raises the damping until it does not. Steps of a system that is determined
+        but unevenly scaled would then be far too short.
+        """
+        before, damping = gtsam.Values(self.values()), self.damping()
         self._optimizer.iterate()
+        if self.damping() > damping and self._elimination.turns_to_qr(self._graph, before, damping):
+            self._optimizer = self._begun(before)
+            self._optimizer.iterate()
 
     def error(self) -> float:
         """Cost at the current values."""
@@ -124,7 +137,7 @@ class OnGraph:
         return largest
 
 
-def parameters_of(rule: StopRule, elimination: "Elimination | InOrder") -> gtsam.LevenbergMarquardtParams:
+def parameters_of(rule: StopRule, elimination: "InOrder") -> gtsam.LevenbergMarquardtParams:
     """GTSAM's options for a rule and an order of elimination."""
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setlambdaUpperBound(MOST_DAMPING)
@@ -239,25 +252,46 @@ def _still_to_gain(costs: list[float]) -> tuple[float, bool]:
 
 
 class InOrder:
-    """Cholesky factorisation in a given order of elimination."""
+    """Factorisation in a given order of elimination: Cholesky, or QR where that fails.
+
+    GTSAM's Cholesky fails on a variable of which one direction is known 4096 times better than another. QR is
+    more robust, but three times slower.
+    """
 
     def __init__(self, keys: Sequence[int]) -> None:
         self.ordering = gtsam.Ordering()
         for key in keys:
             self.ordering.push_back(key)
+        self.by_qr = False
 
     def set_up(self, parameters: gtsam.NonlinearOptimizerParams) -> None:
         """Set the parameters of an optimiser to use it."""
-        parameters.setLinearSolverType("MULTIFRONTAL_CHOLESKY")
+        parameters.setLinearSolverType("MULTIFRONTAL_QR" if self.by_qr else "MULTIFRONTAL_CHOLESKY")
         parameters.setOrdering(self.ordering)
 
+    def turns_to_qr(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, damping: float) -> bool:
+        """Whether it turns from Cholesky to QR, since Cholesky fails at the values with this damping."""
+        if self.by_qr:
+            return False
+        linear, zero = graph.linearize(values), values.zeroVectors()
+        for key in values.keys():  # noqa: SIM118  gtsam.Values is not a dictionary
+            n = len(zero.at(key))
+            unit = gtsam.noiseModel.Unit.Create(n)
+            linear.push_back(gtsam.JacobianFactor(key, np.sqrt(damping) * np.eye(n), np.zeros(n), unit))
+        try:
+            linear.optimize(self.ordering)
+        except RuntimeError as error:
+            if _INDETERMINATE not in str(error):
+                raise
+            self.by_qr = True
+        return self.by_qr
 
-class Elimination:
+
+class Elimination(InOrder):
     """Factorisation and order of elimination for graphs of one structure.
 
-    GTSAM's Cholesky fails on a variable of which one direction is known 4096 times better than another: a far
-    landmark with its range, or a camera pose under a tight tie once its angles are eliminated. So all
-    variables except cameras and landmarks are eliminated last. QR is more robust, but three times slower.
+    GTSAM's Cholesky would fail on a far landmark with its range, or on a camera pose under a tight tie once
+    its angles are eliminated. So all variables except cameras and landmarks are eliminated last.
     """
 
     def __init__(
@@ -267,11 +301,6 @@ class Elimination:
         last = [key for key in values.keys() if kind_of(key) not in first]  # noqa: SIM118  gtsam.Values
         self.ordering = gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(graph, last, False)
         self.by_qr = by_qr
-
-    def set_up(self, parameters: gtsam.NonlinearOptimizerParams) -> None:
-        """Set the parameters of an optimiser to use it."""
-        parameters.setLinearSolverType("MULTIFRONTAL_QR" if self.by_qr else "MULTIFRONTAL_CHOLESKY")
-        parameters.setOrdering(self.ordering)
 
     def step(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.VectorValues:
         """The Gauss-Newton step of the graph at the values; by QR once Cholesky has failed.

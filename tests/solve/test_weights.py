@@ -22,6 +22,7 @@ from pancam_graph.rigs import Eye, Rig, mer_navcam
 from pancam_graph.simulate import Simulation
 from pancam_graph.solve import prepare
 from pancam_graph.solve._screen import ScreeningRounds
+from support.truth import errors_in_sigmas
 
 SMALL = SimulationOptions(stops=2, pans=3, sweep_rad=1.5, points_per_image=15, noise_stretch=5.0)
 NEAR_M = 20.0
@@ -348,3 +349,15 @@ def test_the_spread_is_as_the_covariance_says_and_larger_where_correlation_is_ig
     spread = {name: float(np.sqrt(np.mean(np.square(e)))) for name, e in error.items()}
     assert spread["variances"] > 1.3 * spread["covariance"]
     assert spread["sigma"] > 1.6 * spread["covariance"]
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_ellipses_10000_to_1_take_no_more_steps_than_round_ones(seed: int) -> None:
+    """GTSAM's Cholesky calls such a system indeterminate; damped until it does not, the solve crawled."""
+    simulation = simulate(mer_navcam(), replace(SMALL, noise_stretch=1e4), seed=seed)
+    solution = solve(simulation.traverse, SolveOptions(loss="none"))
+    angles, stops = errors_in_sigmas(simulation, solution)
+    assert solution.converged
+    assert solution.iterations <= 6
+    assert np.abs(angles).max() < 5
+    assert stops.max() < 2.5
