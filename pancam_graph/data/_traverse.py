@@ -9,7 +9,7 @@ from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import gtsam
 import numpy as np
@@ -23,7 +23,7 @@ from pancam_graph.data._noise import PixelNoise, mean_sigma_px
 from pancam_graph.data._sharing import Sharing
 from pancam_graph.rigs import Rig
 
-__all__ = ["Frame", "Image", "Observations", "Stop", "Traverse"]
+__all__ = ["DrivePart", "Frame", "Image", "Observations", "Stop", "Traverse"]
 
 _ASYMMETRY = 1e-9
 """Largest difference of a covariance's two mixed entries, as a share of its larger variance."""
@@ -164,10 +164,13 @@ class Traverse:
     matching: Matching | None = None
     """Statistics of the search for observations in images; None for observations from elsewhere."""
 
+    _of_which_one: ClassVar[tuple[str, ...]] = ("stops", "frames", "images")
+    """Kinds of entries of which there must be one at least."""
+
     def __post_init__(self) -> None:
         """Check ids, references and ranges."""
         for kind, entries in (("stops", self.stops), ("frames", self.frames), ("images", self.images)):
-            if not entries:
+            if not entries and kind in self._of_which_one:
                 raise InputError(f"{kind}: expected at least one entry, found none")
             _require_unique(kind, [e.id for e in entries])
         stop_ids, frame_ids = {s.id for s in self.stops}, {f.id for f in self.frames}
@@ -229,7 +232,7 @@ class Traverse:
     @cached_property
     def pan_tilt_rad(self) -> FloatArray:
         """(frames, 2) pan and tilt as telemetry gives them."""
-        return np.array([[f.pan_rad, f.tilt_rad] for f in self.frames])
+        return np.array([[f.pan_rad, f.tilt_rad] for f in self.frames]).reshape(-1, 2)
 
     def camera_poses(
         self,
@@ -258,6 +261,13 @@ class Traverse:
         other = copy(self)
         object.__setattr__(other, "warnings", (*self.warnings, *warnings))
         return other
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DrivePart(Traverse):
+    """Some stops of a drive, where nothing may have been pointed or photographed."""
+
+    _of_which_one: ClassVar[tuple[str, ...]] = ("stops",)
 
 
 def _require_unique(kind: str, ids: Sequence[str]) -> None:

@@ -12,3 +12,5 @@ from pancam_graph.elimination._panels import Root as Root
 from pancam_graph.elimination._panels import pattern as pattern
 from pancam_graph.elimination._system import LandmarkSystem as LandmarkSystem
 from pancam_graph.elimination._system import Room as Room
+from pancam_graph.elimination._with_rows import Rows as Rows
+from pancam_graph.elimination._with_rows import with_rows as with_rows

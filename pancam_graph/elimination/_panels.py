@@ -233,6 +233,11 @@ class Root:
     rows: tuple[FloatArray, ...]
     """For each group (rank, columns of its panel + 1): R, and e as the last column."""
 
+    @property
+    def leaves_free(self) -> bool:
+        """Whether a direction of some group is undetermined: fewer rows than columns."""
+        return any(len(rows) < n for rows, n in zip(self.rows, self.structure.dim, strict=True))
+
     def gain(self) -> float:
         """Decrease of the linearised cost by the step that solves the system: |e|^2 / 2."""
         return 0.5 * sum(float(rows[:, -1] @ rows[:, -1]) for rows in self.rows)

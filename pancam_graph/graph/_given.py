@@ -46,6 +46,18 @@ class Seat:
             moves[held, held] = 0.0
         return Seat(read=lambda values: read_variable(values, key), parts=((key, moves),))
 
+    def on(self, name: Mapping[int, int]) -> "Seat":
+        """The same on variables that another template has under other keys; `name` is by the key here."""
+        keys = [key for key, _ in self.parts]
+
+        def read(values: gtsam.Values) -> Any:
+            here = gtsam.Values()
+            for key in keys:
+                here.insert(key, read_variable(values, name[key]))
+            return self.read(here)
+
+        return Seat(read=read, parts=tuple((name[key], moves) for key, moves in self.parts))
+
     @staticmethod
     def fixed(value: Any) -> "Seat":
         """A variable that nothing moves."""

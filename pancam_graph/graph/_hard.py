@@ -24,7 +24,7 @@ from pancam_graph.elimination import Covariance, Linkage, Posture
 from pancam_graph.factors import Key
 from pancam_graph.graph._factors import FactorList
 from pancam_graph.graph._given import Seat
-from pancam_graph.graph._keys import Kind, index_of, key_of
+from pancam_graph.graph._keys import Kind, index_of, key_of, kind_of
 from pancam_graph.graph._template import FactorTemplate, diagonal_noise
 from pancam_graph.landmarks import CameraViews
 
@@ -42,7 +42,7 @@ class HardTemplate(FactorTemplate):
     def __init__(self, traverse: Traverse, sharing: Sharing | None = None) -> None:
         """Of `sharing`, calibration, mounts and pan_T_tilt count; circles follow from the mounts."""
         super().__init__(traverse, "mast", replace(sharing or Sharing(), radius=FIXED))
-        sigmas = np.array([[f.sigma_pan_rad, f.sigma_tilt_rad] for f in traverse.frames])
+        sigmas = np.array([[f.sigma_pan_rad, f.sigma_tilt_rad] for f in traverse.frames]).reshape(-1, 2)
         self._sigmas = sigmas
         free = sigmas.any(axis=1)
         self._frames = tuple(
@@ -255,6 +255,21 @@ class HardTemplate(FactorTemplate):
             if len(frames):
                 held[self.angles_key(stop)] = np.flatnonzero(self._sigmas[frames].ravel() == 0)
         return held
+
+    @cached_property
+    def owners(self) -> dict[tuple[str, ...], int]:
+        """Keys of the variables by what they are and by the ids of their owners.
+
+        Templates of the same drive have the same owners, in whatever order stops, frames and images come.
+        """
+        t = self.traverse
+        out: dict[tuple[str, ...], int] = {}
+        for key in self.linkage.key:
+            if kind_of(key) in {Kind.MAST, Kind.ANGLES}:
+                out[kind_of(key).value, t.stops[index_of(key)].id] = key
+        for v in self.rig_variables.variables:
+            out[v.quantity, self.rig_variables.owner(v)] = v.key
+        return out
 
     @property
     def has_cameras(self) -> bool:

@@ -110,7 +110,7 @@ class RigVariables:
         out = []
         for i, (number, first) in enumerate(zip(numbers, firsts, strict=True)):
             of_owner = place == i
-            focal = 1.0 if axis else float(np.mean(self._K[of_owner, 0, 0]))
+            focal = 1.0 if axis else self._focal_px(None if scope == "all" else int(t.image_eye[first]))
             out.append(
                 RigVariable(
                     quantity=quantity,
@@ -129,6 +129,14 @@ class RigVariables:
                 )
             )
         return tuple(out)
+
+    def _focal_px(self, eye: int | None) -> float:
+        """Focal length that scales default priors: the eye's, or the mean of all eyes of the rig.
+
+        It does not depend on which images a traverse has, so that a drive has the same priors at every stop.
+        """
+        of_eyes = [p.calibration_matrix[0, 0] for p in self.traverse.rig.pinholes]
+        return float(np.mean(of_eyes) if eye is None else of_eyes[eye])
 
     def _basis_of(self, quantity: Quantity, free: tuple[str, ...], n_sites: int) -> FloatArray:
         """(sites, entries, columns) takes free entries to all entries of the correction."""

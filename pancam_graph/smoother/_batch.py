@@ -5,7 +5,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from pancam_graph.data import Traverse
+from pancam_graph.data import DrivePart, Traverse
 from pancam_graph.graph import Factors, HardTemplate
 from pancam_graph.landmarks import Landmarks
 from pancam_graph.smoother._map import DriveMap
@@ -17,9 +17,9 @@ __all__ = ["solved_anew", "whole_problem", "whole_template", "whole_traverse"]
 def whole_traverse(drive: DriveMap) -> Traverse:
     """All stops with all observations, in the order in which they were added."""
     parts = [s.traverse for s in drive.stations]
-    return Traverse(
+    return DrivePart(
         name="",
-        rig=parts[0].rig,
+        rig=drive.rig,
         stops=tuple(stop for t in parts for stop in t.stops),
         frames=tuple(frame for t in parts for frame in t.frames),
         images=tuple(image for t in parts for image in t.images),
@@ -29,7 +29,7 @@ def whole_traverse(drive: DriveMap) -> Traverse:
 
 def whole_template(drive: DriveMap) -> HardTemplate:
     """The rig of the whole drive as a template; its variables have the drive's keys."""
-    return HardTemplate(whole_traverse(drive), drive.stations[0].template.rig_variables.sharing)
+    return HardTemplate(whole_traverse(drive), drive.sharing)
 
 
 def whole_problem(drive: DriveMap, values: gtsam.Values) -> Problem:

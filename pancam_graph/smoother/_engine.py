@@ -14,7 +14,7 @@ from pancam_graph.smoother._frame import orthonormal
 from pancam_graph.smoother._map import Change, DriveMap
 from pancam_graph.smoother._smoother_options import SmootherOptions
 from pancam_graph.smoother._station import Postures, Station
-from pancam_graph.smoother._tree import Tree
+from pancam_graph.smoother._tree import Tree, UnevenError
 
 __all__ = ["Engine", "Rounds"]
 
@@ -50,7 +50,7 @@ class Engine:
 
     def __init__(self, drive: DriveMap, options: SmootherOptions) -> None:
         self._drive, self._options = drive, options
-        self._tree = Tree()
+        self._tree, self._by_qr = Tree(), False
         self._priors = gtsam.NonlinearFactorGraph()
         """All factors except landmark blocks, for the cost."""
         self._bent: list[int] = []
@@ -122,7 +122,13 @@ class Engine:
         moving: set[int] = set()
         while True:
             affected = self._linearise(touched, new, theta, moving, removed)
-            slots = self._update(factors, theta, removed, moving, affected)
+            values = gtsam.Values(self._tree.estimate)
+            values.insert(new)
+            try:
+                slots = self._update(factors, theta, removed, moving, affected)
+            except UnevenError:
+                self._by_qr = True
+                slots = self._anew(values, factors if bends and rounds == 0 else ())
             if bends and rounds == 0:
                 self._bent = slots
             rounds, relinearised, handled = rounds + 1, relinearised + len(moving), handled + len(affected)
@@ -205,8 +211,19 @@ class Engine:
         return moving
 
     def restart(self, values: gtsam.Values) -> None:
-        """Build a new tree of all factors, linearised at `values`, for which landmarks are placed already."""
-        self._tree, self._bent, theta = Tree(), [], Postures(values)
+        """Build a new tree of all factors, linearised at `values`, for which landmarks are placed already.
+
+        By QR where Cholesky fails, now and in updates to come.
+        """
+        try:
+            self._anew(values)
+        except UnevenError:
+            self._by_qr = True
+            self._anew(values)
+
+    def _anew(self, values: gtsam.Values, bending: Sequence[gtsam.NonlinearFactor] = ()) -> list[int]:
+        """Build a new tree at `values`; slots of the temporary factors `bending`."""
+        self._tree, self._bent, theta = Tree(by_qr=self._by_qr), [], Postures(values)
         blocks = list(self._drive.blocks.values())
         for block in blocks:
             theta.of_all(block.patch.stations)
@@ -215,8 +232,9 @@ class Engine:
         self._priors = gtsam.NonlinearFactorGraph()
         for factor in factors:
             self._priors.push_back(factor)
-        self._update(factors, values, [], set(), set(self._drive.blocks))
+        slots = self._update([*bending, *factors], values, [], set(), set(self._drive.blocks))
         self._evaluate(set(self._drive.blocks))
+        return slots[: len(bending)]
 
     def _update(
         self,

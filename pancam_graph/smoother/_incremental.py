@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -23,6 +23,7 @@ from pancam_graph.data import (
 )
 from pancam_graph.graph import HardTemplate, UserFactors
 from pancam_graph.smoother._ledger import Fate
+from pancam_graph.smoother._order import order_of_stops
 from pancam_graph.smoother._smoother import TraverseSmoother
 from pancam_graph.smoother._smoother_options import SmootherOptions, Update
 from pancam_graph.solve import (
@@ -64,7 +65,9 @@ def solve_incrementally(
     on_stop: Callable[[Update], None] | None = None,
     factors: UserFactors | None = None,
 ) -> Solution:
-    """Solve a traverse by adding its stops in order to a smoother; `on_stop` is called after each.
+    """Solve a traverse by adding its stops one by one to a smoother; `on_stop` is called after each.
+
+    Their order is that of the file as long as each shares tracks with the one before (`order_of_stops`).
 
     `factors` as for `solve`; they are added after the last stop.
 
@@ -89,8 +92,10 @@ def solve_incrementally(
         ),
     )
     updates = []
-    for stop, frames, images, observations in stops_of(traverse):
-        updates.append(smoother.add_stop(stop, frames, images, observations))
+    order, parts = order_of_stops(traverse), list(stops_of(traverse))
+    for number, previous in order:
+        stop, after = parts[number][0], None if previous is None else traverse.stops[previous].id
+        updates.append(smoother.add_stop(*parts[number], after=after))
         _LOG.info("%s: cost %.6g, %.3f s", stop.id, updates[-1].cost, updates[-1].seconds)
         if on_stop is not None:
             on_stop(updates[-1])
@@ -98,7 +103,7 @@ def solve_incrementally(
         sharing = (options.sharing or traverse.sharing or Sharing()).for_model("mast")
         smoother.add_factors_of(HardTemplate(traverse, sharing), factors)
     solved = time.perf_counter()
-    solution = _as_solution(traverse, options, smoother, updates, factors)
+    solution = _as_solution(traverse, options, smoother, [i for i, _ in order], updates, factors)
     done = time.perf_counter()
     return replace(solution, seconds=Seconds(initialise=0.0, solve=solved - begin, report=done - solved))
 
@@ -107,23 +112,28 @@ def _as_solution(
     traverse: Traverse,
     options: SolveOptions,
     smoother: TraverseSmoother,
+    order: Sequence[int],
     updates: list[Update],
     factors: UserFactors | None,
 ) -> Solution:
     """The smoother's estimate as a solution of the traverse.
 
-    The outliers are judged once more, as `solve` does, now that all stops are known: what is kept should not
-    depend on the order in which they came. Rejected loop closures stay out.
+    `order` has the rows of its stops as they were added. The outliers are judged once more, as `solve` does,
+    now that all stops are known: what is kept should not depend on the order in which they came. Rejected
+    loop closures stay out.
     """
     assert traverse.observations is not None
     used = np.zeros(len(traverse.observations), dtype=bool)
     unbelieved = used.copy()
-    as_added = _rows_as_added(traverse)
+    as_added = _rows_as_added(traverse, order)
     used[as_added] = smoother.used
     unbelieved[as_added] = smoother.state().fate == int(Fate.CLOSURE)
     costs = tuple(u.cost for u in updates)
     with blas_on_one_thread():
-        before = screened_elsewhere(prepare(traverse, options, factors=factors), smoother.values(), used)
+        prepared = prepare(traverse, options, factors=factors)
+        template = prepared.problem.template
+        assert isinstance(template, HardTemplate)  # the model and tie that the smoother has
+        before = screened_elsewhere(prepared, smoother.values_on(template), used)
         screened = screened_again(before, unbelieved)
         fitted = fitted_elsewhere(
             screened,
@@ -132,19 +142,21 @@ def _as_solution(
             is_optimum=screened is before,
         )
         solution = solution_of(judge(fitted))
+    by_stop = [updates[int(i)] for i in np.argsort(order)]
     warnings = (w for u in updates for w in u.warnings)
     return replace(
         solution,
         warnings=tuple(dict.fromkeys((*solution.warnings, *warnings))),
         incremental=Incremental(
-            seconds_per_stop=tuple(u.seconds for u in updates),
-            cost_per_stop=costs,
-            relinearised_per_stop=tuple(u.relinearised for u in updates),
+            seconds_per_stop=tuple(u.seconds for u in by_stop),
+            cost_per_stop=tuple(u.cost for u in by_stop),
+            relinearised_per_stop=tuple(u.relinearised for u in by_stop),
         ),
     )
 
 
-def _rows_as_added(traverse: Traverse) -> IntArray:
-    """Rows of the traverse's observations in the order in which its stops bring them."""
+def _rows_as_added(traverse: Traverse, order: Sequence[int]) -> IntArray:
+    """Rows of the traverse's observations as its stops, in their `order`, bring them."""
     assert traverse.observations is not None
-    return np.argsort(traverse.image_stop[traverse.observations.image], kind="stable")
+    place = np.argsort(order)
+    return np.argsort(place[traverse.image_stop[traverse.observations.image]], kind="stable")

@@ -62,7 +62,7 @@ def judged_together(
     ledger = drive.ledger
     rows = np.setdiff1d(np.flatnonzero(np.isin(ledger.fate, [int(f) for f in _JUDGED])), but)
     rows = rows[np.isin(drive.station_of(rows), [s.number for s in members])]
-    traverse = _alone(members, values, options)
+    traverse = _alone(drive, members, values, options)
     image = np.concatenate([s.first_image + np.arange(len(s.traverse.images)) for s in members])
     observations = ledger.observations.select(rows)
     place = np.zeros(int(image.max(initial=0)) + 1, dtype=np.int64)
@@ -81,14 +81,16 @@ def judged_together(
     return _judgement(rows, members, screened)
 
 
-def _alone(members: list[Station], values: gtsam.Values, options: SmootherOptions) -> Traverse:
+def _alone(
+    drive: DriveMap, members: list[Station], values: gtsam.Values, options: SmootherOptions
+) -> Traverse:
     """The stations as a traverse; with odometry their priors are where `values` have them."""
     stops = [s.traverse.stops[0] for s in members]
     if options.telemetry == "odometry":
         stops = [replace(o, world_T_mast=s.world_T_mast(values)) for o, s in zip(stops, members, strict=True)]
     return Traverse(
         name="",
-        rig=members[0].traverse.rig,
+        rig=drive.rig,
         stops=tuple(stops),
         frames=tuple(frame for s in members for frame in s.traverse.frames),
         images=tuple(image for s in members for image in s.traverse.images),

@@ -8,6 +8,7 @@ import numpy as np
 
 from pancam_graph.base.geometry import BoolArray, IntArray
 from pancam_graph.base.threads import each
+from pancam_graph.data import Sharing
 from pancam_graph.elimination import Room
 from pancam_graph.graph import (
     FactorList,
@@ -19,6 +20,7 @@ from pancam_graph.graph import (
     seated,
 )
 from pancam_graph.landmarks import Landmarks, residuals
+from pancam_graph.rigs import Rig
 from pancam_graph.smoother._block import LandmarkBlock
 from pancam_graph.smoother._ledger import Fate, Ledger
 from pancam_graph.smoother._placing import Placed, Seen, believed, combined, gathered, placed_anew
@@ -55,7 +57,8 @@ class _Rebuilt:
 class DriveMap:
     """Stations, observations and blocks. A block is named by the number of the station that saw it first."""
 
-    def __init__(self, outlier_sigma: float | None) -> None:
+    def __init__(self, rig: Rig, sharing: Sharing, outlier_sigma: float | None) -> None:
+        self.rig, self.sharing = rig, sharing
         self._outlier_sigma, self._room = outlier_sigma, Room()
         self.stations: list[Station] = []
         self.ledger = Ledger()
@@ -66,27 +69,42 @@ class DriveMap:
         """The same factors on the drive's variables."""
         self.image_station = np.zeros(0, dtype=np.int64)
         """(images,) number of each image's station, over the whole drive"""
+        self._first_with: dict[int, int] = {}
+        """Number of the first station, by the key of each variable of the rig that stops share."""
         self._track, self._home = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
 
     def add(self, station: Station) -> None:
         """Add a station, whose number must be the number of stations so far."""
         self.stations.append(station)
+        for key in station.shared_keys:
+            self._first_with.setdefault(key, station.number)
         numbers = np.full(len(station.traverse.images), station.number)
         self.image_station = np.concatenate([self.image_station, numbers])
 
     def factors(self, *, firm: bool) -> list[gtsam.NonlinearFactor]:
         """All factors but those of landmarks and of the caller; see `Station.factors`."""
-        shared = self.stations[0].shared_priors() if self.stations else []
+        shared = (factor for s in self.stations for factor in self.shared_priors(s))
         return [*shared, *(factor for s in self.stations for factor in s.factors(firm=firm))]
 
-    def take_factors(self, template: HardTemplate, factors: UserFactors, values: gtsam.Values) -> FactorList:
+    def shared_priors(self, station: Station) -> FactorList:
+        """Priors of the rig's shared variables that this station is the first of the drive to have."""
+        return station.shared_priors(
+            {k for k in station.shared_keys if self._first_with[k] == station.number}
+        )
+
+    def take_factors(
+        self, template: HardTemplate, own: HardTemplate, factors: UserFactors, values: gtsam.Values
+    ) -> FactorList:
         """Add the caller's factors, on a template of the whole drive; return them on the drive's variables.
+
+        That template may have stops, frames and images in another order than `own`, which has them as added.
 
         `values` are those of the drive. Raises InputError, and changes nothing, for a factor that cannot be
         evaluated there.
         """
         given = given_factors(factors, template.keys)
-        seats = template.seats(given)
+        name = {key: own.owners[owner] for owner, key in template.owners.items()}
+        seats = {key: seat.on(name) for key, seat in template.seats(given).items()}
         check_given(given, seats, values)
         new: FactorList = [factor for one in given if (factor := seated(one, seats)) is not None]
         self.given += given

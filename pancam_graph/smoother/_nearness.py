@@ -41,6 +41,8 @@ def by_nearness(drive: DriveMap, rows: IntArray, around: dict[int, set[int]]) ->
 
 def sample(drive: DriveMap, station: Station, rows: IntArray) -> Seen | None:
     """A sample of tracks that localises a station: with a landmark, or observed from it twice."""
+    if not len(rows):
+        return None
     track = drive.ledger.track[rows]
     names, name_of_row, count = np.unique(track, return_inverse=True, return_counts=True)
     names = names[(count >= 2) | (drive.home(names) >= 0)]

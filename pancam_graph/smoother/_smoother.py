@@ -10,8 +10,8 @@ from pancam_graph.base.errors import InputError, SolveError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.base.threads import blas_on_one_thread
 from pancam_graph.cameras import carry_to_pinhole
-from pancam_graph.data import Frame, Image, Observations, Sharing, Stop, Traverse
-from pancam_graph.graph import GraphKeys, HardTemplate, UserFactors
+from pancam_graph.data import DrivePart, Frame, Image, Observations, Sharing, Stop, Traverse
+from pancam_graph.graph import GraphKeys, HardTemplate, UserFactors, read_variable
 from pancam_graph.io import prefixed
 from pancam_graph.landmarks import Landmarks
 from pancam_graph.rigs import Rig
@@ -46,7 +46,7 @@ class TraverseSmoother:
         """Begin an empty drive of a rover with this rig."""
         self.rig, self.options = rig, options or SmootherOptions()
         self._sharing = (self.options.sharing or Sharing()).for_model("mast")
-        self._drive = DriveMap(self.options.outlier_sigma)
+        self._drive = DriveMap(rig, self._sharing, self.options.outlier_sigma)
         self._engine = Engine(self._drive, self.options)
         self._stop: dict[str, Station] = {}
         self._image_row: dict[str, int] = {}
@@ -67,6 +67,13 @@ class TraverseSmoother:
     def values(self) -> gtsam.Values:
         """Estimates of all variables, under the keys of a batch template of the drive."""
         return gtsam.Values(self._engine.estimate)
+
+    def values_on(self, template: HardTemplate) -> gtsam.Values:
+        """Estimates of all variables under the keys of a template of the drive in another order."""
+        own, out = self._template.owners, gtsam.Values()
+        for owner, key in template.owners.items():
+            out.insert(key, read_variable(self._engine.estimate, own[owner]))
+        return out
 
     @property
     def traverse(self) -> Traverse:
@@ -124,13 +131,13 @@ class TraverseSmoother:
         is the stop from which odometry leads here; default: the one added last. Raises InputError, and
         changes nothing, for an id that was added before and for a number out of its range.
         """
-        entries = Traverse(
+        entries = DrivePart(
             name="",
             rig=self.rig,
             stops=(stop,),
             frames=tuple(frames),
             images=tuple(images),
-            observations=observations,
+            observations=observations if observations is not None and len(observations) else None,
         )
         self._require_new(entries)
         previous = self._station(after) if after is not None else next(reversed(self._stop.values()), None)
@@ -211,8 +218,7 @@ class TraverseSmoother:
         change = Change()
         known = run.take_in(near, known, change, far, around, start)
         new = copied(known, new.keys())
-        first = drive.stations[0].shared_priors() if station.number == 0 else []
-        run.advance(change, [*first, *station.factors(firm=False)], new)
+        run.advance(change, [*drive.shared_priors(station), *station.factors(firm=False)], new)
         run.close_loops(far)
 
     def add_observations(self, observations: Observations) -> Update:
@@ -263,10 +269,10 @@ class TraverseSmoother:
         return self.add_factors_of(self._template, factors)
 
     def add_factors_of(self, template: HardTemplate, factors: UserFactors) -> Update:
-        """The same on the keys of a template of the whole drive, whose frames may be in another order."""
+        """The same on the keys of a template of the whole drive, which may be in another order."""
         run = self._run()
         with blas_on_one_thread():
-            new = self._drive.take_factors(template, factors, self._engine.estimate)
+            new = self._drive.take_factors(template, self._template, factors, self._engine.estimate)
             if new:
                 run.advance(Change(), new)
             return run.finished()
@@ -332,7 +338,7 @@ class TraverseSmoother:
             for number, stop in enumerate(t.stops):
                 frames = tuple(t.frames[i] for i in np.flatnonzero(t.frame_stop == number))
                 images = tuple(t.images[i] for i in np.flatnonzero(t.image_stop == number))
-                entries = Traverse(name="", rig=t.rig, stops=(stop,), frames=frames, images=images)
+                entries = DrivePart(name="", rig=t.rig, stops=(stop,), frames=frames, images=images)
                 station = Station(number, entries, smoother._sharing, len(smoother._image_row))
                 if (after := int(state.after[number])) >= 0:
                     smoother._follow(station, drive.stations[after])
@@ -342,7 +348,7 @@ class TraverseSmoother:
                 drive.ledger.take_over(state.fate)
             drive.restore(state.track, state.home, Landmarks(vector=state.vector, origin_m=state.origin_m))
             values = state.values()
-            drive.take_factors(smoother._template, factors, values)
+            drive.take_factors(smoother._template, smoother._template, factors, values)
             if len(drive.given) != state.n_given:
                 raise InputError(
                     f"factors: expected the {state.n_given} that were added before the smoother was kept, "

@@ -1,6 +1,6 @@
 """One stop as a factor template, and several stops joined into the linkage of a landmark system."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from functools import cached_property
 
 import gtsam
@@ -124,24 +124,26 @@ class Station:
     def other_priors(self, *, firm: bool) -> list[gtsam.NonlinearFactor]:
         """The priors of `factors` that are not on the mast."""
         t, out = self.traverse, list[gtsam.NonlinearFactor]()
-        sigmas = np.array([[f.sigma_pan_rad, f.sigma_tilt_rad] for f in t.frames])
+        sigmas = np.array([[f.sigma_pan_rad, f.sigma_tilt_rad] for f in t.frames]).reshape(-1, 2)
         free = sigmas.any(axis=1)
         if free.any():
             noise = _noise(sigmas[free].ravel(), firm=firm)
             out.append(gtsam.PriorFactorVector(self.angles, t.pan_tilt_rad[free].ravel(), noise))
         return out + self._rig_priors(0)
 
-    def shared_priors(self) -> list[gtsam.NonlinearFactor]:
-        """Priors of the entries of the rig that all stops share."""
-        return self._rig_priors(None)
+    def shared_priors(self, keys: Collection[int]) -> list[gtsam.NonlinearFactor]:
+        """Priors of those entries of the rig that stops share and whose keys are given."""
+        return self._rig_priors(None, keys)
 
-    def _rig_priors(self, owner: int | None) -> list[gtsam.NonlinearFactor]:
+    def _rig_priors(
+        self, owner: int | None, keys: Collection[int] | None = None
+    ) -> list[gtsam.NonlinearFactor]:
         return [
             gtsam.PriorFactorVector(
                 self.global_key[v.key], np.zeros(len(v.sigma)), gtsam.noiseModel.Diagonal.Sigmas(v.sigma)
             )
             for v in self.template.rig_variables.of_stop(owner)
-            if np.isfinite(v.sigma).any()
+            if np.isfinite(v.sigma).any() and (keys is None or self.global_key[v.key] in keys)
         ]
 
 

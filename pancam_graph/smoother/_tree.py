@@ -8,7 +8,7 @@ import numpy as np
 from pancam_graph.base.errors import SolveError
 from pancam_graph.base.geometry import FloatArray
 
-__all__ = ["Tree"]
+__all__ = ["Tree", "UnevenError"]
 
 _WILDFIRE = 1e-8
 """Changes of the solution below this are not propagated in the tree, radians and metres: far below any
@@ -19,11 +19,18 @@ _ANY = 1e-15
 """A relinearisation threshold that every variable with any change exceeds."""
 
 
+class UnevenError(SolveError):
+    """Cholesky fails on the system of a tree: a direction is undetermined, or the scales are too uneven."""
+
+
 class Tree:
     """The Bayes tree of all stops, its point of linearisation `theta` and its `estimate`."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, by_qr: bool = False) -> None:
+        """`by_qr`: factorised by QR, which is slower than Cholesky but bears uneven scales."""
+        self._by_qr = by_qr
         parameters = gtsam.ISAM2Params()
+        parameters.setFactorization("QR" if by_qr else "CHOLESKY")
         parameters.relinearizeSkip = 1
         parameters.findUnusedFactorSlots = True
         steps = gtsam.ISAM2GaussNewtonParams()
@@ -58,7 +65,8 @@ class Tree:
     ) -> list[int]:
         """Remove and add factors, and linearise the keys `moving` again; return the slots of new factors.
 
-        Raises SolveError where a direction is undetermined.
+        Raises SolveError where a direction is undetermined; of that UnevenError, unless by QR. The tree is of
+        no use then.
         """
         graph = gtsam.NonlinearFactorGraph()
         for factor in factors:
@@ -74,8 +82,8 @@ class Tree:
         try:
             result = self._isam.update(graph, values, parameters)
         except RuntimeError as error:
-            why = " ".join(str(error).split(".")[0].split())  # GTSAM's text has several lines
-            raise SolveError(f"nothing holds a direction of the drive: {why}") from error
+            kind = SolveError if self._by_qr else UnevenError
+            raise kind(f"nothing holds a direction of the drive: {_in_a_line(error)}") from error
         self.theta, self.estimate = self._isam.getLinearizationPoint(), self._isam.calculateEstimate()
         delta = self._isam.getDelta()
         self._delta = {key: delta.at(key) for key in self.theta.keys()}  # noqa: SIM118  gtsam.Values
@@ -87,3 +95,8 @@ class Tree:
             return np.asarray(self._isam.marginalCovariance(keys[0]))
         joint = self._isam.jointMarginalCovariance(list(keys))
         return np.block([[joint.at(a, b) for b in keys] for a in keys])
+
+
+def _in_a_line(error: RuntimeError) -> str:
+    """The first sentence of GTSAM's message."""
+    return " ".join(str(error).split(".")[0].split())

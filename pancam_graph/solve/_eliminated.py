@@ -167,7 +167,7 @@ class Ended:
         """
         if self.joint is None:
             return ReducedSystem.of(self.problem, (self.system, self.rows))
-        return ReducedSystem(system=self.system, rows=self.rows, root=self.joint)
+        return ReducedSystem(system=self.system, rows=self.rows, root=self.joint).firm(self.problem)
 
 
 def _gain_ahead(system: LandmarkSystem, root: Callable[[], Root]) -> float | None:

@@ -1,13 +1,13 @@
 """A problem with its landmarks eliminated: the square root of the system in the variables of cameras."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 
 from pancam_graph.base.geometry import IntArray
-from pancam_graph.elimination import LandmarkSystem, Linkage, Panels, Root
+from pancam_graph.elimination import LandmarkSystem, Linkage, Panels, Root, Rows, with_rows
 from pancam_graph.graph import Factors, FactorTemplate, graph_of
 from pancam_graph.solve._problem import Problem, system_of
 
@@ -40,7 +40,13 @@ class ReducedSystem:
         Raises SolveError where no observation takes part.
         """
         system, rows = arranged or system_of(problem)
-        return ReducedSystem(system=system, rows=rows, root=_panels_of(problem, system).root())
+        return ReducedSystem(system=system, rows=rows, root=_panels_of(problem, system).root()).firm(problem)
+
+    def firm(self, problem: Problem) -> "ReducedSystem":
+        """The same, or one by QR where a weak prior of the problem is lost in rounding errors of this one."""
+        if not self.root.leaves_free:
+            return self
+        return replace(self, root=_root_by_qr(problem, self.system))
 
 
 def panels_of(problem: Problem) -> Panels:
@@ -82,7 +88,46 @@ def loosened_root(problem: Problem, system: LandmarkSystem, factor: float) -> Ro
     add((*factors.ties, *factors.seated), 1.0)
     add(factors.priors, factor**-2)
     panels.hold(held_columns(template))
-    return panels.root()
+    root = panels.root()
+    return _root_by_qr(problem, system, factor) if root.leaves_free else root
+
+
+def _root_by_qr(problem: Problem, system: LandmarkSystem, factor: float = 1.0) -> Root:
+    """The square root of `loosened_root`, by QR of the rows of landmarks and of all other factors."""
+    template, link, factors, values = (
+        problem.template,
+        problem.template.linkage,
+        problem.factors,
+        problem.values,
+    )
+    held = held_columns(template)
+    panels = system.linearise(template.posture(values))
+    panels.hold(held)
+    more = _rows(link, graph_of((*factors.ties, *factors.seated)).linearize(values), held, 1.0)
+    more += _rows(link, graph_of(factors.priors).linearize(values), held, 1 / factor)
+    return with_rows(panels.root(), more)
+
+
+def _rows(
+    linkage: Linkage, linear: gtsam.GaussianFactorGraph, held: dict[int, IntArray], weight: float
+) -> list[Rows]:
+    """Rows of factors as GTSAM linearises them, `weight` times; those of held columns are 0."""
+    out: list[Rows] = []
+    for i in range(linear.size()):
+        factor = linear.at(i)
+        if factor is None:
+            continue
+        keys = factor.keys()
+        groups = [int(linkage.group[linkage.row[key]]) for key in keys]
+        columns = [linkage.columns_of(key) for key in keys]
+        rows = weight * factor.augmentedJacobian()
+        rows[:, -1] *= -1  # GTSAM has the right-hand side there, minus the residual
+        is_held = [
+            np.isin(np.arange(c.start, c.stop), held.get(g, [])) for g, c in zip(groups, columns, strict=True)
+        ]
+        rows[:, np.flatnonzero(np.concatenate(is_held))] = 0.0
+        out.append((groups, columns, rows))
+    return out
 
 
 def held_columns(template: FactorTemplate) -> dict[int, IntArray]:

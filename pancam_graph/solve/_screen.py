@@ -83,7 +83,10 @@ def screened_again(screened: Screened, excluded: BoolArray) -> Screened:
         return screened
     rounds = ScreeningRounds(replace(prepared, problem=screened.problem, is_near=True), excluded)
     changed = rounds.share_changed()
-    return rounds.to_the_end() if prepared.rescales_noise or changed > _ABOUT else screened
+    if not prepared.rescales_noise and changed <= _ABOUT:
+        return screened
+    # The start stays the one that was prepared, with which the end is compared.
+    return replace(rounds.to_the_end(), prepared=prepared)
 
 
 class ScreeningRounds:

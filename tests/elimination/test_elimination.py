@@ -19,6 +19,7 @@ from pancam_graph.elimination import (
     Root,
     pattern,
     relative_pose_covariance,
+    with_rows,
 )
 from pancam_graph.landmarks import CameraViews, LossName, loss_of
 from support.elimination_reference import assert_systems_agree, dense_of, true_cost, whole
@@ -135,6 +136,34 @@ def test_square_root_where_directions_are_free(name: str) -> None:
         R, e = stacked(system.panels.root())
         assert R.T @ R == pytest.approx(system.S, abs=1e-11 * (1 + np.abs(system.S).max()))
         assert R.T @ e == pytest.approx(system.s, abs=1e-9)
+
+
+@pytest.mark.parametrize("name", ["one", "chain", "chain of threes", "loop", "star", "all"])
+def test_rows_that_are_stacked_keep_what_a_sum_of_squares_would_lose(name: str) -> None:
+    """Differences alone enter, and a prior 1e-8 times as sure on the first column of every group."""
+    dims, cliques = GRAPHS[name]
+    dim: IntArray = np.array(dims, dtype=np.int64)
+    begin = np.concatenate([[0], np.cumsum(dim)])
+    rng = np.random.default_rng(3)
+    rows = [rng.normal(size=(60, int(begin[-1]))) for _ in cliques]
+    for clique, J in zip(cliques, rows, strict=True):
+        outside = np.ones(int(begin[-1]), dtype=bool)
+        for g in clique:
+            outside[begin[g] : begin[g + 1]] = False
+        J[:, outside] = 0.0
+        mean = J.sum(axis=1, keepdims=True) / (~outside).sum()
+        J[:] = np.where(outside, 0.0, J - mean)  # blind to a common shift
+    panels = Panels(pattern(dim, cliques))
+    for clique, J in zip(cliques, rows, strict=True):
+        groups = panels.sorted(clique)
+        columns = np.concatenate([np.arange(begin[g], begin[g + 1]) for g in groups])
+        panels.add(groups, J[:, columns].T @ J[:, columns], np.zeros(len(columns)))
+    weak = 1e-8
+    more = [([g], [slice(0, 1)], np.array([[weak, 0.0]])) for g in range(len(dim))]
+    covariance = with_rows(panels.root(), more).covariance()
+    # All columns shift alike by 1 / (weak sqrt(groups)), beside what the differences leave open.
+    for g in range(len(dim)):
+        np.testing.assert_allclose(covariance.block(g, g), 1 / (weak**2 * len(dim)), rtol=1e-4)
 
 
 @pytest.mark.parametrize("name", ["chain", "all"])
