@@ -11,11 +11,12 @@ import gtsam
 import numpy as np
 
 from pancam_graph.base.geometry import (
+    BoolArray,
     FloatArray,
     IntArray,
     pan_tilt_from_rotation,
+    pan_tilt_rotation,
     pose_arrays,
-    rz,
     wrap_angle,
 )
 from pancam_graph.data import Sharing, State, Traverse
@@ -29,6 +30,12 @@ from pancam_graph.graph._template import FactorTemplate, diagonal_noise
 from pancam_graph.landmarks import CameraViews
 
 __all__ = ["SoftTemplate"]
+
+_STEEP = 0.5
+"""Horizontal part of the head's x axis below which pan and tilt are those of the whole rotation: that of 60
+degrees of tilt."""
+_NEAREST_STEPS = 3
+"""Gauss-Newton steps to the nearest pan and tilt."""
 
 
 class SoftTemplate(FactorTemplate):
@@ -258,29 +265,48 @@ class SoftTemplate(FactorTemplate):
 
         images = np.flatnonzero((t.image_frame == frame) & (self.model != "mast"))
         if isinstance(slot := self.pan_tilt(frame), Key):
-            nominal = self._d_nominal(state.pan_tilt_rad[frame]) if len(images) else np.zeros((2, 2))
+            is_seen = bool(len(images))
+            nominal = self._d_nominal(frame, state.pan_tilt_rad[frame]) if is_seen else np.zeros((2, 2))
             add(slot.key, np.eye(2) - nominal)
         mast_R = state.world_T_mast[stop].rotation().matrix()
         by_mast = np.zeros((2, 3))
         for i in images:
             camera_R = mast_R.T @ state.world_R_camera[i]
             head_R = camera_R @ t.rig.eyes[int(t.image_eye[i])].head_T_camera.rotation().matrix().T
-            d_angles = _d_pan_tilt(head_R) / len(images)
+            d_angles = self._d_angles(frame, state.pan_tilt_rad[frame], head_R) / len(images)
             add(self.camera_key(int(i)), d_angles @ camera_R @ self.camera_turn(int(i), state))
             by_mast -= d_angles
         if len(images) and isinstance(slot := self.mast(stop), Key):
             add(slot.key, by_mast)
         return np.concatenate(columns), np.hstack(rows)
 
-    def _d_nominal(self, pan_tilt_rad: FloatArray) -> FloatArray:
-        """Jacobian (2, 2) of the nominal pan and tilt of `image_pointing_offset` by the angles.
+    @cached_property
+    def _is_steep(self) -> BoolArray:
+        """(frames,) whether the head looks so far up or down that its x axis tells little of its pan."""
+        return np.asarray(np.hypot(*self._mast_R_head(self.traverse.pan_tilt_rad)[:, :2, 0].T) < _STEEP)
+
+    def _mast_R_head(self, pan_tilt_rad: FloatArray) -> FloatArray:
+        return self.traverse.rig.mast_T_head(pan_tilt_rad[:, 0], pan_tilt_rad[:, 1])[0]
+
+    def _turns(self, pan_tilt_rad: FloatArray) -> FloatArray:
+        """Rotation vectors (n, 3, 2) of the head in the mast frame per radian of its pan and tilt (n, 2)."""
+        pan_R = pan_tilt_rotation(pan_tilt_rad[:, 0], np.zeros(len(pan_tilt_rad)))
+        tilt_axis = pan_R @ self.traverse.rig.pan_T_tilt.rotation().matrix()[:, 1]
+        return np.stack([np.broadcast_to([0.0, 0.0, 1.0], tilt_axis.shape), -tilt_axis], axis=2)
+
+    def _d_nominal(self, frame: int, pan_tilt_rad: FloatArray) -> FloatArray:
+        """Jacobian (2, 2) of the nominal pan and tilt of `image_pointing_offset` by the angles (2,).
 
         It is the identity where the tilt axis is perpendicular to the pan axis.
         """
-        pan, tilt = pan_tilt_rad[:1], pan_tilt_rad[1:]
-        tilt_axis = rz(float(pan[0])) @ self.traverse.rig.pan_T_tilt.rotation().matrix()[:, 1]
-        turns = np.column_stack([[0.0, 0.0, 1.0], -tilt_axis])
-        return np.asarray(_d_pan_tilt(self.traverse.rig.mast_T_head(pan, tilt)[0][0]) @ turns)
+        head_R = self._mast_R_head(pan_tilt_rad[None])[0]
+        return np.asarray(self._d_angles(frame, pan_tilt_rad, head_R) @ self._turns(pan_tilt_rad[None])[0])
+
+    def _d_angles(self, frame: int, pan_tilt_rad: FloatArray, mast_R_head: FloatArray) -> FloatArray:
+        """Jacobian (2, 3) of a frame's pan and tilt by a small rotation of the head in the mast frame."""
+        if self._is_steep[frame]:
+            return np.asarray(np.linalg.pinv(self._turns(pan_tilt_rad[None])[0]))
+        return _d_pan_tilt(mast_R_head)
 
     def camera_turn(self, image: int, state: State) -> FloatArray:
         """Jacobian (3, k) of a camera's rotation, in its own frame, by the first columns of its variable."""
@@ -289,7 +315,11 @@ class SoftTemplate(FactorTemplate):
     def image_pointing_offset(
         self, masts: tuple[gtsam.Pose3, ...], pan_tilt_rad: FloatArray, world_R_camera: FloatArray
     ) -> FloatArray:
-        """(images, 2) pan and tilt of each camera pose relative to its mast, minus those of its frame."""
+        """(images, 2) pan and tilt of each camera pose relative to its mast, minus those of its frame.
+
+        They are those of the head's x axis; where that is steep (`_is_steep`), those whose head differs from
+        the camera's by the smallest rotation, since a twist about a vertical axis looks like a pan.
+        """
         t = self.traverse
         masts_R, _ = pose_arrays(masts)
         mounts_R, _ = pose_arrays([e.head_T_camera for e in t.rig.eyes])
@@ -298,10 +328,21 @@ class SoftTemplate(FactorTemplate):
             @ world_R_camera
             @ mounts_R[t.image_eye].transpose(0, 2, 1)
         )
-        before = t.rig.mast_T_head(pan_tilt_rad[t.image_frame, 0], pan_tilt_rad[t.image_frame, 1])[0]
-        seen, nominal = pan_tilt_from_rotation(head_R), pan_tilt_from_rotation(before)
-        offset = np.column_stack([seen[0] - nominal[0], seen[1] - nominal[1]])
-        return wrap_angle(offset)
+        angles = pan_tilt_rad[t.image_frame]
+        seen, nominal = pan_tilt_from_rotation(head_R), pan_tilt_from_rotation(self._mast_R_head(angles))
+        offset = wrap_angle(np.column_stack([seen[0] - nominal[0], seen[1] - nominal[1]]))
+        steep = np.flatnonzero(self._is_steep[t.image_frame])
+        offset[steep] = self._nearest(head_R[steep], angles[steep]) - angles[steep]
+        return offset
+
+    def _nearest(self, mast_R_head: FloatArray, pan_tilt_rad: FloatArray) -> FloatArray:
+        """Angles (n, 2) near the given ones whose heads differ from the given ones by the least rotation."""
+        angles = pan_tilt_rad
+        for _ in range(_NEAREST_STEPS):
+            turned = mast_R_head @ self._mast_R_head(angles).transpose(0, 2, 1)
+            rotation = np.array([gtsam.Rot3.Logmap(gtsam.Rot3(one)) for one in turned]).reshape(-1, 3)
+            angles = angles + (np.linalg.pinv(self._turns(angles)) @ rotation[:, :, None])[:, :, 0]
+        return angles
 
 
 def _d_pan_tilt(mast_R_head: FloatArray) -> FloatArray:

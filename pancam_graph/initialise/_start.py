@@ -1,7 +1,7 @@
 """Initial mast poses, angles and cameras of a solve."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -13,7 +13,13 @@ from pancam_graph.data import Traverse
 from pancam_graph.initialise._circle import fit_circle
 from pancam_graph.initialise._extract import FreeCameras, extract_free, head_tilt_rad, mast_pan_rad
 
-__all__ = ["Start", "start_from_cameras", "start_from_odometry", "start_from_telemetry"]
+__all__ = [
+    "Start",
+    "in_turns_of_telemetry",
+    "start_from_cameras",
+    "start_from_odometry",
+    "start_from_telemetry",
+]
 
 _ONE_TILT_RAD = 0.01
 """Frames whose tilts differ by less share a circle: encoders repeat to a tenth of that."""
@@ -36,6 +42,21 @@ class Start:
     def __post_init__(self) -> None:
         """Turn the angles to float64. Raises InputError for what is no number."""
         object.__setattr__(self, "pan_tilt_rad", float_array("start: pan_tilt_rad", self.pan_tilt_rad))
+
+
+def in_turns_of_telemetry(start: Start, traverse: Traverse) -> Start:
+    """The start with angles within half a turn of telemetry's, whose priors know nothing of whole turns."""
+    said = traverse.pan_tilt_rad
+    if start.pan_tilt_rad.shape != said.shape:
+        raise InputError(
+            f"start: pan_tilt_rad: expected shape {said.shape}, one row for each frame, "
+            f"found {start.pan_tilt_rad.shape}"
+        )
+    off = start.pan_tilt_rad - said
+    if np.all(np.abs(off) <= np.pi):
+        return start
+    near = np.where(np.abs(off) <= np.pi, start.pan_tilt_rad, said + wrap_angle(off))
+    return replace(start, pan_tilt_rad=near)
 
 
 def start_from_telemetry(traverse: Traverse) -> Start:

@@ -21,7 +21,7 @@ from pancam_graph.graph import (
     check_given,
     given_factors,
 )
-from pancam_graph.initialise import FreeCameras, Start, start_from_telemetry
+from pancam_graph.initialise import FreeCameras, Start, in_turns_of_telemetry, start_from_telemetry
 from pancam_graph.landmarks import Landmarks, Measurements, rays_of, residuals, triangulate
 from pancam_graph.solve._alternation import AlternatingSolver
 from pancam_graph.solve._carrying import carry, first_ranges_m
@@ -96,7 +96,7 @@ def prepare(
         raise InputError(
             "observations: expected some, found none; find them in the images first (find_observations)"
         )
-    start = start or start_from_telemetry(traverse)
+    start = in_turns_of_telemetry(start, traverse) if start else start_from_telemetry(traverse)
     cameras = start.cameras if options.model in {"free", "projective"} else None
     sharing = (options.sharing or traverse.sharing or Sharing()).for_model(options.model)
     template = _template(traverse, options, sharing)
