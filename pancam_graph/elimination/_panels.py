@@ -160,6 +160,20 @@ class Panels:
             diagonal = np.arange(len(panel))
             panel[diagonal, diagonal] *= 1 + share
 
+    def times(self, x: FloatArray) -> FloatArray:
+        """S x (columns, n) for x (columns, n), group by group."""
+        st, out = self.structure, np.zeros_like(x)
+        first = np.concatenate([[0], np.cumsum(st.dim)])
+        for g, panel in enumerate(self.panel):
+            n, begin, rows = int(st.dim[g]), st.begin[g], slice(first[g], first[g + 1])
+            upper = np.triu(panel[:, :n])
+            out[rows] += (upper + np.triu(upper, 1).T) @ x[rows]
+            for h, a, b in zip(st.after[g][1:], begin[1:-1], begin[2:], strict=True):
+                others = slice(first[h], first[h + 1])
+                out[rows] += panel[:, a:b] @ x[others]
+                out[others] += panel[:, a:b].T @ x[rows]
+        return out
+
     def trace_with(self, covariance: "Covariance") -> float:
         """Trace of S times a covariance that has its blocks."""
         total = 0.0

@@ -10,11 +10,12 @@ score: Stefanski and Carroll 1987), and its variance is the system at the expect
 """
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.elimination import FreeDirectionError
 from pancam_graph.landmarks import InverseRanges, Landmarks, at_inverse_ranges, inverse_ranges
 from pancam_graph.solve._joint import all_columns, retracted
@@ -37,7 +38,11 @@ _ROUNDS = 60
 _SETTLED = 0.05
 """Step in sigmas that ends the rounds."""
 _NEAR = 0.3
-"""Step in sigmas below which the distribution of ranges may depend on direction."""
+"""Step in sigmas below which the distribution of ranges is learnt anew, and may depend on direction."""
+_LEARNT = 3
+"""How often it is learnt anew at most: then, and where rounds have settled."""
+_DOUBTFUL, _MOST_DOUBT = 0.2, 0.7
+"""Shares of the information of a direction: the least that counts, and the most that is taken off."""
 _FIRST_ROUNDS = 10
 """Rounds after which it may depend on direction however large the step is, and after which a step that is no
 shorter than the one before is taken by half, lest two states alternate."""
@@ -51,6 +56,8 @@ class FarTerrain:
     """At the solution, landmarks where they fit best."""
     expected: Landmarks
     """The landmarks at their expected inverse ranges: where covariances are linearised."""
+    doubt: Mapping[int, FloatArray]
+    """By group of variables, (n, n) information of the system that the ranges do not bear out."""
     converged: bool
     """Whether the rounds ended."""
 
@@ -67,7 +74,7 @@ def far_terrain(problem: Problem) -> FarTerrain | None:
     if int(broad.sum()) < _LEAST:
         return None
     prior = RangePrior()
-    expected = _expected(placed, broad, prior)
+    expected = _expected(placed, broad, prior).landmarks
     reduced = ReducedSystem.of(placed.at(placed.values, expected))
     feigned = _feigned(placed, reduced)
     _LOG.info("far terrain: %d landmarks of broad range feign %.2g of information", broad.sum(), feigned)
@@ -82,22 +89,31 @@ def _solved(
     """Rounds of: step to where the gradient vanishes, ranges fitted there, and expected ranges again."""
     link = problem.template.linkage
     held = all_columns(link, held_columns(problem.template))
-    before = np.inf
+    length, learnt = np.inf, 0
     for number in range(_ROUNDS):
-        length = float(np.sqrt(2 * reduced.root.gain()))
+        before, length = length, float(np.sqrt(2 * reduced.root.gain()))
         _LOG.debug("far terrain: round %d, step %.3g sigma", number, length)
-        if not prior.is_divided and (length < _NEAR or number >= _FIRST_ROUNDS):
-            # Not before: at the biased optimum, ranges follow the directions that the bias gives them.
-            prior.is_divided = True
-        elif length < _SETTLED:
-            return FarTerrain(problem=problem, expected=expected, converged=True)
+        near = length < (_SETTLED if learnt else _NEAR) or (not learnt and number >= _FIRST_ROUNDS)
+        if near and learnt < _LEARNT:
+            # A distribution learnt far from the solution keeps traces of the bias there.
+            prior, learnt = RangePrior(is_divided=True), learnt + 1
+            expected = _expected(problem, broad, prior).landmarks
+            reduced = ReducedSystem.of(problem.at(problem.values, expected))
+            length = float(np.sqrt(2 * reduced.root.gain()))
+        if length < _SETTLED:
+            break
         alternates = number >= _FIRST_ROUNDS and length > 0.9 * before
         step = reduced.root.step() * (0.5 if alternates else 1.0)
-        step[held], before = 0.0, length
+        step[held] = 0.0
         problem = problem.at(retracted(link, problem.values, step), problem.landmarks).placed()
-        expected = _expected(problem, broad, prior)
+        expected = _expected(problem, broad, prior).landmarks
         reduced = ReducedSystem.of(problem.at(problem.values, expected))
-    return FarTerrain(problem=problem, expected=expected, converged=False)
+    return FarTerrain(
+        problem=problem,
+        expected=expected,
+        doubt=_doubt(problem, _expected(problem, broad, prior)),
+        converged=length < _SETTLED,
+    )
 
 
 def _may_matter(problem: Problem) -> bool:
@@ -124,19 +140,81 @@ def _broad(problem: Problem, ranges: InverseRanges) -> BoolArray:
     return np.asarray(problem.present & (ranges.variance > (_BROAD * ranges.per_m) ** 2))
 
 
-def _expected(problem: Problem, broad: BoolArray, prior: RangePrior) -> Landmarks:
-    """Landmarks at their expected inverse ranges; those whose range is not broad stay as they are."""
-    ranges = _ranges(problem)
-    rows: IntArray = np.flatnonzero(broad)
-    direction: FloatArray = problem.landmarks.vector[rows, :3] / problem.landmarks.length[rows, None]
-    per_m = prior.expected(ranges.per_m[rows], ranges.variance[rows], direction)
-    at = Landmarks(vector=problem.landmarks.vector[rows], origin_m=problem.landmarks.origin_m[rows])
-    of_rows = InverseRanges(
-        per_m=ranges.per_m[rows], variance=ranges.variance[rows], shift=ranges.shift[rows]
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Expected:
+    """Inverse ranges that are expected, beside those fitted."""
+
+    ranges: InverseRanges
+    """As fitted."""
+    per_m: FloatArray
+    """(landmarks,) expected; those fitted where the range is not broad"""
+    follows: FloatArray
+    """(landmarks,) variance of the fitted one times the derivative of the expected one by it; 0 likewise"""
+    landmarks: Landmarks
+    """At the expected ones."""
+
+
+def _expected(problem: Problem, broad: BoolArray, prior: RangePrior) -> _Expected:
+    """Expected inverse ranges of the landmarks whose range is broad; the others stay as they are."""
+    ranges, rows = _ranges(problem), np.flatnonzero(broad)
+    direction = problem.landmarks.vector[rows, :3] / problem.landmarks.length[rows, None]
+    per_m, follows = ranges.per_m.copy(), np.zeros(len(broad))
+    per_m[rows], follows[rows] = prior.expected(ranges.per_m[rows], ranges.variance[rows], direction)
+    return _Expected(
+        ranges=ranges, per_m=per_m, follows=follows, landmarks=_at(problem, ranges, per_m).landmarks
     )
-    vector = problem.landmarks.vector.copy()
-    vector[rows] = at_inverse_ranges(at, of_rows, per_m).vector
-    return replace(problem.landmarks, vector=vector)
+
+
+def _at(problem: Problem, ranges: InverseRanges, per_m: FloatArray) -> Problem:
+    """A problem with landmarks at other inverse ranges; those at the fitted ones stay bit for bit."""
+    moved = at_inverse_ranges(problem.landmarks, ranges, per_m).vector
+    stays = (per_m == ranges.per_m)[:, None]
+    vector = np.where(stays, problem.landmarks.vector, moved)
+    return problem.at(problem.values, replace(problem.landmarks, vector=vector))
+
+
+def _doubt(problem: Problem, expected: _Expected) -> dict[int, FloatArray]:
+    """Information K of the gradient beyond its slope J, by group, where it is a good part of the whole.
+
+    K = sum A(g)'N A(g) is the variance of the gradient, J = sum A(g)'N A(q) its slope, which the fitted
+    ranges tell without bias: A(g)'N A(q^) less v dg/dq^ times the product of the slopes of A (Stein 1981).
+    Both are quadratic in ranges, so systems at three ranges give J. Along an eigenvector where K - J is a
+    share d of the information with priors, the variance is 1 / (1 - d)^2 of what K says.
+    """
+    q, g = expected.ranges.per_m, expected.per_m
+    middle, apart = 0.5 * (g + q), np.sqrt(0.25 * (g - q) ** 2 + expected.follows)
+    at = [panels_of(_at(problem, expected.ranges, x)) for x in (g, middle, middle + apart, middle - apart)]
+    link, out = problem.template.linkage, {}
+    excess = at[0].copy()
+    for which, factor in ((1, -2.0), (2, 0.5), (3, 0.5)):
+        for panel, other in zip(excess.panel, at[which].panel, strict=True):
+            np.add(panel, factor * other, out=panel)
+    root = at[0].root()
+    for group in np.flatnonzero(link.group_dim).tolist():
+        n, first = int(link.group_dim[group]), int(link.group_column[group])
+        try:
+            columns = root.inverse_columns(group, slice(0, n))
+        except FreeDirectionError:
+            return {}
+        covariance = columns[first : first + n]
+        # The whole system as it follows the group, and its excess information there.
+        moves: FloatArray = np.asarray(np.linalg.solve(covariance, columns.T).T)
+        share, direction = _shares(moves.T @ excess.times(moves), covariance)
+        doubtful = share > _DOUBTFUL
+        if doubtful.any():
+            information = np.linalg.solve(covariance, direction[:, doubtful])
+            less = 1 - (1 - share[doubtful].clip(max=_MOST_DOUBT)) ** 2
+            out[group] = (less * information) @ information.T
+    return out
+
+
+def _shares(information: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Shares (n,) of information in the inverse of a covariance, and their directions (n, n) of one sigma."""
+    scale = np.sqrt(np.diag(covariance).clip(1e-300))
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    unit = scale[:, None] * vectors * np.sqrt(values.clip(0.0))
+    share, turn = np.linalg.eigh(unit.T @ (information + information.T) @ unit / 2)
+    return share, unit @ turn
 
 
 def _feigned(problem: Problem, reduced: ReducedSystem) -> float:

@@ -1,11 +1,11 @@
 """Stage 3, fit: least squares over the observations that are used."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pancam_graph.base.geometry import BoolArray
+from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.data import PixelNoise
 from pancam_graph.graph import HardTemplate
 from pancam_graph.landmarks import Landmarks
@@ -39,6 +39,8 @@ class Fitted:
     """The solver's own record of where it ended; None where landmarks are explicit, or no fit was made."""
     expected: Landmarks | None = None
     """Landmarks at the inverse ranges where covariances are linearised; None: at those fitted."""
+    doubt: Mapping[int, FloatArray] = field(default_factory=dict)
+    """By group of variables, (n, n) information there that covariances do without."""
 
 
 def fit(screened: Screened) -> Fitted:
@@ -117,7 +119,9 @@ def _without_range_bias(fitted: Fitted) -> Fitted:
     if far is None:
         return fitted
     moved = _back(far, problem)
-    reason = outcome.reason if far.converged else "far terrain: corrections of the solution do not settle"
+    reason = outcome.reason if outcome.converged else "far terrain: corrections of the solution settled"
+    if not far.converged:
+        reason = "far terrain: corrections of the solution do not settle"
     return replace(
         fitted,
         problem=moved,
@@ -130,6 +134,7 @@ def _without_range_bias(fitted: Fitted) -> Fitted:
         ),
         ended=None,
         expected=far.expected,
+        doubt=far.doubt,
     )
 
 

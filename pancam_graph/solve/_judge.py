@@ -87,7 +87,7 @@ def reduced_of(fitted: Fitted, problem: Problem) -> ReducedSystem:
     """`regular_problem` with landmarks eliminated; the fit's own system where the problem is the fit's."""
     if fitted.ended is not None and fitted.ended.problem is problem:
         return fitted.ended.reduced()
-    return ReducedSystem.of(problem)
+    return ReducedSystem.of(problem, without=fitted.doubt)
 
 
 def _uncertainty(

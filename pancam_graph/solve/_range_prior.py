@@ -37,27 +37,30 @@ _RELAXED = 1.8
 class RangePrior:
     """The distribution as it stands; each call learns it again, from near its last state."""
 
-    def __init__(self) -> None:
-        self.is_divided = False
-        """Whether the next calls divide directions into cells, chosen by the first of them."""
+    def __init__(self, *, is_divided: bool = False) -> None:
+        """`is_divided`: directions are divided into cells, which the first call chooses."""
+        self._is_divided = is_divided
         self._cell: IntArray | None = None
         self._nodes = np.zeros(0)
         self._common = np.zeros(0)
         self._of_cell: dict[int, FloatArray] = {}
 
-    def expected(self, per_m: FloatArray, variance: FloatArray, direction: FloatArray) -> FloatArray:
+    def expected(
+        self, per_m: FloatArray, variance: FloatArray, direction: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Expected true inverse ranges (n,), each given its noisy one (n,), of these variances (n,).
 
-        `direction` (n, 3) are unit vectors. Every call is for the same n landmarks. Never below 0.
+        `direction` (n, 3) are unit vectors. Every call is for the same n landmarks. Never below 0. The second
+        value (n,) is the product of each variance with the derivative of what is expected by what is noisy.
         """
         rounds = _MORE_ROUNDS
         if len(self._nodes) == 0:
             self._nodes, rounds = _grid(per_m, variance), _ROUNDS
             self._common = np.full(len(self._nodes), 1 / len(self._nodes))
-        nodes, out = self._nodes, np.empty(len(per_m))
+        nodes, out, follows = self._nodes, np.empty(len(per_m)), np.empty(len(per_m))
         whole = _likelihood(per_m, variance * _wider(len(per_m)), nodes)
         self._common = _learnt(whole, self._common, rounds)
-        if self.is_divided and self._cell is None:
+        if self._is_divided and self._cell is None:
             self._cell, rounds = self._divided(per_m, variance, direction), _ROUNDS
         cell = np.zeros(len(per_m), dtype=np.int64) if self._cell is None else self._cell
         n_cells = int(cell.max()) + 1
@@ -69,8 +72,12 @@ class RangePrior:
                 share = self._of_cell.get(c, self._common)
                 share = _learnt(likelihood, share, rounds, self._common)
                 self._of_cell[c] = share
-            out[rows] = (likelihood @ (share * nodes)) / (likelihood @ share)
-        return out
+            total = likelihood @ share
+            out[rows] = (likelihood @ (share * nodes)) / total
+            # The derivative is the variance that is left over that of the noise (Tweedie's formula).
+            left = (likelihood @ (share * nodes**2)) / total - out[rows] ** 2
+            follows[rows] = left.clip(0.0) / _wider(len(rows))
+        return out, follows
 
     def _divided(self, per_m: FloatArray, variance: FloatArray, direction: FloatArray) -> IntArray:
         """Cells (n,) of the division that best predicts each half of the landmarks from the other."""

@@ -1,12 +1,12 @@
 """A problem with its landmarks eliminated: the square root of the system in the variables of cameras."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 
-from pancam_graph.base.geometry import IntArray
+from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.elimination import LandmarkSystem, Linkage, Panels, Root, Rows, with_rows
 from pancam_graph.graph import Factors, FactorTemplate, graph_of
 from pancam_graph.solve._problem import Problem, system_of
@@ -34,13 +34,22 @@ class ReducedSystem:
     """Square root of the system."""
 
     @staticmethod
-    def of(problem: Problem, arranged: tuple[LandmarkSystem, IntArray] | None = None) -> "ReducedSystem":
+    def of(
+        problem: Problem,
+        arranged: tuple[LandmarkSystem, IntArray] | None = None,
+        *,
+        without: Mapping[int, FloatArray] | None = None,
+    ) -> "ReducedSystem":
         """Linearise a problem; `arranged` is its landmark system and rows, if these exist already.
 
-        Raises SolveError where no observation takes part.
+        `without` is information (n, n) by group that is taken off. Raises SolveError where no observation
+        takes part.
         """
         system, rows = arranged or system_of(problem)
-        return ReducedSystem(system=system, rows=rows, root=_panels_of(problem, system).root()).firm(problem)
+        panels = _panels_of(problem, system)
+        for group, information in (without or {}).items():
+            panels.panel[group][:, : len(information)] -= information
+        return ReducedSystem(system=system, rows=rows, root=panels.root()).firm(problem)
 
     def firm(self, problem: Problem) -> "ReducedSystem":
         """The same, or one by QR where a weak prior of the problem is lost in rounding errors of this one."""

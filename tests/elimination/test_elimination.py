@@ -223,6 +223,13 @@ def test_trace_with_a_covariance_of_another_system(name: str) -> None:
     assert system.panels.trace_with(covariance) == pytest.approx(expected, rel=1e-10)
 
 
+@pytest.mark.parametrize("name", GRAPHS)
+def test_product_with_a_matrix(name: str) -> None:
+    system = Random(name)
+    x = np.random.default_rng(4).standard_normal((len(system.S), 3))
+    assert system.panels.times(x) == pytest.approx(system.S @ x, rel=1e-10, abs=1e-10)
+
+
 def test_no_covariance_of_what_no_clique_joins() -> None:
     with pytest.raises(KeyError):
         Random("apart").panels.root().covariance().block(0, 3)

@@ -1,6 +1,7 @@
 """Stops that share only far terrain: neither biased nor surer than they may be."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -10,6 +11,7 @@ from pancam_graph import Solution, SolveOptions, solve
 from pancam_graph.base.geometry import FloatArray
 from pancam_graph.landmarks import at_inverse_ranges, inverse_ranges
 from pancam_graph.smoother import solve_incrementally
+from pancam_graph.solve import reduced_of, regular_problem
 from pancam_graph.solve._far_terrain import far_terrain
 from pancam_graph.solve._problem import Problem
 from pancam_graph.solve._range_prior import RangePrior
@@ -114,6 +116,14 @@ def test_landmarks_keep_their_ranges_where_told_to() -> None:
     np.testing.assert_allclose(np.linalg.norm(moved.vector, axis=1), 1.0, rtol=1e-12)
 
 
+def test_information_that_ranges_do_not_bear_out_is_taken_off() -> None:
+    fit_ = fitted(kilometre().traverse, PLAIN)
+    regular = reduced_of(fit_, regular_problem(fit_)).root.covariance().block(1, 1)
+    less = 0.5 * np.linalg.inv(regular)
+    halved = reduced_of(replace(fit_, doubt={1: less}), regular_problem(fit_)).root.covariance().block(1, 1)
+    np.testing.assert_allclose(halved, 2 * regular, rtol=1e-5, atol=1e-9 * np.abs(regular).max())
+
+
 class TestRangePrior:
     def drawn(self, true: FloatArray, sigma: float, seed: int = 0) -> tuple[FloatArray, FloatArray]:
         """Noisy inverse ranges, and what is expected of each."""
@@ -121,7 +131,7 @@ class TestRangePrior:
         noisy = true + sigma * rng.standard_normal(len(true))
         direction = rng.standard_normal((len(true), 3))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        return noisy, RangePrior().expected(noisy, np.full(len(true), sigma**2), direction)
+        return noisy, RangePrior().expected(noisy, np.full(len(true), sigma**2), direction)[0]
 
     def test_one_range_for_all_is_found(self) -> None:
         _, expected = self.drawn(np.full(1000, 1e-3), sigma=1e-3)
@@ -152,9 +162,8 @@ class TestRangePrior:
         true = np.where(azimuth < 0, 1e-3, 3e-3)
         noisy = true + 1e-3 * rng.standard_normal(1000)
         direction = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.zeros(1000)])
-        prior = RangePrior()
-        prior.is_divided = True
-        expected = prior.expected(noisy, np.full(1000, 1e-6), direction)
+        prior = RangePrior(is_divided=True)
+        expected, _ = prior.expected(noisy, np.full(1000, 1e-6), direction)
         assert np.sqrt(np.mean((expected - true) ** 2)) < 2.5e-4
 
 
