@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pancam_graph.base.geometry import BoolArray, FloatArray
-from pancam_graph.elimination import FreeDirectionError
+from pancam_graph.elimination import FreeDirectionError, Panels
 from pancam_graph.landmarks import InverseRanges, Landmarks, at_inverse_ranges, inverse_ranges
 from pancam_graph.solve._joint import all_columns, retracted
 from pancam_graph.solve._problem import Problem, reach_m
@@ -43,6 +43,8 @@ _LEARNT = 3
 """How often it is learnt anew at most: then, and where rounds have settled."""
 _DOUBTFUL, _MOST_DOUBT = 0.2, 0.7
 """Shares of the information of a direction: the least that counts, and the most that is taken off."""
+_MOST_GROUPS = 8
+"""Groups of variables, at most, of which information is taken off."""
 _FIRST_ROUNDS = 10
 """Rounds after which it may depend on direction however large the step is, and after which a step that is no
 shorter than the one before is taken by half, lest two states alternate."""
@@ -184,28 +186,42 @@ def _doubt(problem: Problem, expected: _Expected) -> dict[int, FloatArray]:
     q, g = expected.ranges.per_m, expected.per_m
     middle, apart = 0.5 * (g + q), np.sqrt(0.25 * (g - q) ** 2 + expected.follows)
     at = [panels_of(_at(problem, expected.ranges, x)) for x in (g, middle, middle + apart, middle - apart)]
-    link, out = problem.template.linkage, {}
     excess = at[0].copy()
     for which, factor in ((1, -2.0), (2, 0.5), (3, 0.5)):
         for panel, other in zip(excess.panel, at[which].panel, strict=True):
             np.add(panel, factor * other, out=panel)
-    root = at[0].root()
-    for group in np.flatnonzero(link.group_dim).tolist():
-        n, first = int(link.group_dim[group]), int(link.group_column[group])
+    out: dict[int, FloatArray] = {}
+    # One group after the other, the most doubtful first: what several share is not taken off twice.
+    for _ in range(_MOST_GROUPS):
+        group, less = _most_doubtful(problem, at[0], excess)
+        if less is None:
+            break
+        for panels in (at[0], excess):
+            panels.panel[group][:, : len(less)] -= less
+        out[group] = out.get(group, 0.0) + less
+    return out
+
+
+def _most_doubtful(problem: Problem, system: Panels, excess: Panels) -> tuple[int, FloatArray | None]:
+    """The group with the largest share of excess information in its own, and what to take off there."""
+    link, root = problem.template.linkage, system.copy().root()
+    most, group, less = _DOUBTFUL, 0, None
+    for g in np.flatnonzero(link.group_dim).tolist():
+        n, first = int(link.group_dim[g]), int(link.group_column[g])
         try:
-            columns = root.inverse_columns(group, slice(0, n))
+            columns = root.inverse_columns(g, slice(0, n))
         except FreeDirectionError:
-            return {}
+            return 0, None
         covariance = columns[first : first + n]
         # The whole system as it follows the group, and its excess information there.
         moves: FloatArray = np.asarray(np.linalg.solve(covariance, columns.T).T)
         share, direction = _shares(moves.T @ excess.times(moves), covariance)
-        doubtful = share > _DOUBTFUL
-        if doubtful.any():
+        if share[-1] > most:
+            doubtful = share > _DOUBTFUL
             information = np.linalg.solve(covariance, direction[:, doubtful])
-            less = 1 - (1 - share[doubtful].clip(max=_MOST_DOUBT)) ** 2
-            out[group] = (less * information) @ information.T
-    return out
+            taken = 1 - (1 - share[doubtful].clip(max=_MOST_DOUBT)) ** 2
+            most, group, less = float(share[-1]), g, (taken * information) @ information.T
+    return group, less
 
 
 def _shares(information: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:

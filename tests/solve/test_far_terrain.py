@@ -119,7 +119,7 @@ def test_landmarks_keep_their_ranges_where_told_to() -> None:
 def test_information_that_ranges_do_not_bear_out_is_taken_off() -> None:
     fit_ = fitted(kilometre().traverse, PLAIN)
     regular = reduced_of(fit_, regular_problem(fit_)).root.covariance().block(1, 1)
-    less = 0.5 * np.linalg.inv(regular)
+    less: FloatArray = np.asarray(0.5 * np.linalg.inv(regular))
     halved = reduced_of(replace(fit_, doubt={1: less}), regular_problem(fit_)).root.covariance().block(1, 1)
     np.testing.assert_allclose(halved, 2 * regular, rtol=1e-5, atol=1e-9 * np.abs(regular).max())
 
