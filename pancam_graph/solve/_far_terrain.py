@@ -43,7 +43,7 @@ _LEARNT = 3
 """How often it is learnt anew at most: then, and where rounds have settled."""
 _DOUBTFUL, _MOST_DOUBT = 0.2, 0.7
 """Shares of the information of a direction: the least that counts, and the most that is taken off."""
-_MOST_GROUPS = 8
+_MOST_GROUPS = 1
 """Groups of variables, at most, of which information is taken off."""
 _FIRST_ROUNDS = 10
 """Rounds after which it may depend on direction however large the step is, and after which a step that is no
@@ -64,6 +64,20 @@ class FarTerrain:
     """Whether the rounds ended."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Expected:
+    """Inverse ranges that are expected, beside those fitted."""
+
+    ranges: InverseRanges
+    """As fitted."""
+    per_m: FloatArray
+    """(landmarks,) expected; those fitted where the range is not broad"""
+    follows: FloatArray
+    """(landmarks,) variance of the fitted one times the derivative of the expected one by it; 0 likewise"""
+    landmarks: Landmarks
+    """At the expected ones."""
+
+
 def far_terrain(problem: Problem) -> FarTerrain | None:
     """The solution of a problem at its least-squares optimum that noise in ranges does not bias.
 
@@ -76,8 +90,8 @@ def far_terrain(problem: Problem) -> FarTerrain | None:
     if int(broad.sum()) < _LEAST:
         return None
     prior = RangePrior()
-    expected = _expected(placed, broad, prior).landmarks
-    reduced = ReducedSystem.of(placed.at(placed.values, expected))
+    expected = _expected(placed, broad, prior)
+    reduced = ReducedSystem.of(placed.at(placed.values, expected.landmarks))
     feigned = _feigned(placed, reduced)
     _LOG.info("far terrain: %d landmarks of broad range feign %.2g of information", broad.sum(), feigned)
     if feigned < _MORE:
@@ -86,7 +100,7 @@ def far_terrain(problem: Problem) -> FarTerrain | None:
 
 
 def _solved(
-    problem: Problem, broad: BoolArray, prior: RangePrior, reduced: ReducedSystem, expected: Landmarks
+    problem: Problem, broad: BoolArray, prior: RangePrior, reduced: ReducedSystem, known: _Expected
 ) -> FarTerrain:
     """Rounds of: step to where the gradient vanishes, ranges fitted there, and expected ranges again."""
     link = problem.template.linkage
@@ -99,8 +113,8 @@ def _solved(
         if near and learnt < _LEARNT:
             # A distribution learnt far from the solution keeps traces of the bias there.
             prior, learnt = RangePrior(is_divided=True), learnt + 1
-            expected = _expected(problem, broad, prior).landmarks
-            reduced = ReducedSystem.of(problem.at(problem.values, expected))
+            known = _expected(problem, broad, prior)
+            reduced = ReducedSystem.of(problem.at(problem.values, known.landmarks))
             length = float(np.sqrt(2 * reduced.root.gain()))
         if length < _SETTLED:
             break
@@ -108,12 +122,12 @@ def _solved(
         step = reduced.root.step() * (0.5 if alternates else 1.0)
         step[held] = 0.0
         problem = problem.at(retracted(link, problem.values, step), problem.landmarks).placed()
-        expected = _expected(problem, broad, prior).landmarks
-        reduced = ReducedSystem.of(problem.at(problem.values, expected))
+        known = _expected(problem, broad, prior)
+        reduced = ReducedSystem.of(problem.at(problem.values, known.landmarks))
     return FarTerrain(
         problem=problem,
-        expected=expected,
-        doubt=_doubt(problem, _expected(problem, broad, prior)),
+        expected=known.landmarks,
+        doubt=_doubt(problem, known),
         converged=length < _SETTLED,
     )
 
@@ -140,20 +154,6 @@ def _ranges(problem: Problem) -> InverseRanges:
 def _broad(problem: Problem, ranges: InverseRanges) -> BoolArray:
     """(landmarks,) whether a landmark takes part and its range is badly known."""
     return np.asarray(problem.present & (ranges.variance > (_BROAD * ranges.per_m) ** 2))
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Expected:
-    """Inverse ranges that are expected, beside those fitted."""
-
-    ranges: InverseRanges
-    """As fitted."""
-    per_m: FloatArray
-    """(landmarks,) expected; those fitted where the range is not broad"""
-    follows: FloatArray
-    """(landmarks,) variance of the fitted one times the derivative of the expected one by it; 0 likewise"""
-    landmarks: Landmarks
-    """At the expected ones."""
 
 
 def _expected(problem: Problem, broad: BoolArray, prior: RangePrior) -> _Expected:
@@ -193,25 +193,32 @@ def _doubt(problem: Problem, expected: _Expected) -> dict[int, FloatArray]:
     out: dict[int, FloatArray] = {}
     # One group after the other, the most doubtful first: what several share is not taken off twice.
     for _ in range(_MOST_GROUPS):
-        group, less = _most_doubtful(problem, at[0], excess)
-        if less is None:
+        group, less, settled = _most_doubtful(problem, at[0], excess)
+        if len(less) == 0:
             break
-        for panels in (at[0], excess):
-            panels.panel[group][:, : len(less)] -= less
+        at[0].panel[group][:, : len(less)] -= less
+        try:
+            at[0].copy().root().covariance()
+        except FreeDirectionError:  # in rounding, what is left would hold nothing
+            break
+        excess.panel[group][:, : len(less)] -= settled
         out[group] = out.get(group, 0.0) + less
     return out
 
 
-def _most_doubtful(problem: Problem, system: Panels, excess: Panels) -> tuple[int, FloatArray | None]:
-    """The group with the largest share of excess information in its own, and what to take off there."""
+def _most_doubtful(problem: Problem, system: Panels, excess: Panels) -> tuple[int, FloatArray, FloatArray]:
+    """The group with the largest share of excess information in its own, what to take off, and its excess.
+
+    What to take off is empty where no share counts.
+    """
     link, root = problem.template.linkage, system.copy().root()
-    most, group, less = _DOUBTFUL, 0, None
+    most, group, less, settled = _DOUBTFUL, 0, np.zeros((0, 0)), np.zeros((0, 0))
     for g in np.flatnonzero(link.group_dim).tolist():
         n, first = int(link.group_dim[g]), int(link.group_column[g])
         try:
             columns = root.inverse_columns(g, slice(0, n))
         except FreeDirectionError:
-            return 0, None
+            return 0, np.zeros((0, 0)), np.zeros((0, 0))
         covariance = columns[first : first + n]
         # The whole system as it follows the group, and its excess information there.
         moves: FloatArray = np.asarray(np.linalg.solve(covariance, columns.T).T)
@@ -220,8 +227,10 @@ def _most_doubtful(problem: Problem, system: Panels, excess: Panels) -> tuple[in
             doubtful = share > _DOUBTFUL
             information = np.linalg.solve(covariance, direction[:, doubtful])
             taken = 1 - (1 - share[doubtful].clip(max=_MOST_DOUBT)) ** 2
-            most, group, less = float(share[-1]), g, (taken * information) @ information.T
-    return group, less
+            most, group = float(share[-1]), g
+            less = (taken * information) @ information.T
+            settled = (share[doubtful] * information) @ information.T
+    return group, less, settled
 
 
 def _shares(information: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
