@@ -1,8 +1,9 @@
 """Custom GTSAM factors: pure residuals with analytic Jacobians, and thin makers.
 
 One module a factor: `mast` (pan-tilt chain, 6 rows), `mast_projection` (a point seen from a rigid mast, 2
-rows), `circle` (thesis eq. 4.8, 3 rows), `projective` (projection matrix, 12 rows). Factors that GTSAM has
-(priors, projections of a camera pose) are taken from GTSAM.
+rows), `circle` (thesis eq. 4.8, 3 rows), `projective` (projection matrix, 12 rows), `joint_prior` (vectors
+with correlated errors). Factors that GTSAM has (priors of one variable, projections of a camera pose) are
+taken from GTSAM.
 """
 
 from pancam_graph.factors._slots import Corrected as Corrected
@@ -13,6 +14,8 @@ from pancam_graph.factors._slots import Slot as Slot
 from pancam_graph.factors.circle import CircleOffset as CircleOffset
 from pancam_graph.factors.circle import circle_factor as circle_factor
 from pancam_graph.factors.circle import circle_residual as circle_residual
+from pancam_graph.factors.joint_prior import joint_prior_factor as joint_prior_factor
+from pancam_graph.factors.joint_prior import joint_prior_residual as joint_prior_residual
 from pancam_graph.factors.landmark_blocks import LandmarkBlocks as LandmarkBlocks
 from pancam_graph.factors.mast import mast_factor as mast_factor
 from pancam_graph.factors.mast import mast_residual as mast_residual

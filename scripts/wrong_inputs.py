@@ -1,8 +1,8 @@
 """Give drives with known truth one wrong input at a time, and print what solutions and verdicts make of it.
 
-For each fault a line: runs, how many failed their tests, the largest error in formal sigmas among those that
-passed, how many of these are silent failures (beyond 6 sigma), and the tests that failed most often. The
-same options give the same numbers.
+For each fault a line: runs, how many failed their tests, how many let telemetry go; of those that passed the
+mean squared error over variance, the largest error in formal sigmas, and how many are silent failures (beyond
+6 sigma); and the tests that failed most often. The same options give the same numbers.
 
 Exit status: 0 no silent failure, 1 some, 2 bad input.
 """
@@ -32,13 +32,18 @@ def _right(s: Simulation, rng: np.random.Generator) -> Traverse:
     return s.traverse
 
 
-def _frame_pan(degrees: float) -> Fault:
-    """The pan of one frame is wrong."""
+def _frame(*, pan: float = 0.0, tilt: float = 0.0) -> Fault:
+    """The pan or the tilt of one frame is wrong by so many degrees."""
 
     def fault(s: Simulation, rng: np.random.Generator) -> Traverse:
         frames = list(s.traverse.frames)
         i = int(rng.integers(len(frames)))
-        frames[i] = replace(frames[i], pan_rad=frames[i].pan_rad + float(np.deg2rad(degrees)))
+        before = frames[i]
+        frames[i] = replace(
+            before,
+            pan_rad=before.pan_rad + float(np.deg2rad(pan)),
+            tilt_rad=before.tilt_rad + float(np.deg2rad(tilt)),
+        )
         return replace(s.traverse, frames=tuple(frames))
 
     return fault
@@ -153,6 +158,8 @@ class Case:
     """Options of the simulation beside the usual ones."""
 
 
+_FEW_LINKS = {"stops": 1, "pans": 7, "points_per_image": 15}
+"""One panorama whose frames have few neighbours: many have one alone."""
 CASES: dict[str, Case] = {
     "right": Case(),
     "3 % outliers": Case(drive={"outliers": 0.03}),
@@ -160,7 +167,16 @@ CASES: dict[str, Case] = {
     **{f"{100 * share:.0f} % outliers": Case(drive={"outliers": share}) for share in (0.33, 0.4, 0.5, 0.6)},
     **{f"sigmas stated {1 / f:g} times too small": Case(fault=_stated_noise(f)) for f in (0.1, 0.3)},
     **{f"sigmas stated {f:g} times too large": Case(fault=_stated_noise(f)) for f in (3.0, 10.0)},
-    **{f"pan of a frame off by {d:g} degrees": Case(fault=_frame_pan(d)) for d in (0.5, 1.0, 3.0, 10.0)},
+    **{f"pan of a frame off by {d:g} degrees": Case(fault=_frame(pan=d)) for d in (0.5, 1.0, 3.0, 10.0)},
+    **{f"tilt of a frame off by {d:g} degrees": Case(fault=_frame(tilt=d)) for d in (0.5, 1.0, 3.0, 10.0)},
+    **{
+        f"pan off by {d:g} degrees, few links": Case(fault=_frame(pan=d), drive=_FEW_LINKS)
+        for d in (0.5, 3.0)
+    },
+    **{
+        f"tilt off by {d:g} degrees, few links": Case(fault=_frame(tilt=d), drive=_FEW_LINKS)
+        for d in (0.5, 3.0)
+    },
     "pans of a stop off by 1 degree, told 0.077": Case(
         fault=_stop_pans(1.0, 0.077), drive={"sigma_stop_rad": 1e-3}
     ),
@@ -180,8 +196,10 @@ class Outcome:
     """What became of one run."""
 
     passed: bool
-    error: float
-    """Largest error of a pan, a tilt or a component of a stop's pose, in formal sigmas."""
+    errors: FloatArray
+    """(n,) of pans, tilts and components of stops' poses, in formal sigmas; empty if nothing was solved."""
+    let_go: bool
+    """Whether telemetry was let go."""
     failed: tuple[str, ...]
     """Names of the tests that failed; the error itself where nothing was solved."""
 
@@ -194,12 +212,13 @@ def measure(case: Case, rig: str, seed: int, *, incremental: bool) -> Outcome:
     try:
         solution = (solve_incrementally if incremental else solve)(traverse, SolveOptions())
     except PancamGraphError as error:
-        return Outcome(passed=False, error=np.nan, failed=(str(error)[:40],))
+        return Outcome(passed=False, errors=np.zeros(0), let_go=False, failed=(str(error)[:40],))
     verdict = solution.verdict
     assert verdict is not None  # every solve is tested
     return Outcome(
         passed=solution.passed,
-        error=float(np.max(errors_in_sigmas(solution, simulation))),
+        errors=errors_in_sigmas(solution, simulation),
+        let_go=any(test.name == "let go" and test.value for test in verdict.tests),
         failed=tuple(test.name for test in verdict.failures),
     )
 
@@ -230,7 +249,8 @@ def main() -> int:
     silent = 0
     progress = Progress()
     chosen = {n: c for n, c in CASES.items() if not a.only or any(text in n for text in a.only)}
-    print(f"{'case':<45} {'runs':>5} {'failed':>7} {'worst passed':>13} {'silent':>7}  tests that failed")
+    heads = ("runs", 5), ("failed", 7), ("let go", 7), ("square", 7), ("worst", 6), ("silent", 7)
+    print(f"{'case':<45} {' '.join(f'{h:>{n}}' for h, n in heads)}  tests that failed")
     for name, case in chosen.items():
         with progress.shown(name):
             outcomes = [
@@ -238,13 +258,15 @@ def main() -> int:
                 for i in range(a.seeds)
                 for rig in a.rigs
             ]
-        passed = [o.error for o in outcomes if o.passed]
-        n_silent = sum(not error <= _SILENT for error in passed)
+        passed = [o.errors for o in outcomes if o.passed]
+        n_silent = sum(not np.max(errors) <= _SILENT for errors in passed)
         silent += n_silent
         often = Counter(test for o in outcomes for test in o.failed).most_common(3)
         said = ", ".join(f"{test} {n}" for test, n in often)
-        worst = f"{max(passed):.1f}" if passed else "-"
-        counts = f"{len(outcomes):>5} {len(outcomes) - len(passed):>7} {worst:>13} {n_silent:>7}"
+        every = np.concatenate([np.zeros(0), *passed])
+        square, worst = (f"{np.mean(every**2):.2f}", f"{every.max():.1f}") if passed else ("-", "-")
+        counts = f"{len(outcomes):>5} {len(outcomes) - len(passed):>7} {sum(o.let_go for o in outcomes):>7}"
+        counts += f" {square:>7} {worst:>6} {n_silent:>7}"
         print(f"{name:<45} {counts}  {said}", flush=True)
     return 1 if silent else 0
 

@@ -67,6 +67,11 @@ class Frame:
     sigma_tilt_rad: float
     """Standard deviation of the tilt prior; 0 holds the tilt."""
 
+    @property
+    def sigmas_rad(self) -> FloatArray:
+        """Standard deviations (2,) of pan and tilt."""
+        return np.array([self.sigma_pan_rad, self.sigma_tilt_rad])
+
 
 @dataclass(frozen=True, kw_only=True)
 class Image:

@@ -25,7 +25,7 @@ from pancam_graph.factors import Key
 from pancam_graph.graph._factors import FactorList
 from pancam_graph.graph._given import Seat
 from pancam_graph.graph._keys import Kind, index_of, key_of, kind_of
-from pancam_graph.graph._template import FactorTemplate, diagonal_noise
+from pancam_graph.graph._template import FactorTemplate
 from pancam_graph.landmarks import CameraViews
 
 __all__ = ["HardTemplate"]
@@ -219,11 +219,8 @@ class HardTemplate(FactorTemplate):
         frames = self._frames[stop]
         if not len(frames):
             return []
-        measured, noise = (
-            self.traverse.pan_tilt_rad[frames].ravel(),
-            diagonal_noise(self._sigmas[frames].ravel()),
-        )
-        return [gtsam.PriorFactorVector(self.angles_key(stop), measured, noise)]
+        measured = self.traverse.pan_tilt_rad[frames].ravel()
+        return [gtsam.PriorFactorVector(self.angles_key(stop), measured, self.angle_noise(stop, frames))]
 
     def values(self, state: State) -> gtsam.Values:
         """The variables at a state."""

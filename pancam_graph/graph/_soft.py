@@ -21,7 +21,15 @@ from pancam_graph.base.geometry import (
 )
 from pancam_graph.data import Sharing, State, Traverse
 from pancam_graph.elimination import Linkage, Posture
-from pancam_graph.factors import CircleOffset, Fixed, Key, Slot, circle_factor, mast_factor
+from pancam_graph.factors import (
+    CircleOffset,
+    Fixed,
+    Key,
+    Slot,
+    circle_factor,
+    joint_prior_factor,
+    mast_factor,
+)
 from pancam_graph.graph._factors import FactorList
 from pancam_graph.graph._given import Seat
 from pancam_graph.graph._graph_options import Flex, Model
@@ -119,13 +127,21 @@ class SoftTemplate(FactorTemplate):
         poses = [values.atPose3(self.camera_key(i)) for i in range(len(self.traverse.images))]
         return self.views_of(*pose_arrays(poses), values)
 
-    def frame_factors(self, frame: int) -> FactorList:
-        """The prior of a frame's pan and tilt."""
-        entry, slot = self.traverse.frames[frame], self.pan_tilt(frame)
-        if not isinstance(slot, Key):
-            return []
-        sigmas = np.array([entry.sigma_pan_rad, entry.sigma_tilt_rad])
-        return [gtsam.PriorFactorVector(slot.key, self.traverse.pan_tilt_rad[frame], diagonal_noise(sigmas))]
+    def angle_factors(self, stop: int) -> FactorList:
+        """Priors of a stop's pans and tilts: one a frame, or one of all where they share an error."""
+        t = self.traverse
+        free = [f for f in np.flatnonzero(t.frame_stop == stop) if isinstance(self.pan_tilt(int(f)), Key)]
+        frames = np.array(free, dtype=np.int64)
+        if len(frames) and self.let_go.common_rad[stop].any():
+            keys = [Key(key_of(Kind.ANGLES, int(f))) for f in frames]
+            measured = t.pan_tilt_rad[frames].ravel()
+            return [joint_prior_factor(self.angle_noise(stop, frames), keys, measured)]
+        return [
+            gtsam.PriorFactorVector(
+                key_of(Kind.ANGLES, int(f)), t.pan_tilt_rad[f], self.angle_noise(stop, np.array([f]))
+            )
+            for f in frames
+        ]
 
     def tie_factors(self, images: IntArray) -> FactorList:
         """The ties of some images' camera poses to the mast, in the model `circle` also to their circles.
@@ -168,7 +184,7 @@ class SoftTemplate(FactorTemplate):
         """Priors of masts, then of angles."""
         t = self.traverse
         masts = [factor for i in range(len(t.stops)) for factor in self.stop_factors(i)]
-        return masts + [factor for i in range(len(t.frames)) for factor in self.frame_factors(i)]
+        return masts + [factor for i in range(len(t.stops)) for factor in self.angle_factors(i)]
 
     def ties(self, *, apart: bool = False) -> FactorList:
         """Ties of cameras to the mast: one factor for each stop, or for each image if `apart`."""

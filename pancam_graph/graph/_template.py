@@ -2,7 +2,9 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from copy import copy
 from functools import cached_property
+from typing import Self
 
 import gtsam
 import numpy as np
@@ -16,6 +18,7 @@ from pancam_graph.graph._given import GivenFactor, Seat, seated
 from pancam_graph.graph._graph_keys import GraphKeys
 from pancam_graph.graph._graph_options import Model
 from pancam_graph.graph._keys import Kind, index_of, key_of, kind_of, read_variable
+from pancam_graph.graph._let_go import LetGo
 from pancam_graph.graph._rig_variables import RigVariables
 from pancam_graph.landmarks import CameraViews
 
@@ -33,6 +36,13 @@ class FactorTemplate(ABC):
         self.traverse = traverse
         self.model: Model = model
         self.rig_variables = RigVariables(traverse, sharing or Sharing().for_model(model))
+        self.let_go = LetGo.nothing(traverse)
+
+    def letting_go(self, let_go: LetGo) -> Self:
+        """The same variables, with other priors of telemetry: those of all factors made from then on."""
+        other = copy(self)
+        other.let_go = let_go
+        return other
 
     @property
     @abstractmethod
@@ -182,7 +192,17 @@ class FactorTemplate(ABC):
         entry, slot = self.traverse.stops[stop], self.mast(stop)
         if not isinstance(slot, Key):
             return []
-        return [gtsam.PriorFactorPose3(slot.key, entry.world_T_mast, diagonal_noise(entry.sigmas))]
+        sigmas = self.let_go.widened(entry.sigmas, self.let_go.stops[stop])
+        return [gtsam.PriorFactorPose3(slot.key, entry.world_T_mast, diagonal_noise(sigmas))]
+
+    def angle_noise(self, stop: int, frames: IntArray) -> gtsam.noiseModel.Base:
+        """Noise of the pan and tilt of some frames of a stop, one after the other."""
+        stated = np.array([self.traverse.frames[f].sigmas_rad for f in frames])
+        extra = self.let_go.angles_rad[frames]
+        covariance = self.let_go.angle_covariance(stop, stated, extra)
+        if covariance is None:
+            return diagonal_noise(self.let_go.widened(stated, extra).ravel())
+        return gtsam.noiseModel.Gaussian.Covariance(covariance)
 
     def held_of_stops(self) -> dict[int, IntArray]:
         """`held_columns` of the masts."""

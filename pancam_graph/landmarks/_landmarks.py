@@ -134,6 +134,10 @@ class Landmarks:
         depth = np.maximum(w, self.length / furthest_m).clip(1e-300)
         return np.asarray(self.origin_m + x / depth[:, None])
 
+    def of(self, rows: IntArray) -> "Landmarks":
+        """Some of the landmarks."""
+        return Landmarks(vector=self.vector[rows], origin_m=self.origin_m[rows])
+
     def about(self, origin_m: FloatArray) -> "Landmarks":
         """The same points relative to other origins (landmarks, 3)."""
         x = self.vector[:, :3] + self.vector[:, 3:] * (self.origin_m - origin_m)

@@ -31,6 +31,7 @@ from pancam_graph.solve import (
     fitted_elsewhere,
     judge,
     prepare,
+    reconsidered,
     screened_again,
     screened_elsewhere,
     solution_of,
@@ -133,15 +134,15 @@ def _as_solution(
         prepared = prepare(traverse, options, factors=factors)
         template = prepared.problem.template
         assert isinstance(template, HardTemplate)  # the model and tie that the smoother has
-        before = screened_elsewhere(prepared, smoother.values_on(template), used)
-        screened = screened_again(before, unbelieved)
+        before = screened_elsewhere(prepared, smoother.values_on(template), used, unbelieved)
+        screened = screened_again(before)
         fitted = fitted_elsewhere(
             screened,
             costs if factors is None else (*costs, smoother.cost),
             f"{len(updates)} stops added one by one",
             is_optimum=screened is before,
         )
-        solution = solution_of(judge(fitted))
+        solution = solution_of(reconsidered(judge(fitted)))
     by_stop = [updates[int(i)] for i in np.argsort(order)]
     warnings = (w for u in updates for w in u.warnings)
     return replace(

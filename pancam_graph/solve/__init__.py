@@ -18,6 +18,7 @@ from pancam_graph.solve._optimise import optimise as optimise
 from pancam_graph.solve._prepare import Prepared as Prepared
 from pancam_graph.solve._prepare import prepare as prepare
 from pancam_graph.solve._problem import Problem as Problem
+from pancam_graph.solve._reconsider import reconsidered as reconsidered
 from pancam_graph.solve._rejection import robust_scale as robust_scale
 from pancam_graph.solve._rejection import snoop as snoop
 from pancam_graph.solve._screen import Screened as Screened

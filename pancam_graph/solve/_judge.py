@@ -12,6 +12,7 @@ from pancam_graph.solve._carrying import carried_again
 from pancam_graph.solve._covariance import Uncertainty, uncertainty
 from pancam_graph.solve._diagnose import connection_warnings, listed
 from pancam_graph.solve._fit import Fitted, regular
+from pancam_graph.solve._let_go import parts_let_go, sentence
 from pancam_graph.solve._prepare import triangulated
 from pancam_graph.solve._problem import Problem
 from pancam_graph.solve._reduced import ReducedSystem
@@ -30,6 +31,8 @@ class Judged:
     uncertainty: Uncertainty
     used: BoolArray
     """(observations,) whether each took part in the fit."""
+    regular: Problem
+    """The problem as covariances are taken from it."""
     first: Problem
     """The start, with the measurements of the optimum and the landmarks that fit the start best: what is
     gained from there to the optimum is due to the cameras alone."""
@@ -46,11 +49,13 @@ def judge(fitted: Fitted) -> Judged:
     used = np.zeros(len(prepared.observations), dtype=bool)
     used[problem.measurements.row[problem.kept]] = True
     first = _first(fitted)
+    let_go = parts_let_go(prepared.traverse, problem.template.let_go, state)
     return Judged(
         fitted=fitted,
         state=state,
         uncertainty=covariances,
         used=used,
+        regular=regular,
         first=first,
         verdict=verdict(
             Optimum(
@@ -60,10 +65,12 @@ def judge(fitted: Fitted) -> Judged:
                 uncertainty=covariances,
                 used=used,
                 cost_initial=first.cost(),
+                let_go=let_go,
             )
         ),
         warnings=(
             *prepared.warnings,
+            *(f"{sentence(part)}: let go" for part in let_go),
             *warnings,
             *_fit_warnings(fitted, used),
             *connection_warnings(prepared.traverse, used),
@@ -126,6 +133,8 @@ def _first(fitted: Fitted) -> Problem:
     """`Judged.first` of a fit."""
     prepared, problem = fitted.screened.prepared, fitted.problem
     first, m = prepared.problem, problem.measurements
+    if problem.template.let_go:
+        first = replace(first, template=problem.template, factors=problem.factors)
     if m is first.measurements and problem.accepted.all():
         return first
     first = triangulated(replace(first, measurements=m, accepted=problem.accepted)).placed()

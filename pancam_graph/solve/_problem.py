@@ -11,7 +11,7 @@ import numpy as np
 from pancam_graph.base.errors import SolveError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.elimination import LandmarkSystem
-from pancam_graph.graph import Factors, FactorTemplate
+from pancam_graph.graph import Factors, FactorTemplate, LetGo
 from pancam_graph.landmarks import SQUARED, CameraViews, Landmarks, Loss, Measurements, refine, residuals
 from pancam_graph.solve._optimise import Iteration, Outcome
 from pancam_graph.solve._stopping import StopRule
@@ -80,9 +80,16 @@ class Problem:
 
     def on(self, template: FactorTemplate) -> "Problem":
         """The same problem on another template, with the nearest cameras that its variables allow."""
+        template = template.letting_go(self.template.let_go)
         values = template.values(self.template.state(self.values, np.zeros((0, 3))))
         factors = template.factors(self.factors.given, present=self.values)
         return replace(self, template=template, factors=factors, values=values)
+
+    def letting_go(self, let_go: LetGo) -> "Problem":
+        """The same problem with telemetry believed less."""
+        template = self.template.letting_go(let_go)
+        telemetry = tuple(template.telemetry_priors())
+        return replace(self, template=template, factors=replace(self.factors, telemetry=telemetry))
 
     def at(self, values: gtsam.Values, landmarks: Landmarks) -> "Problem":
         """The same problem at other values and landmarks."""

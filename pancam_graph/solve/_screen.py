@@ -9,6 +9,7 @@ import numpy as np
 from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.landmarks import loss_of, refine
 from pancam_graph.solve._chance_links import chance_links
+from pancam_graph.solve._pointing_again import pointing_again
 from pancam_graph.solve._prepare import Prepared, solver_for, triangulated
 from pancam_graph.solve._problem import Problem, Solver
 from pancam_graph.solve._rejection import Snooping, snoop
@@ -38,6 +39,8 @@ class Screened:
     """(observations,) whether each was an outlier in any round, also if it was accepted again later."""
     by_chance: BoolArray
     """(observations,) whether each was left out though it fits, since chance alone explains its links."""
+    excluded: BoolArray
+    """(observations,) whether each is never accepted, whatever its residual."""
     is_near: bool
     """Whether the cameras were adjusted already, so that no rigid mast is fitted first."""
 
@@ -55,24 +58,38 @@ def screen(prepared: Prepared) -> Screened:
             problem=prepared.problem,
             set_aside=np.zeros(n, dtype=bool),
             by_chance=np.zeros(n, dtype=bool),
+            excluded=np.zeros(n, dtype=bool),
             is_near=prepared.is_near,
         )
     rounds = ScreeningRounds(prepared)
     rounds.from_telemetry()
     rounds.bring_near()
+    rounds.turn_back()
     return rounds.to_the_end()
 
 
-def screened_elsewhere(prepared: Prepared, values: gtsam.Values, used: BoolArray) -> Screened:
-    """The prepared problem at values that were estimated elsewhere, with the observations (n,) used there."""
+def screened_elsewhere(
+    prepared: Prepared, values: gtsam.Values, used: BoolArray, excluded: BoolArray | None = None
+) -> Screened:
+    """The prepared problem at values that were estimated elsewhere, with the observations (n,) used there.
+
+    Those `excluded` (n,) are not accepted later either.
+    """
     accepted = used[prepared.problem.measurements.row]
     problem = triangulated(replace(prepared.problem, accepted=accepted, values=values)).placed()
     nothing = np.zeros(len(used), dtype=bool)
-    return Screened(prepared=prepared, problem=problem, set_aside=nothing, by_chance=nothing, is_near=True)
+    return Screened(
+        prepared=prepared,
+        problem=problem,
+        set_aside=nothing,
+        by_chance=nothing,
+        excluded=nothing if excluded is None else excluded,
+        is_near=True,
+    )
 
 
-def screened_again(screened: Screened, excluded: BoolArray) -> Screened:
-    """The observations judged anew, from where the cameras are; those `excluded` (n,) are not accepted.
+def screened_again(screened: Screened) -> Screened:
+    """The observations judged anew, from where the cameras are; those excluded are not accepted.
 
     The same object, unless one test of all observations with the cameras held judges more than very few of
     them otherwise. Where the residuals decide how large the noise is, they are always judged anew: whoever
@@ -81,9 +98,9 @@ def screened_again(screened: Screened, excluded: BoolArray) -> Screened:
     prepared = screened.prepared
     if prepared.options.loss == "none":
         return screened
-    rounds = ScreeningRounds(replace(prepared, problem=screened.problem, is_near=True), excluded)
+    rounds = ScreeningRounds(replace(prepared, problem=screened.problem, is_near=True), screened.excluded)
     changed = rounds.share_changed()
-    if not prepared.rescales_noise and changed <= _ABOUT:
+    if not (rounds.turn_back() or prepared.rescales_noise or changed > _ABOUT):
         return screened
     # The start stays the one that was prepared, with which the end is compared.
     return replace(rounds.to_the_end(), prepared=prepared)
@@ -97,9 +114,11 @@ class ScreeningRounds:
         self._prepared = prepared
         self._solver: Solver = solver_for(prepared.options, prepared.on_iteration, is_near=prepared.is_near)
         self.problem = prepared.problem
+        self._let_go = prepared.problem.template.let_go
         self._scale = 1.0
         nothing = np.zeros(len(prepared.observations), dtype=bool)
-        self._banned = (nothing if excluded is None else excluded)[self.problem.measurements.row]
+        self._excluded = nothing if excluded is None else excluded
+        self._banned = self._excluded[self.problem.measurements.row]
         self.set_aside = nothing.copy()
         self.by_chance = nothing.copy()
 
@@ -128,6 +147,20 @@ class ScreeningRounds:
             if n_changed <= _ABOUT * len(self.problem.accepted):
                 break
 
+    def turn_back(self) -> bool:
+        """Turn frames that lost their links to where these agree; whether there is any.
+
+        The priors of what is turned are let go, until screening ends.
+        """
+        before = self.problem
+        self.problem = pointing_again(
+            before,
+            self._banned,
+            cutoff_sigma=self._prepared.options.outlier_sigma,
+            scale=self._scale,
+        )
+        return self.problem is not before
+
     def share_changed(self) -> float:
         """Share of the observations that one test of all of them, with the cameras held, judges otherwise."""
         before = self.problem.accepted
@@ -147,11 +180,15 @@ class ScreeningRounds:
                 break
             self._banned |= by_chance
             self.by_chance[self.problem.measurements.row[by_chance]] = True
+        if self.problem.template.let_go is not self._let_go:
+            # Whose error it was, the whole of telemetry decides (`reconsidered`).
+            self.problem = self.problem.letting_go(self._let_go)
         return Screened(
             prepared=self._prepared,
             problem=self.problem,
             set_aside=self.set_aside,
             by_chance=self.by_chance,
+            excluded=self._excluded,
             is_near=True,
         )
 

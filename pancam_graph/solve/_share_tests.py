@@ -11,7 +11,7 @@ from pancam_graph.data import VerdictTest
 from pancam_graph.solve._chances import CHANCE
 from pancam_graph.solve._problem import Problem
 
-__all__ = ["shares_in_use"]
+__all__ = ["let_go_links", "links_of", "shares_in_use"]
 
 _LEFT_OUT = 0.9
 """Largest share of the observations that may be left out as outliers."""
@@ -20,6 +20,8 @@ _FAIR = 0.25
 _FAIR_LINKS = 0.6
 """... and of points that join it to others: a pose that is wrong keeps some of these, as two rays meet
 wherever they lie in one plane."""
+_FAIR_LET_GO = 0.95
+"""The same of a frame whose telemetry was let go: its pointing is then right, or something else is wrong."""
 _OBSERVATIONS = 12
 """Images, frames and stops with fewer observations are not tested alone ..."""
 _LINKS = 4
@@ -50,10 +52,29 @@ def shares_in_use(problem: Problem) -> Iterator[VerdictTest]:
     for name, owner, ids in (frames, stops):
         what = f"points shared with another {name}"
         test = _Fairness(name=f"{name} links", owner=name, what=what, least=_LINKS, fair=_FAIR_LINKS, ids=ids)
-        yield test.of(*_links(problem, owner))
+        yield test.of(*links_of(problem, owner))
 
 
-def _links(problem: Problem, owner: IntArray) -> tuple[IntArray, BoolArray]:
+def let_go_links(problem: Problem) -> Iterator[VerdictTest]:
+    """That a frame whose pan or tilt was let go has found its links again; none where no frame's was.
+
+    If it has not, it is not its telemetry that is wrong, or not only.
+    """
+    t, frames = problem.template.traverse, np.flatnonzero(problem.template.let_go.angles_rad.any(axis=1))
+    if not len(frames):
+        return
+    test = _Fairness(
+        name="links let go",
+        owner="frame",
+        what="points shared with another frame",
+        least=_LINKS,
+        fair=_FAIR_LET_GO,
+        ids=[f.id for f in t.frames],
+    )
+    yield test.of(*links_of(problem, t.image_frame), among=frames)
+
+
+def links_of(problem: Problem, owner: IntArray) -> tuple[IntArray, BoolArray]:
     """Each owner of each landmark that two owners or more see (n,), and whether it still joins them (n,).
 
     `owner` (images,) is the frame or the stop of each image.
@@ -84,16 +105,22 @@ class _Fairness:
     """Part of the usual share in use that each must have."""
     ids: Sequence[str]
 
-    def of(self, owner: IntArray, kept: BoolArray) -> VerdictTest:
-        """The test, given the owner of each thing (n,) and whether it is in use (n,)."""
+    def of(self, owner: IntArray, kept: BoolArray, among: IntArray | None = None) -> VerdictTest:
+        """The test, given the owner of each thing (n,) and whether it is in use (n,).
+
+        Only owners `among` some are tested; default: all.
+        """
+        is_tested = np.ones(len(self.ids), dtype=bool)
+        if among is not None:
+            is_tested = np.isin(np.arange(len(self.ids)), among)
         usual = float(np.mean(kept)) if len(kept) else 1.0
         n = np.bincount(owner, minlength=len(self.ids))
         used = np.bincount(owner, kept, minlength=len(self.ids))
         share, limit = used / n.clip(1), 1 - self.fair * usual
         # Few are in use by chance too, where few are owned.
         is_sure = scipy.special.bdtr(used, n, usual) < CHANCE / len(self.ids)
-        suspect = (n >= self.least) & is_sure & (share < self.fair * usual)
-        tested = np.flatnonzero(suspect if suspect.any() else n >= self.least)
+        suspect = is_tested & (n >= self.least) & is_sure & (share < self.fair * usual)
+        tested = np.flatnonzero(suspect if suspect.any() else is_tested & (n >= self.least))
         if not len(tested):
             good = f"too few {self.what} to test a {self.owner} alone"
             return VerdictTest.of(self.name, None, limit, good, "")

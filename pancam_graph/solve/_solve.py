@@ -15,6 +15,7 @@ from pancam_graph.solve._judge import judge
 from pancam_graph.solve._optimise import Iteration
 from pancam_graph.solve._options import SolveOptions
 from pancam_graph.solve._prepare import prepare
+from pancam_graph.solve._reconsider import reconsidered
 from pancam_graph.solve._screen import screen
 from pancam_graph.solve._solution_of import solution_of
 
@@ -55,6 +56,7 @@ def solve(
         screened = screen(prepared)
         fitted = fit(screened)
         judged = judge(fitted)
+        judged = reconsidered(judged)
         clock.ended("solve")
         solution = solution_of(judged)
         clock.ended("report")

@@ -1,25 +1,31 @@
 """How far a solution moved from its telemetry, in units of what telemetry's stated errors and images allow.
 
-A prior's correction e, in units of its sigma, has the covariance D = I - S^-1 C S^-1 if everything is as
-stated: S has the sigmas, C is the covariance of the solution. A suspected error of the form h (one entry, or
-one offset of many entries) is tested by |h'e| / sqrt(h'Dh), the w-test of data snooping (Baarda 1968); for
-errors of independent telemetry it is the most powerful one.
+A prior's correction e has the covariance S - C if everything is as stated: S is the prior's covariance, C
+that of the solution. A suspected error along a (one entry, or one offset of many entries) is tested by
+|a'z| / sqrt(a'Ka) with z = S^-1 e and K = S^-1 - S^-1 C S^-1, the w-test of data snooping (Baarda 1968); the
+error itself is estimated as a'z / a'Ka.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import TypedDict
 
 import gtsam
 import numpy as np
+import scipy
 
 from pancam_graph.base.geometry import FloatArray, IntArray, pose_arrays
-from pancam_graph.elimination import Covariance, JointCovariance
+from pancam_graph.elimination import Covariance, JointCovariance, Root
 from pancam_graph.graph import FactorTemplate, Kind, index_of, kind_of
+from pancam_graph.solve._covariance import Uncertainty
 from pancam_graph.solve._problem import Problem
 
 __all__ = [
+    "MAST_ENTRIES",
     "Correction",
     "StopTelemetry",
+    "Suspected",
     "corrections",
     "leg_corrections",
     "telemetry_of",
@@ -29,7 +35,7 @@ __all__ = [
 MAST_ENTRIES = ("roll", "pitch", "heading", "x", "y", "z")
 """Entries of a mast pose's tangent, in the mast's own frame."""
 _BLIND = 1e-6
-"""Variance of a correction, in units of the prior's, below which images say nothing of the entry."""
+"""Share of an error that shows in the correction, below which images say nothing of it."""
 _MOST_STOPS = 100
 """Legs are tested in drives of up to this many stops: the joint covariance of all stops is dense."""
 
@@ -43,106 +49,231 @@ class StopTelemetry:
     """(n,) `pan`, `tilt`, or one of `MAST_ENTRIES`."""
     frame: IntArray
     """(n,) row of the frame that an angle belongs to; -1 for entries of the mast."""
+    column: IntArray
+    """(n,) among the columns of the stop's group of variables."""
+    correction: FloatArray
+    """(n,) estimate less telemetry, radians or metres."""
     sigma: FloatArray
     """(n,) of the prior, radians or metres."""
-    whitened: FloatArray
-    """(n,) corrections in units of their sigmas."""
-    spread: FloatArray
-    """(n, n) covariance of `whitened` if all errors are as stated."""
+    whitening: FloatArray | None
+    """(n, n) that turns errors of telemetry to unit variance; None where they are independent."""
+    posterior: FloatArray
+    """(n, n) covariance of the solution."""
+
+    @property
+    def whitened(self) -> FloatArray:
+        """(n,) corrections; their covariance would be I if images were all."""
+        if self.whitening is None:
+            return np.asarray(self.correction / self.sigma)
+        return np.asarray(self.whitening @ self.correction)
+
+    @cached_property
+    def spread(self) -> FloatArray:
+        """(n, n) covariance of `whitened` if all errors are as stated."""
+        w, eye = self.whitening, np.eye(len(self.sigma))
+        if w is None:
+            return np.asarray(eye - self.posterior / np.outer(self.sigma, self.sigma))
+        return np.asarray(eye - w @ self.posterior @ w.T)
+
+    @cached_property
+    def pull(self) -> FloatArray:
+        """(n,) z = S^-1 e."""
+        return self.back(self.whitened)
+
+    @cached_property
+    def shown(self) -> FloatArray:
+        """(n, n) K = S^-1 - S^-1 C S^-1, the covariance of `pull`."""
+        return self.back(self.back(self.spread).T)
+
+    def back(self, m: FloatArray) -> FloatArray:
+        """W' m, of W that whitens."""
+        if self.whitening is None:
+            return np.asarray((m.T / self.sigma).T)
+        return np.asarray(self.whitening.T @ m)
+
+    def told(self, along: FloatArray) -> FloatArray:
+        """S^-1 a of an error along a (n,)."""
+        if self.whitening is None:
+            return np.asarray(along / self.sigma**2)
+        return np.asarray(self.whitening.T @ (self.whitening @ along))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Correction:
     """One suspected error of telemetry, and how strongly the solution speaks for it."""
 
     entry: str
-    """As in `StopTelemetry.entry`."""
+    """As in `StopTelemetry.entry`, or `leg x`, `leg y`, `leg z`."""
     stop: int
+    """Row of the stop; of a leg the one at its end."""
     frame: int | None
     """Row of the frame; None if the error is one of the stop, or common to its frames."""
     is_common: bool
     """Whether all frames of the stop share it."""
     size: float
     """Correction, radians or metres; of a common one the mean."""
+    error: float
+    """Estimate of the suspected error, radians or metres."""
+    shown: float
+    """Information on the error, one over its variance: a'Ka."""
     sigmas: float
     """Size of the test, absolute: a standard normal number if telemetry is as stated."""
+    along: Mapping[int, FloatArray]
+    """By stop, the suspected error's share (n,) in each entry of its `StopTelemetry`."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Suspected:
+    """All errors of telemetry that a solution is tested for."""
+
+    telemetry: list[StopTelemetry]
+    angles: list[Correction]
+    """Of pans and tilts, single and common to a stop."""
+    stops: list[Correction]
+    """Of stops, and of legs."""
+    root: Root
+    """Square root of the system that the covariances are of."""
+
+    @staticmethod
+    def of(problem: Problem, u: Uncertainty) -> "Suspected":
+        """Those of a solution whose covariances are known."""
+        assert u.variables is not None  # the caller has looked
+        assert u.masts is not None
+        telemetry = telemetry_of(problem, u.variables)
+        single = list(corrections(telemetry))
+        angles = [c for c in single if c.entry in {"pan", "tilt"}]
+        stops = [c for c in single if c.entry not in {"pan", "tilt"}]
+        stops += leg_corrections(problem, telemetry, u.masts)
+        return Suspected(telemetry=telemetry, angles=angles, stops=stops, root=u.masts.root)
+
+    @property
+    def n_entries(self) -> int:
+        """Number of entries of telemetry that are not held."""
+        return sum(len(one.entry) for one in self.telemetry)
 
 
 def telemetry_of(problem: Problem, covariance: Covariance) -> list[StopTelemetry]:
     """Corrections of all stops at a problem's values; `covariance` is that of its variables."""
-    template = problem.template
-    found: dict[int, list[tuple[int, tuple[str, ...], IntArray, FloatArray, FloatArray]]] = {}
+    template, link = problem.template, problem.template.linkage
+    held = link.by_group(template.held_columns().items())
+    parts: dict[int, list[_Prior]] = {}
     for factor in problem.factors.telemetry:
         keys = list(factor.keys())
-        if len(keys) != 1 or kind_of(keys[0]) not in {Kind.MAST, Kind.ANGLES}:
+        kinds = [kind_of(key) for key in keys]
+        if kinds != [Kind.MAST] and set(kinds) != {Kind.ANGLES}:
             continue  # a motion between two stops
         assert isinstance(factor, gtsam.NoiseModelFactor)  # every prior is one
-        stop, entry, frame = _entries(template, keys[0])
-        sigma = np.asarray(factor.noiseModel().sigmas())
-        found.setdefault(stop, []).append(
-            (keys[0], entry, frame, sigma, np.asarray(factor.unwhitenedError(problem.values)))
-        )
-    out = []
-    for stop, parts in sorted(found.items()):
-        link = template.linkage
-        columns = np.concatenate([np.arange(c.start, c.stop) for p in parts for c in [link.columns_of(p[0])]])
-        entry = tuple(name for p in parts for name in p[1])
-        frame, sigma, error = (np.concatenate([p[k] for p in parts]) for k in (2, 3, 4))
-        free = np.flatnonzero(sigma > 0)
-        columns, sigma = columns[free], sigma[free]
-        block = covariance.block(stop, stop)[np.ix_(columns, columns)]
-        out.append(
-            StopTelemetry(
-                stop=stop,
-                entry=tuple(entry[i] for i in free),
-                frame=frame[free],
+        stop, entry, frame = _entries(template, keys)
+        noise = factor.noiseModel()
+        sigma = np.asarray(noise.sigmas())
+        parts.setdefault(stop, []).append(
+            _Prior(
+                entry=entry,
+                frame=frame,
+                column=np.concatenate([np.arange(c.start, c.stop) for c in map(link.columns_of, keys)]),
+                correction=np.asarray(factor.unwhitenedError(problem.values)),
                 sigma=sigma,
-                whitened=error[free] / sigma,
-                spread=np.eye(len(free)) - block / np.outer(sigma, sigma),
+                whitening=_correlated(noise),
             )
         )
-    return out
+    none = np.zeros(0, dtype=np.int64)
+    return [_of_stop(s, of_stop, held.get(s, none), covariance) for s, of_stop in sorted(parts.items())]
 
 
-def _entries(template: FactorTemplate, key: int) -> tuple[int, tuple[str, ...], IntArray]:
-    """Stop of a variable, and the name and frame of each of its components."""
-    if kind_of(key) is Kind.MAST:
-        return index_of(key), MAST_ENTRIES, np.full(6, -1)
-    frames = template.angle_frames(key)
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Prior:
+    """One prior of telemetry."""
+
+    entry: tuple[str, ...]
+    frame: IntArray
+    column: IntArray
+    correction: FloatArray
+    sigma: FloatArray
+    whitening: FloatArray | None
+    """As in `StopTelemetry`."""
+
+
+def _correlated(noise: gtsam.noiseModel.Base) -> FloatArray | None:
+    """The whitening matrix of noise whose components are not independent."""
+    if isinstance(noise, gtsam.noiseModel.Diagonal) or not isinstance(noise, gtsam.noiseModel.Gaussian):
+        return None
+    return np.asarray(noise.R())
+
+
+def _of_stop(stop: int, priors: Sequence[_Prior], held: IntArray, covariance: Covariance) -> StopTelemetry:
+    """All priors of a stop, without the `held` columns of its variables."""
+    column, sigma = (np.concatenate([getattr(p, name) for p in priors]) for name in ("column", "sigma"))
+    free = np.flatnonzero(~np.isin(column, held))
+    whitening = None
+    if any(p.whitening is not None for p in priors):
+        # A held entry has no correlation with others.
+        blocks = [
+            np.diag(1 / np.where(p.sigma > 0, p.sigma, 1.0)) if p.whitening is None else p.whitening
+            for p in priors
+        ]
+        whitening = np.asarray(scipy.linalg.block_diag(*blocks)[np.ix_(free, free)])
+    entry = [name for p in priors for name in p.entry]
+    return StopTelemetry(
+        stop=stop,
+        entry=tuple(entry[i] for i in free),
+        frame=np.concatenate([p.frame for p in priors])[free],
+        column=column[free],
+        correction=np.concatenate([p.correction for p in priors])[free],
+        sigma=sigma[free],
+        whitening=whitening,
+        posterior=covariance.block(stop, stop)[np.ix_(column[free], column[free])],
+    )
+
+
+def _entries(template: FactorTemplate, keys: Sequence[int]) -> tuple[int, tuple[str, ...], IntArray]:
+    """Stop of some variables, and the name and frame of each of their components."""
+    if kind_of(keys[0]) is Kind.MAST:
+        return index_of(keys[0]), MAST_ENTRIES, np.full(6, -1)
+    frames = np.concatenate([template.angle_frames(key) for key in keys])
     return int(template.traverse.frame_stop[frames[0]]), ("pan", "tilt") * len(frames), np.repeat(frames, 2)
 
 
 def corrections(telemetry: Sequence[StopTelemetry]) -> Iterator[Correction]:
     """Each entry by itself, and a common offset of the pans, and of the tilts, of each stop."""
     for one in telemetry:
-        variance = np.diag(one.spread)
-        for i in np.flatnonzero(variance > _BLIND):
+        n, names = len(one.entry), np.array(one.entry)
+        for i in range(n):
             frame = int(one.frame[i])
-            yield Correction(
-                entry=one.entry[i],
-                stop=one.stop,
-                frame=None if frame < 0 else frame,
-                is_common=False,
-                size=float(one.whitened[i] * one.sigma[i]),
-                sigmas=float(abs(one.whitened[i]) / np.sqrt(variance[i])),
-            )
+            if found := _along(one, np.eye(n)[i]):
+                yield Correction(
+                    entry=one.entry[i],
+                    stop=one.stop,
+                    frame=None if frame < 0 else frame,
+                    is_common=False,
+                    **found,
+                )
         for name in ("pan", "tilt"):
-            rows = np.flatnonzero(np.array(one.entry) == name)
-            if len(rows) < 2:
-                continue
-            shape = 1 / one.sigma[rows]
-            shape /= np.linalg.norm(shape)
-            variance_of_offset = float(shape @ one.spread[np.ix_(rows, rows)] @ shape)
-            if variance_of_offset <= _BLIND:
-                continue
-            yield Correction(
-                entry=name,
-                stop=one.stop,
-                frame=None,
-                is_common=True,
-                size=float(np.mean(one.whitened[rows] * one.sigma[rows])),
-                sigmas=float(abs(shape @ one.whitened[rows]) / np.sqrt(variance_of_offset)),
-            )
+            shape = (names == name).astype(float)
+            if shape.sum() > 1 and (found := _along(one, shape)):
+                yield Correction(entry=name, stop=one.stop, frame=None, is_common=True, **found)
+
+
+class _Found(TypedDict):
+    size: float
+    error: float
+    shown: float
+    sigmas: float
+    along: Mapping[int, FloatArray]
+
+
+def _along(one: StopTelemetry, shape: FloatArray) -> _Found | None:
+    """The test of an error along a shape (n,) of one stop's entries; None where images say nothing of it."""
+    shown = float(shape @ one.shown @ shape)
+    if shown <= _BLIND * float(shape @ one.told(shape)):
+        return None
+    pull = float(shape @ one.pull)
+    return _Found(
+        size=float(shape @ one.correction / shape.sum()),
+        error=pull / shown,
+        shown=shown,
+        sigmas=abs(pull) / np.sqrt(shown),
+        along={one.stop: shape},
+    )
 
 
 def total(telemetry: Sequence[StopTelemetry]) -> tuple[float, float]:
@@ -160,64 +291,76 @@ def total(telemetry: Sequence[StopTelemetry]) -> tuple[float, float]:
     return float(np.sqrt(squares / expected)), expected**2 / variance
 
 
-def leg_corrections(problem: Problem, masts: JointCovariance) -> list[Correction]:
+def leg_corrections(
+    problem: Problem, telemetry: Sequence[StopTelemetry], masts: JointCovariance
+) -> list[Correction]:
     """A shift of all stops after a leg against all before it, for each leg; the entries are `leg x` to `z`.
 
-    In the directions of the world's axes. None in drives of fewer than two free stops, or of very many.
+    In the directions of the world's axes. None in drives of fewer than two stops, or of very many.
     """
     stops = problem.template.traverse.stops
     n = len(stops)
     if not 2 <= n <= _MOST_STOPS:
         return []
-    e, D, world_R = _positions(problem, masts)
-    sigma = np.array([stop.sigma_translation_m for stop in stops])
+    e, D, sigma = _positions(telemetry, masts, n)
+    world_R, _ = pose_arrays([stop.world_T_mast for stop in stops])
     out = []
     for after in range(1, n):
         for axis, name in enumerate(("leg x", "leg y", "leg z")):
-            shape = np.zeros((n, 3))
-            later = np.flatnonzero(sigma[after:] > 0) + after
-            shape[later] = world_R[later][:, axis] / sigma[later, None]
-            h = shape.ravel()
-            if not h.any():
+            shift = np.where(sigma > 0, world_R[:, axis], 0.0)
+            shift[:after] = 0.0
+            h = np.divide(shift, sigma, out=np.zeros_like(shift), where=sigma > 0).ravel()
+            variance, along = float(h @ D @ h), dict[int, FloatArray]()
+            if variance <= _BLIND * float(h @ h):
                 continue
-            h /= np.linalg.norm(h)
-            variance = float(h @ D @ h)
-            if variance > _BLIND:
-                out.append(
-                    Correction(
-                        entry=name,
-                        stop=after,
-                        frame=None,
-                        is_common=False,
-                        size=float(h @ e / np.linalg.norm(shape)),
-                        sigmas=float(abs(h @ e) / np.sqrt(variance)),
-                    )
+            for one in telemetry:
+                if shift[one.stop].any():
+                    along[one.stop] = np.zeros(len(one.entry))
+                    along[one.stop][_position_rows(one)] = shift[one.stop]
+            out.append(
+                Correction(
+                    entry=name,
+                    stop=after,
+                    frame=None,
+                    is_common=False,
+                    size=float(h @ e / (h @ h)),
+                    error=float(h @ e / variance),
+                    shown=variance,
+                    sigmas=float(abs(h @ e) / np.sqrt(variance)),
+                    along=along,
                 )
+            )
     return out
 
 
-def _positions(problem: Problem, masts: JointCovariance) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Corrections of all positions (3 stops,), their covariance if all is as stated, and world_R_mast."""
-    stops, values = problem.template.traverse.stops, problem.values
-    n = len(stops)
-    world_R, _ = pose_arrays([stop.world_T_mast for stop in stops])
-    e, C = np.zeros((n, 3)), np.zeros((n, 3, n, 3))
+def _position_rows(one: StopTelemetry) -> slice:
+    """Rows of a stop's x, y and z; none where telemetry holds them."""
+    begin = one.entry.index("x") if "x" in one.entry else 0
+    return slice(begin, begin + 3 * ("x" in one.entry))
+
+
+def _positions(
+    telemetry: Sequence[StopTelemetry], masts: JointCovariance, n: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Corrections of positions (3 n,) over their sigmas, their covariance if all is as stated, the sigmas.
+
+    The sigma (n, 3) of a position that telemetry holds is 0. A position's errors depend on no others.
+    """
+    e, C, sigma = np.zeros((n, 3)), np.zeros((n, 3, n, 3)), np.zeros((n, 3))
     begin = np.concatenate([[0], np.cumsum(masts.root.structure.dim)])
-    sigma = np.array([stop.sigma_translation_m for stop in stops])
-    free = [i for i, place in enumerate(masts.places) if place is not None and sigma[i] > 0]
-    estimated = problem.template.masts(values)
-    for i in free:
-        place = masts.places[i]
-        assert place is not None  # as `free` says
-        start = place.columns.start
-        columns = masts.root.inverse_columns(place.group, slice(start + 3, start + 6))
-        e[i] = stops[i].world_T_mast.localCoordinates(estimated[i])[3:] / sigma[i]
-        for j in free:
-            other = masts.places[j]
-            assert other is not None  # as `free` says
-            first = int(begin[other.group]) + other.columns.start + 3
-            C[j, :, i] = columns[first : first + 3] / (sigma[i] * sigma[j])
+    rows = {one.stop: _position_rows(one) for one in telemetry}
+    free = [one for one in telemetry if rows[one.stop].stop]
+    columns = {one.stop: one.column[rows[one.stop]] for one in free}
+    for one in free:
+        sigma[one.stop] = one.sigma[rows[one.stop]]
+        e[one.stop] = one.correction[rows[one.stop]] / sigma[one.stop]
+    for one in free:
+        i, of_one = one.stop, columns[one.stop]
+        inverse = masts.root.inverse_columns(i, slice(int(of_one[0]), int(of_one[-1]) + 1))
+        for other in free:
+            j = other.stop
+            C[j, :, i] = inverse[begin[j] + columns[j]] / np.outer(sigma[j], sigma[i])
     D = -C
-    for i in free:
-        D[i, :, i] += np.eye(3)
-    return e.ravel(), D.reshape(3 * n, 3 * n), world_R
+    for one in free:
+        D[one.stop, :, one.stop] += np.eye(3)
+    return e.ravel(), D.reshape(3 * n, 3 * n), sigma

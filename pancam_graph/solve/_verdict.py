@@ -14,18 +14,13 @@ from pancam_graph.data import Traverse, Verdict, VerdictTest
 from pancam_graph.solve._chances import CHANCE, rms_limit, two_sided_limit
 from pancam_graph.solve._covariance import Uncertainty
 from pancam_graph.solve._fit import Fitted
+from pancam_graph.solve._let_go import Part, most_let_go, sentence
 from pancam_graph.solve._noise_tests import Residuals
 from pancam_graph.solve._problem import Problem
 from pancam_graph.solve._reduced import ReducedSystem
 from pancam_graph.solve._rig_score import HeldEntry, held_entries
-from pancam_graph.solve._share_tests import shares_in_use
-from pancam_graph.solve._telemetry_tests import (
-    Correction,
-    corrections,
-    leg_corrections,
-    telemetry_of,
-    total,
-)
+from pancam_graph.solve._share_tests import let_go_links, shares_in_use
+from pancam_graph.solve._telemetry_tests import Correction, Suspected, total
 
 __all__ = ["Optimum", "verdict"]
 
@@ -37,6 +32,8 @@ _OVERSTATED = 2.0
 """Ratio of the stated noise to residuals from which it is said."""
 _UNEVEN = 2.0
 """Largest ratio of an image's, or a camera's, residuals to those of all."""
+_NAMED = 6
+"""Parts of telemetry let go that are named."""
 _HELD_GAIN = 25.0
 """Decrease of the cost from which a held number of the rig is named, if it is also this ..."""
 _HELD_SHARE = 0.02
@@ -57,6 +54,8 @@ class Optimum:
     """(observations,) whether each is in use."""
     cost_initial: float
     """Cost at the start, over the same observations."""
+    let_go: Sequence[Part]
+    """What of telemetry was let go."""
 
     @property
     def traverse(self) -> Traverse:
@@ -70,7 +69,14 @@ def verdict(at: Optimum) -> Verdict:
     tests = [_converged(at), _finite(residuals), _cost(at), _optimum(at), *shares_in_use(at.fitted.problem)]
     if len(residuals.square):
         tests += _noise(at, residuals)
-    tests += [_sigmas(at), *_telemetry(at), *_freed(at), *_held(at)]
+    tests += [
+        _sigmas(at),
+        *_telemetry(at),
+        _let_go(at),
+        *let_go_links(at.fitted.problem),
+        *_freed(at),
+        *_held(at),
+    ]
     return Verdict(tests=tuple(tests))
 
 
@@ -163,6 +169,27 @@ def _noise(at: Optimum, residuals: Residuals) -> Iterator[VerdictTest]:
     eyes = [eye.name for eye in t.rig.eyes]
     yield _uneven("camera", residuals, t.image_eye, eyes)
     yield _uneven("image", residuals, np.arange(len(t.images)), [i.id for i in t.images])
+    yield from _noise_let_go(at.fitted.problem, residuals)
+
+
+def _noise_let_go(problem: Problem, residuals: Residuals) -> Iterator[VerdictTest]:
+    """That frames whose pan or tilt was let go fit like all others; none where no frame's was."""
+    t, frames = problem.template.traverse, np.flatnonzero(problem.template.let_go.angles_rad.any(axis=1))
+    if not len(frames):
+        return
+    ratio, freedom = residuals.by(t.image_frame, len(t.frames))
+    allowed = np.array([rms_limit(freedom[f], CHANCE / len(frames)) for f in frames])
+    sure = ratio[frames] / max(residuals.ratio, 1e-300) / allowed
+    worst = int(np.argmax(sure))
+    name = t.frames[frames[worst]].id
+    yield VerdictTest.of(
+        "noise let go",
+        float(sure[worst]),
+        1.0,
+        "frames whose telemetry was let go fit like all others",
+        f"residuals of frame {name}, whose telemetry was let go, are {sure[worst]:.3g} times what chance "
+        "allows: its pixels are probably wrong, not its pointing; leave it out",
+    )
 
 
 def _uneven(name: str, residuals: Residuals, owner: IntArray, ids: Sequence[str]) -> VerdictTest:
@@ -212,8 +239,8 @@ def _telemetry(at: Optimum) -> Iterator[VerdictTest]:
     u = at.uncertainty
     if u.variables is None or u.masts is None:
         return
-    telemetry = telemetry_of(at.problem, u.variables)
-    rms, freedom = total(telemetry)
+    suspected = Suspected.of(at.problem, u)
+    rms, freedom = total(suspected.telemetry)
     if freedom > 0:
         says = f"corrections of telemetry are {rms:.3g} times what its sigmas and the images allow (RMS)"
         yield VerdictTest.of(
@@ -223,10 +250,7 @@ def _telemetry(at: Optimum) -> Iterator[VerdictTest]:
             says,
             f"{says}: give telemetry larger sigmas, or look for a wrong rig or wrong matches",
         )
-    single = list(corrections(telemetry))
-    angles = [c for c in single if c.entry in {"pan", "tilt"}]
-    stops = [c for c in single if c.entry not in {"pan", "tilt"}]
-    stops += leg_corrections(at.problem, u.masts)
+    angles, stops = suspected.angles, suspected.stops
     for name, some, widen in (
         ("pointing", angles, "widen sigma_pan_rad and sigma_tilt_rad there"),
         ("stops", stops, "widen sigma_translation_m and sigma_rotation_rad there"),
@@ -241,6 +265,26 @@ def _telemetry(at: Optimum) -> Iterator[VerdictTest]:
                 f"largest correction: {says}",
                 f"{says}: this telemetry, or what the images say of it, is wrong; {widen}, or check the rig",
             )
+
+
+def _let_go(at: Optimum) -> VerdictTest:
+    """Parts of telemetry that were let go; too many fail."""
+    parts, most = at.let_go, most_let_go(2 * len(at.traverse.frames) + 6 * len(at.traverse.stops))
+    if not parts:
+        return VerdictTest.note("let go", 0.0, 0.0, "no telemetry was let go", "")
+    some = "; ".join(sentence(part) for part in parts[:_NAMED])
+    says = f"{len(parts)} part{'s' if len(parts) > 1 else ''} of telemetry let go: {some}"
+    if len(parts) > _NAMED:
+        says += f"; and {len(parts) - _NAMED} more"
+    if len(parts) <= most:
+        return VerdictTest.note("let go", float(len(parts)), 0.0, "", f"{says}; look where it came from")
+    return VerdictTest.of(
+        "let go",
+        float(len(parts)),
+        float(most),
+        "",
+        f"{says}: too many to believe the rest; check telemetry, its sigmas, and the rig",
+    )
 
 
 def _describe(c: Correction, t: Traverse) -> str:

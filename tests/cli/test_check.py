@@ -4,7 +4,6 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from pancam_graph import SimulationOptions, simulate, write_traverse
@@ -29,9 +28,12 @@ def wrong(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("wrong")
     options = SimulationOptions(stops=1, pans=7, points_per_image=15)
     traverse = simulate(mer_navcam(), options, seed=2).traverse
-    frames = list(traverse.frames)
-    frames[3] = replace(frames[3], tilt_rad=frames[3].tilt_rad + np.deg2rad(2.0))
-    write_traverse(replace(traverse, frames=tuple(frames)), folder / "in")
+    observations = traverse.observations
+    assert observations is not None
+    # The pixels of frame 3 see nothing that the other frames see.
+    uv_px, of_frame = observations.uv_px.copy(), traverse.image_frame[observations.image] == 3
+    uv_px[of_frame] = uv_px[of_frame][:, ::-1]
+    write_traverse(traverse.with_observations(replace(observations, uv_px=uv_px)), folder / "in")
     assert main(["refine", str(folder / "in"), "--out", str(folder / "out"), "--no-report", "--quiet"]) == 1
     return folder / "out"
 

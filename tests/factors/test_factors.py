@@ -15,6 +15,7 @@ from pancam_graph.factors import (
     Key,
     circle_factor,
     circle_residual,
+    joint_prior_factor,
     mast_factor,
 )
 from pancam_graph.rigs import Eye, Rig, exomars_pancam
@@ -263,3 +264,31 @@ def test_an_exception_in_a_factor_reaches_the_caller() -> None:
     call: Callable[[gtsam.Values], float] = graph.error
     with pytest.raises(IndexError, match="out of bounds"):
         call(values)
+
+
+def test_joint_prior_of_independent_vectors_is_a_prior_of_each() -> None:
+    rng = np.random.default_rng(8)
+    keys, sigmas, measured = [A, A + 1, A + 2], rng.uniform(0.1, 2.0, 6), rng.standard_normal(6)
+    values, apart = gtsam.Values(), gtsam.NonlinearFactorGraph()
+    for i, key in enumerate(keys):
+        values.insert(key, rng.standard_normal(2))
+        noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas[2 * i : 2 * i + 2])
+        apart.push_back(gtsam.PriorFactorVector(key, measured[2 * i : 2 * i + 2], noise))
+    noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+    joint = joint_prior_factor(noise, [Key(key) for key in keys], measured)
+    assert joint.error(values) == pytest.approx(apart.error(values), rel=1e-12)
+    unit = joint_prior_factor(gtsam.noiseModel.Unit.Create(6), [Key(key) for key in keys], measured)
+    check_jacobians(unit, values, vectors=(A, A + 1, A + 2))
+
+
+def test_joint_prior_costs_what_its_covariance_says() -> None:
+    rng = np.random.default_rng(9)
+    root, measured, values = rng.standard_normal((4, 4)), rng.standard_normal(4), gtsam.Values()
+    vectors = rng.standard_normal((2, 2))
+    for i in (0, 1):
+        values.insert(A + i, vectors[i])
+    noise = gtsam.noiseModel.Gaussian.Covariance(root @ root.T)
+    error = vectors.ravel() - measured
+    joint = joint_prior_factor(noise, [Key(A), Key(A + 1)], measured)
+    expected = 0.5 * error @ np.linalg.solve(root @ root.T, error)
+    assert joint.error(values) == pytest.approx(expected, rel=1e-9)

@@ -70,10 +70,10 @@ def test_judged_again_from_the_end_nothing_changes_but_what_is_excluded() -> Non
     simulation = simulate(TEMPLATES["mer-navcam"](), replace(DRIVE, outliers=0.1), seed=4)
     screened = screen(prepare(simulation.traverse, SolveOptions()))
     nothing = np.zeros(len(simulation.truth.outlier), dtype=bool)
-    assert screened_again(screened, nothing) is screened
+    assert screened_again(screened) is screened
     excluded = nothing.copy()
     excluded[::10] = True
-    problem = screened_again(screened, excluded).problem
+    problem = screened_again(replace(screened, excluded=excluded)).problem
     kept, was_kept = problem.accepted, screened.problem.accepted
     out = excluded[problem.measurements.row]
     assert not kept[out].any()

@@ -1,9 +1,7 @@
 """The verdict: right drives pass it, each kind of wrong input fails the test that it should."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
-import gtsam
 import numpy as np
 import pytest
 
@@ -34,14 +32,6 @@ def failed(solution: Solution) -> set[str]:
     return {test.name for test in solution.verdict.failures}
 
 
-def with_frames(traverse: Traverse, rows: Sequence[int], pan_rad: float) -> Traverse:
-    """The traverse with the pans of some frames off."""
-    frames = list(traverse.frames)
-    for i in rows:
-        frames[i] = replace(frames[i], pan_rad=frames[i].pan_rad + pan_rad)
-    return replace(traverse, frames=tuple(frames))
-
-
 def with_sigmas(traverse: Traverse, factor: float) -> Traverse:
     observations = traverse.observations
     assert observations is not None
@@ -65,8 +55,6 @@ def test_a_right_drive_passes_in_other_models(model: str) -> None:
 
 def test_a_drive_that_was_solved_stop_by_stop_has_a_verdict() -> None:
     assert solve_incrementally(drive().traverse).passed
-    wrong = with_frames(drive().traverse, [4], 0.05)
-    assert "pointing" in failed(solve_incrementally(wrong))
 
 
 @pytest.mark.parametrize("factor", [0.1, 0.3])
@@ -91,35 +79,6 @@ def test_estimated_noise_needs_no_sigmas() -> None:
     solution = solve(wrong, SolveOptions(rescale_noise=True))
     assert solution.passed
     assert np.median(solution.sigma_px) == pytest.approx(0.3, rel=0.1)
-
-
-def test_a_pan_that_is_wrong_is_named() -> None:
-    solution = solve(with_frames(drive().traverse, [4], np.deg2rad(1.0)))
-    pointing = named(solution)["pointing"]
-    assert not pointing.passed
-    assert "frame00004" in pointing.says
-
-
-def test_pans_that_are_wrong_in_common_are_said() -> None:
-    traverse = drive(sigma_stop_rad=1e-4).traverse
-    of_second = np.flatnonzero(traverse.frame_stop == 1).tolist()
-    solution = solve(with_frames(traverse, of_second, np.deg2rad(1.0)))
-    pointing = named(solution)["pointing"]
-    assert not pointing.passed
-    assert "every pan at stop0001" in pointing.says
-
-
-def test_a_leg_that_is_wrong_is_said() -> None:
-    traverse = drive(stops=4, pans=6, sigma_stop_m=0.02).traverse
-    stops = list(traverse.stops)
-    for i in (2, 3):
-        pose = stops[i].world_T_mast
-        moved = gtsam.Pose3(pose.rotation(), pose.translation() + np.array([0.0, 0.2, 0.0]))
-        stops[i] = replace(stops[i], world_T_mast=moved)
-    solution = solve(replace(traverse, stops=tuple(stops)))
-    test = named(solution)["stops"]
-    assert not test.passed
-    assert "y from stop0001 to stop0002" in test.says
 
 
 def test_an_image_that_does_not_fit_is_named() -> None:
@@ -152,7 +111,7 @@ def test_corrections_over_their_sigmas_are_standard_normal() -> None:
         telemetry = telemetry_of(fit.problem, uncertainty.variables)
         for one in corrections(telemetry):
             (common if one.is_common else single).append(one.sigmas)
-        legs += [c.sigmas for c in leg_corrections(fit.problem, uncertainty.masts)]
+        legs += [c.sigmas for c in leg_corrections(fit.problem, telemetry, uncertainty.masts)]
         rms, freedom = total(telemetry)
         sums.append((rms**2 - 1) * np.sqrt(freedom / 2))
     for sizes, slack in ((single, 0.08), (common, 0.3), (legs, 0.3)):
@@ -179,11 +138,3 @@ def test_a_rig_that_is_wrong_is_advised_of() -> None:
     assert note.passed
     assert note.is_note
     assert "--sharing calibration=eye:focal" in note.says
-
-
-def test_a_frame_that_lost_its_links_is_named() -> None:
-    """Its matches with other frames look like outliers, and those between its own eyes still agree."""
-    solution = solve(with_frames(drive(stops=1, points_per_image=8).traverse, [4], np.deg2rad(3.0)))
-    links = named(solution)["frame links"]
-    assert not links.passed
-    assert "frame00004" in links.says

@@ -1,0 +1,133 @@
+"""Stage 5, reconsider: telemetry that the images contradict is let go, one error after the other."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pancam_graph.base.errors import SolveError
+from pancam_graph.base.geometry import FloatArray
+from pancam_graph.elimination import Root
+from pancam_graph.graph import LetGo
+from pancam_graph.solve._fit import Fitted, fit
+from pancam_graph.solve._judge import Judged, judge
+from pancam_graph.solve._let_go import letting_go, most_let_go, parts_let_go
+from pancam_graph.solve._screen import screened_again
+from pancam_graph.solve._telemetry_tests import Correction, StopTelemetry, Suspected
+
+__all__ = ["reconsidered"]
+
+_TESTS = {"pointing", "stops"}
+"""Tests of the verdict that single errors of telemetry fail."""
+_AS_LIKELY = 15.0
+"""Another error explains the corrections as well if its squared test is not less by more than this ..."""
+_ALIKE = 0.5
+"""... and if its correlation with the largest is at least this."""
+_OF_FRAME = 5.0
+"""Largest part of the cost that a wrong rig adds in one frame, over its mean in all frames."""
+
+
+def reconsidered(judged: Judged) -> Judged:
+    """Judged anew with wrong telemetry let go; the same object where telemetry agrees with the images.
+
+    While a correction of telemetry is larger than chance allows, the largest one's prior is let go (iterated
+    data snooping, Baarda 1968), with the priors of all other errors that would explain it as well: an error
+    of a stop's heading and one of all its pans look alike. What is left is then judged and solved again.
+    Where more than a few parts of telemetry would have to go, or where another rig would explain more, none
+    is: the verdict says why.
+    """
+    now = judged
+    while _fails(now):
+        suspected = Suspected.of(now.regular, now.uncertainty)
+        problem, errors = now.fitted.problem, _largest(suspected)
+        if _is_of_rig(errors[0], now):
+            return judged
+        more = letting_go(problem.template.traverse, errors)
+        let_go = problem.template.let_go + more
+        parts = parts_let_go(problem.template.traverse, let_go, now.state)
+        if len(parts) > most_let_go(suspected.n_entries) or not _adds(more, problem.template.let_go):
+            return judged
+        try:
+            now = judge(_fitted_again(now.fitted, let_go))
+        except SolveError:
+            return judged  # nothing but that telemetry holds a direction
+    return now
+
+
+def _fails(judged: Judged) -> bool:
+    if judged.uncertainty.masts is None or not judged.fitted.outcome.converged:
+        return False
+    return any(test.name in _TESTS for test in judged.verdict.failures)
+
+
+def _is_of_rig(error: Correction, judged: Judged) -> bool:
+    """Whether a held number of the rig would explain more than an error of telemetry does."""
+    gains = [t.value for t in judged.verdict.tests if t.name == "held rig" and t.value is not None]
+    # The rig is wrong in every frame: one frame's corrections can come from its share alone.
+    is_single = error.frame is not None
+    share = _OF_FRAME / len(judged.fitted.screened.prepared.traverse.frames) if is_single else 1.0
+    return any(0.5 * error.sigmas**2 < share * gain for gain in gains)
+
+
+def _adds(more: LetGo, before: LetGo) -> bool:
+    """Whether something is let go further than it was."""
+    pairs = (
+        (more.angles_rad, before.angles_rad),
+        (more.common_rad, before.common_rad),
+        (more.stops, before.stops),
+    )
+    return any(bool((a > b).any()) for a, b in pairs)
+
+
+def _fitted_again(fitted: Fitted, let_go: LetGo) -> Fitted:
+    """The observations judged anew and fitted, from where a fit ended, with telemetry let go."""
+    screened = fitted.screened
+    problem = replace(
+        screened.problem.letting_go(let_go), values=fitted.problem.values, landmarks=fitted.problem.landmarks
+    )
+    excluded = screened.excluded | screened.by_chance
+    again = screened_again(replace(screened, problem=problem, excluded=excluded))
+    new = fit(
+        replace(
+            again,
+            prepared=screened.prepared,
+            set_aside=screened.set_aside | again.set_aside,
+            by_chance=screened.by_chance | again.by_chance,
+        )
+    )
+    costs = (*fitted.outcome.costs, *new.outcome.costs)
+    return replace(new, outcome=replace(new.outcome, costs=costs))
+
+
+def _largest(suspected: Suspected) -> Sequence[Correction]:
+    """The error that the corrections speak for most strongly, and others that explain them as well."""
+    every = [*suspected.angles, *suspected.stops]
+    worst = max(every, key=lambda c: c.sigmas)
+    response = _response(worst, suspected.telemetry, suspected.root)
+    out = [worst]
+    for c in every:
+        if c is worst or c.sigmas**2 < worst.sigmas**2 - _AS_LIKELY:
+            continue
+        common = sum(float(a @ response[stop]) for stop, a in c.along.items())
+        if abs(common) >= _ALIKE * np.sqrt(c.shown * worst.shown):
+            out.append(c)
+    return out
+
+
+def _response(c: Correction, telemetry: Sequence[StopTelemetry], root: Root) -> dict[int, FloatArray]:
+    """By stop, what an error of unit size does to the pulls (n,) of all telemetry: K a."""
+    begin = np.concatenate([[0], np.cumsum(root.structure.dim)])
+    of = {one.stop: one for one in telemetry}
+    told = {stop: of[stop].told(along) for stop, along in c.along.items()}
+    x = np.zeros(int(begin[-1]))
+    for stop, right in told.items():
+        rows = np.flatnonzero(right)
+        columns = of[stop].column[rows]
+        first, last = int(columns.min()), int(columns.max()) + 1
+        inverse = root.inverse_columns(stop, slice(first, last))
+        x += inverse[:, columns - first] @ right[rows]
+    nothing = {one.stop: np.zeros(len(one.entry)) for one in telemetry}
+    return {
+        one.stop: told.get(one.stop, nothing[one.stop]) - one.told(x[begin[one.stop] + one.column])
+        for one in telemetry
+    }
