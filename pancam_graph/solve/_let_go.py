@@ -13,7 +13,8 @@ from pancam_graph.solve._telemetry_tests import MAST_ENTRIES, Correction
 __all__ = ["Part", "letting_go", "most_let_go", "parts_let_go", "sentence"]
 
 _WIDER = 3.0
-"""Sigma that telemetry is let go to, in units of its estimated error: the prior then hardly pulls."""
+"""Sigma that telemetry is let go to, in units of its estimated error: the prior then hardly pulls. Of several
+errors that look alike each is as large as its estimate at most: there it is 1."""
 _FEW = 3
 """Parts of telemetry that may be let go in any drive ..."""
 _SHARE = 0.1
@@ -38,7 +39,7 @@ def letting_go(traverse: Traverse, errors: Sequence[Correction]) -> LetGo:
     """The priors to let go where telemetry has the suspected errors, or some of them."""
     out = LetGo.nothing(traverse)
     for c in errors:
-        sigma = _WIDER * abs(c.error)
+        sigma = (_WIDER if len(errors) == 1 else 1.0) * abs(c.error)
         if c.entry in {"pan", "tilt"}:
             k = int(c.entry == "tilt")
             where = out.common_rad if c.is_common else out.angles_rad

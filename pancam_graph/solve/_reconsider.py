@@ -23,6 +23,8 @@ _AS_LIKELY = 15.0
 """Another error explains the corrections as well if its squared test is not less by more than this ..."""
 _ALIKE = 0.5
 """... and if its correlation with the largest is at least this."""
+_SETTLED_BY = 1e-3
+"""Factor on the relative decrease at which iterations end."""
 _OF_FRAME = 5.0
 """Largest part of the cost that a wrong rig adds in one frame, over its mean in all frames."""
 
@@ -87,16 +89,18 @@ def _fitted_again(fitted: Fitted, let_go: LetGo) -> Fitted:
     )
     excluded = screened.excluded | screened.by_chance
     again = screened_again(replace(screened, problem=problem, excluded=excluded))
-    new = fit(
-        replace(
-            again,
-            prepared=screened.prepared,
-            set_aside=screened.set_aside | again.set_aside,
-            by_chance=screened.by_chance | again.by_chance,
-        )
+    prepared = screened.prepared
+    again = replace(
+        again,
+        prepared=prepared,
+        set_aside=screened.set_aside | again.set_aside,
+        by_chance=screened.by_chance | again.by_chance,
     )
+    # Along what looks alike, steps are long and gain little.
+    options = replace(prepared.options, relative_decrease=_SETTLED_BY * prepared.options.relative_decrease)
+    new = fit(replace(again, prepared=replace(prepared, options=options)))
     costs = (*fitted.outcome.costs, *new.outcome.costs)
-    return replace(new, outcome=replace(new.outcome, costs=costs))
+    return replace(new, screened=again, outcome=replace(new.outcome, costs=costs))
 
 
 def _largest(suspected: Suspected) -> Sequence[Correction]:
