@@ -9,9 +9,13 @@ from functools import cached_property
 
 import numpy as np
 
+from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 
 __all__ = ["PixelNoise", "mean_sigma_px"]
+
+_MOST_UNEVEN = 1e5
+"""Largest ratio of standard deviations of a traverse; beyond about a million, steps lose their direction."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -60,6 +64,28 @@ class PixelNoise:
             return np.asarray(whitened * self._each(self.sigma_px, whitened))
         a, b, c = (self._each(entry, whitened[:, 0]) for entry in self._root)
         return np.stack([a * whitened[:, 0], b * whitened[:, 0] + c * whitened[:, 1]], axis=1)
+
+    @property
+    def axes_px(self) -> tuple[FloatArray, FloatArray]:
+        """Standard deviations (n,) along the short and the long axis of each error ellipse."""
+        if self.covariance_px2 is None:
+            return self.sigma_px, self.sigma_px
+        variance = np.linalg.eigvalsh(self.covariance_px2)
+        # The short one from the determinant, which keeps its digits where the ellipse is long.
+        a, _, c = self._root
+        long = np.sqrt(variance[:, 1])
+        return a * c / long, long
+
+    def require_even(self) -> None:
+        """Raise InputError where some observations are so much surer than others that weights lose digits."""
+        short, long = self.axes_px
+        if len(short) and long.max() > _MOST_UNEVEN * short.min():
+            raise InputError(
+                f"observations: sigma_px: expected standard deviations within a factor of {_MOST_UNEVEN:.0e} "
+                f"of each other, which 64 bits weigh together, found {short.min():.3g} (row "
+                f"{int(np.argmin(short))}) and {long.max():.3g} (row {int(np.argmax(long))}); leave out what "
+                "was not measured, and state no sigma that pixels cannot have"
+            )
 
     @cached_property
     def _root(self) -> tuple[FloatArray, FloatArray, FloatArray]:

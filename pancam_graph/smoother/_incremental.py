@@ -84,6 +84,8 @@ def solve_incrementally(
     ):
         if chosen != expected:
             raise InputError(f"incremental: {name}: expected {expected}, found {chosen}")
+    if traverse.observations is not None:
+        traverse.observations.noise.require_even()
     begin = time.perf_counter()
     smoother = TraverseSmoother(
         traverse.rig,

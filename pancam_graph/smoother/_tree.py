@@ -83,7 +83,10 @@ class Tree:
             result = self._isam.update(graph, values, parameters)
         except RuntimeError as error:
             kind = SolveError if self._by_qr else UnevenError
-            raise kind(f"nothing holds a direction of the drive: {_in_a_line(error)}") from error
+            raise kind(
+                "stop by stop: nothing holds a direction of the drive, or sigmas of observations are too far "
+                f"below what telemetry resolves; all at once bears these: {_in_a_line(error)}"
+            ) from error
         self.theta, self.estimate = self._isam.getLinearizationPoint(), self._isam.calculateEstimate()
         delta = self._isam.getDelta()
         self._delta = {key: delta.at(key) for key in self.theta.keys()}  # noqa: SIM118  gtsam.Values

@@ -24,7 +24,7 @@ from pancam_graph.solve._joint import all_columns, retracted
 from pancam_graph.solve._optimise import Iteration, Outcome, is_short
 from pancam_graph.solve._problem import Problem, system_of
 from pancam_graph.solve._reduced import add_factors, held_columns
-from pancam_graph.solve._stopping import StopRule
+from pancam_graph.solve._stopping import LEFT_SIGMAS, StopRule
 
 __all__ = ["AlternatingSolver"]
 
@@ -54,10 +54,12 @@ class AlternatingSolver(EliminatedSolver):
                 "nothing is free that all stops share"
             )
 
-    def _from_near(self, problem: Problem, rule: StopRule, loss: Loss, stage: str) -> tuple[Problem, Outcome]:
+    def _from_near(
+        self, problem: Problem, rule: StopRule, loss: Loss, stage: str, left_sigmas: float
+    ) -> tuple[Problem, Outcome]:
         """Minimise by alternation; in screening, by the joint solver."""
         if stage != "solve":
-            return super()._from_near(problem, rule, loss, stage)
+            return super()._from_near(problem, rule, loss, stage, left_sigmas)
         point = _Point(problem, loss)
         outcome, joint = _alternate(point, rule, stage, self.on_iteration)
         return self._ended(problem, outcome, point.system, point.rows, joint), outcome
@@ -252,7 +254,8 @@ def _alternate(
         panels, joint = point.panels(), None
         if reason is None and is_settled:
             joint = _whole(panels, point)
-            if joint.gain() + point.system.gain_alone <= rule.relative_decrease * costs[-1]:
+            ahead = joint.gain() + point.system.gain_alone
+            if ahead <= min(rule.relative_decrease * costs[-1], LEFT_SIGMAS**2 / 2):
                 reason = f"relative decrease below {rule.relative_decrease:g}"
         if reason is None and rule.residual_sigmas and costs[-1] <= no_cost:
             reason = f"residuals below {rule.residual_sigmas:g} sigma"

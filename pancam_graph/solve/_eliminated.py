@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import gtsam
+import numpy as np
 
 from pancam_graph.base.geometry import IntArray
 from pancam_graph.elimination import LandmarkSystem, Root
@@ -14,7 +15,7 @@ from pancam_graph.solve._joint import JointSystem, OnLastGroup
 from pancam_graph.solve._optimise import InOrder, Iteration, OnGraph, Outcome, optimise
 from pancam_graph.solve._problem import Problem, Solver, system_of
 from pancam_graph.solve._reduced import ReducedSystem, joint_root
-from pancam_graph.solve._stopping import StopRule
+from pancam_graph.solve._stopping import LEFT_SIGMAS, StopRule
 
 __all__ = ["EliminatedSolver", "Ended"]
 
@@ -38,27 +39,31 @@ class EliminatedSolver(Solver):
 
     def adjust(self, problem: Problem, rule: StopRule) -> tuple[Problem, Outcome]:
         """Levenberg-Marquardt; observations of landmarks behind their camera are then rejected."""
-        problem, outcome = self._fit(problem, rule, SQUARED, "solve")
+        problem, outcome = self._fit(problem, rule, SQUARED, "solve", LEFT_SIGMAS)
         if self._last is None or not self._last.system.any_behind:
             return problem, outcome
         _, in_front = problem.residuals()
         problem, again = self._fit(
-            replace(problem, accepted=problem.accepted & in_front), rule, SQUARED, "solve"
+            replace(problem, accepted=problem.accepted & in_front), rule, SQUARED, "solve", LEFT_SIGMAS
         )
         return problem, replace(again, costs=outcome.costs + again.costs[1:])
 
-    def _fit(self, problem: Problem, rule: StopRule, loss: Loss, stage: str) -> tuple[Problem, Outcome]:
+    def _fit(
+        self, problem: Problem, rule: StopRule, loss: Loss, stage: str, left_sigmas: float = np.inf
+    ) -> tuple[Problem, Outcome]:
         costs: tuple[float, ...] = ()
         if not self._is_near and problem.template.has_cameras:
             problem, outcome = self._fit_rigid(problem, loss, stage)
             costs = outcome.costs[:-1]
         self._is_near = True
-        problem, outcome = self._from_near(problem, rule, loss, stage)
+        problem, outcome = self._from_near(problem, rule, loss, stage, left_sigmas)
         return problem, replace(outcome, costs=costs + outcome.costs)
 
-    def _from_near(self, problem: Problem, rule: StopRule, loss: Loss, stage: str) -> tuple[Problem, Outcome]:
+    def _from_near(
+        self, problem: Problem, rule: StopRule, loss: Loss, stage: str, left_sigmas: float
+    ) -> tuple[Problem, Outcome]:
         """Minimise from good initial cameras, without a fit of a rigid mast."""
-        return self._minimise(problem, rule, loss, stage)
+        return self._minimise(problem, rule, loss, stage, left_sigmas)
 
     def _fit_rigid(self, problem: Problem, loss: Loss, stage: str) -> tuple[Problem, Outcome]:
         """The problem with its cameras at the optimum of a rigid mast.
@@ -72,17 +77,19 @@ class EliminatedSolver(Solver):
         rigid_problem, outcome = self._minimise(problem.on(rigid), rule, loss, stage)
         return rigid_problem.on(problem.template), outcome
 
-    def _minimise(self, problem: Problem, rule: StopRule, loss: Loss, stage: str) -> tuple[Problem, Outcome]:
+    def _minimise(
+        self, problem: Problem, rule: StopRule, loss: Loss, stage: str, left_sigmas: float = np.inf
+    ) -> tuple[Problem, Outcome]:
         template = problem.template
         if not template.linkage.touched.any():
             return _only_landmarks(problem, loss)
         system, rows = system_of(problem, loss)
         minimise = self._by_groups if template.has_cameras else self._by_blocks
-        outcome, joint = minimise(problem, system, rule, stage)
+        outcome, joint = minimise(problem, system, rule, stage, left_sigmas)
         return self._ended(problem, outcome, system, rows, joint), outcome
 
     def _by_groups(
-        self, problem: Problem, system: LandmarkSystem, rule: StopRule, stage: str
+        self, problem: Problem, system: LandmarkSystem, rule: StopRule, stage: str, left_sigmas: float
     ) -> tuple[Outcome, Root | None]:
         """Minimise on the last group, others eliminated: for models with a variable per image."""
         joint = JointSystem(problem, system)
@@ -94,11 +101,12 @@ class EliminatedSolver(Solver):
             stage=stage,
             on_iteration=self.on_iteration,
             gain_ahead=lambda _values: _gain_ahead(system, joint.root),
+            left_sigmas=left_sigmas,
         )
         return outcome, joint.known_root
 
     def _by_blocks(
-        self, problem: Problem, system: LandmarkSystem, rule: StopRule, stage: str
+        self, problem: Problem, system: LandmarkSystem, rule: StopRule, stage: str, left_sigmas: float
     ) -> tuple[Outcome, Root | None]:
         """Minimise by GTSAM on landmark blocks: for models whose variables each move many images."""
         template = problem.template
@@ -120,6 +128,7 @@ class EliminatedSolver(Solver):
             stage=stage,
             on_iteration=self.on_iteration,
             gain_ahead=lambda values: _gain_ahead(system, lambda: root(values)),
+            left_sigmas=left_sigmas,
         )
         if blocks.settle(outcome.values):
             joint = None  # the landmarks have moved since

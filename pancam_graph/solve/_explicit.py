@@ -12,7 +12,7 @@ from pancam_graph.graph import ExplicitLandmarks, SoftTemplate
 from pancam_graph.landmarks import SQUARED, Loss, point_sigma_m, refine
 from pancam_graph.solve._optimise import Elimination, Iteration, OnGraph, Outcome, optimise
 from pancam_graph.solve._problem import Problem, Solver
-from pancam_graph.solve._stopping import StopRule
+from pancam_graph.solve._stopping import LEFT_SIGMAS, StopRule
 
 __all__ = ["ExplicitSolver"]
 
@@ -133,6 +133,7 @@ class ExplicitSolver(Solver):
             rule,
             n_observations=int(problem.kept.sum()),
             on_iteration=self.on_iteration,
+            left_sigmas=LEFT_SIGMAS,
         )
         points = np.where(present[:, None], explicit.points_m(outcome.values, present), points)
         adjusted = problem.at(explicit.only_cameras(outcome.values), problem.landmarks.moved_to(points))

@@ -128,7 +128,7 @@ def _without_range_bias(fitted: Fitted) -> Fitted:
         outcome=replace(
             outcome,
             values=moved.values,
-            converged=far.converged,
+            converged=outcome.converged and far.converged,
             reason=reason,
             costs=(*outcome.costs, moved.cost()),
         ),

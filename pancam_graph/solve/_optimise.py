@@ -11,7 +11,7 @@ import numpy as np
 from pancam_graph.base.errors import SolveError
 from pancam_graph.base.geometry import IntArray
 from pancam_graph.graph import Kind, kind_of, read_variable
-from pancam_graph.solve._stopping import StopRule
+from pancam_graph.solve._stopping import StopRule, sigmas_left
 
 __all__ = [
     "MOST_DAMPING",
@@ -31,6 +31,8 @@ MOST_DAMPING = 1e10
 """Largest damping (lambda) tried for a step."""
 _INDETERMINATE = "ndeterminate"
 """Part of GTSAM's message for a system without a unique solution."""
+_ROUNDING = 1e-13
+"""Share of the cost below which a gain is rounding."""
 _FAR = 100.0
 """While the expected remaining gain exceeds the limit this many times, the next gain is not computed."""
 
@@ -155,11 +157,13 @@ def optimise(
     stage: str = "solve",
     on_iteration: Callable[[Iteration], None] | None = None,
     gain_ahead: Callable[[gtsam.Values], float | None] | None = None,
+    left_sigmas: float = np.inf,
 ) -> Outcome:
     """Iterate until the rule ends it. `start` makes the optimiser, with `parameters_of` the rule.
 
     `gain_ahead` gives the decrease of cost that the next step from some values promises; None: unknown, and
-    extrapolated from the gains so far.
+    extrapolated from the gains so far. `left_sigmas` is the largest distance to the optimum with which a
+    small decrease ends the iterations, as long as steps gain more than rounding.
 
     Raises SolveError where the linear system cannot be factorised however much it is damped; an exception
     from inside a custom factor reaches the caller as it is.
@@ -190,7 +194,9 @@ def optimise(
                 reason = "no step lowers the cost"
             elif costs[-1] < costs[-2] and is_short(before, optimiser.values(), rule.relative_step):
                 reason = f"relative step below {rule.relative_step:g}"
-            elif rule.relative_decrease and _is_settled(costs, rule.relative_decrease, gain_ahead, optimiser):
+            elif rule.relative_decrease and _is_settled(
+                costs, rule.relative_decrease, gain_ahead, optimiser, left_sigmas
+            ):
                 reason = f"relative decrease below {rule.relative_decrease:g}"
             else:
                 reason = vanished()
@@ -222,8 +228,9 @@ def _is_settled(
     share: float,
     gain_ahead: Callable[[gtsam.Values], float | None] | None,
     optimiser: Optimiser,
+    left_sigmas: float = np.inf,
 ) -> bool:
-    """Whether all further iterations would lower the cost by at most a share of it.
+    """Whether all further iterations would lower the cost by at most a share of it, and be short.
 
     Gains may shrink because a landmark is stuck, which a later step frees. So the gain of the next step,
     where it can be computed, must be small too; covariances need the same linearised system.
@@ -231,11 +238,16 @@ def _is_settled(
     least = share * costs[-1]
     gain, shrinking = _still_to_gain(costs)
     if gain_ahead is None or costs[-2] - costs[-1] <= least:
-        return gain <= least
+        if gain > least:
+            return False
+        if np.isinf(left_sigmas) or costs[-2] - costs[-1] <= _ROUNDING * costs[-1]:
+            return True
+        ahead = None if gain_ahead is None else gain_ahead(optimiser.values())
+        return sigmas_left(costs, ahead) <= left_sigmas
     if shrinking and gain > _FAR * least:
         return False
     ahead = gain_ahead(optimiser.values())
-    return ahead is not None and ahead <= least
+    return ahead is not None and ahead <= least and sigmas_left(costs, ahead) <= left_sigmas
 
 
 def _still_to_gain(costs: list[float]) -> tuple[float, bool]:

@@ -89,13 +89,14 @@ def prepare(
 
     `start` gives the first stops, angles and cameras; default: telemetry's. `factors` are the caller's own,
     on keys of `graph_keys`. Raises InputError for a traverse without observations, for given cameras that are
-    not one an image, for options that the traverse cannot serve, and for factors that cannot be evaluated;
+    not one an image, for sigmas too uneven, options that the traverse cannot serve, and factors that fail;
     SolveError where no track is seen twice.
     """
     if traverse.observations is None:
         raise InputError(
             "observations: expected some, found none; find them in the images first (find_observations)"
         )
+    traverse.observations.noise.require_even()
     start = in_turns_of_telemetry(start, traverse) if start else start_from_telemetry(traverse)
     cameras = start.cameras if options.model in {"free", "projective"} else None
     sharing = (options.sharing or traverse.sharing or Sharing()).for_model(options.model)

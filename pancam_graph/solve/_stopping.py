@@ -7,7 +7,12 @@ import numpy as np
 
 from pancam_graph.base.errors import InputError
 
-__all__ = ["StopRule", "criteria"]
+__all__ = ["LEFT_SIGMAS", "StopRule", "criteria", "sigmas_left"]
+
+LEFT_SIGMAS = 0.1
+"""Largest distance to the optimum, in sigmas of the solution, with which a small decrease ends a fit."""
+_SLOWEST = 0.999
+"""Largest ratio of successive gains assumed in extrapolation."""
 
 _WHOLE = "max_iterations"
 
@@ -31,7 +36,8 @@ class StopRule:
     """Largest number of steps; a solve that reaches it has not converged."""
     relative_decrease: float = 1e-7
     """Largest share of f that further steps may still gain: the last step gained no more, or the linearised
-    system predicts no more of the next. With explicit landmarks, gains are extrapolated from the last two."""
+    system predicts no more of the next. With explicit landmarks, gains are extrapolated from the last two.
+    What is left must also be less than 0.1 sigma of the solution: of a large f, a small share is many."""
     relative_step: float = 0.0
     """Largest length of the last step relative to x before it: |dx| <= relative_step |x|.
 
@@ -55,6 +61,24 @@ class StopRule:
             value = getattr(self, field.name)
             if not 0 <= value < np.inf:
                 raise InputError(f"{field.name}: expected 0 (not used) or a positive number, found {value}")
+
+
+def sigmas_left(costs: Sequence[float], ahead: float | None) -> float:
+    """Distance to the optimum, in the metric of the information: no number is further off in its sigmas.
+
+    `costs` are those of the iterations; `ahead` is the gain that the linearised system predicts of the next
+    step, or None where it is unknown. A step that gains g is sqrt(2 g) sigmas long. Gains of a slow crawl
+    shrink by a constant factor, and all steps that are to come add up.
+    """
+    gains = -np.diff(costs[-3:])
+    crawls = len(gains) == 2 and 0 < gains[1] < gains[0]
+    rate = min(float(gains[1] / gains[0]), _SLOWEST) if crawls else 0.0
+    if ahead is None:
+        last = float(gains[-1]) if len(gains) else np.inf
+        ahead = last * rate if crawls else max(last, 0.0)
+    elif crawls and ahead > gains[1]:
+        rate = 0.0
+    return float(np.sqrt(2 * ahead) / (1 - np.sqrt(rate)))
 
 
 def criteria(texts: Sequence[str]) -> dict[str, float]:

@@ -20,6 +20,7 @@ from pancam_graph.solve._problem import Problem
 from pancam_graph.solve._reduced import ReducedSystem
 from pancam_graph.solve._rig_score import HeldEntry, held_entries
 from pancam_graph.solve._share_tests import let_go_links, shares_in_use
+from pancam_graph.solve._stopping import sigmas_left
 from pancam_graph.solve._telemetry_tests import Correction, Suspected, total
 
 __all__ = ["Optimum", "verdict"]
@@ -124,12 +125,7 @@ def _optimum(at: Optimum) -> VerdictTest:
     # Landmarks at expected ranges are not where they fit best: only those fitted have a step of their own.
     alone = at.reduced.system.gain_alone if at.fitted.expected is None else 0.0
     ahead = at.reduced.root.gain() + alone
-    costs = at.fitted.outcome.costs
-    gains = -np.diff(costs[-3:])
-    # Gains of a slow crawl shrink by a constant factor: all that are to come add up.
-    crawls = len(gains) == 2 and 0 < gains[1] < gains[0]
-    rate = min(gains[1] / gains[0], 0.999) if crawls and ahead <= gains[1] else 0.0
-    off = float(np.sqrt(2 * ahead) / (1 - np.sqrt(rate)))
+    off = sigmas_left(at.fitted.outcome.costs, ahead)
     return VerdictTest.of(
         name,
         off,

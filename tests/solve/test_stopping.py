@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from pancam_graph import SimulationOptions, SolveOptions, StopRule, Traverse, simulate
+from pancam_graph import SimulationOptions, SolveOptions, StopRule, Traverse, simulate, solve
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.graph import ExplicitLandmarks, Flex, SoftTemplate, read_variable
@@ -17,7 +17,7 @@ from pancam_graph.initialise import Start
 from pancam_graph.rigs import mer_navcam
 from pancam_graph.solve import Fitted, InOrder, OnGraph, Problem, judge
 from pancam_graph.solve._optimise import Optimiser, _is_settled
-from pancam_graph.solve._stopping import criteria
+from pancam_graph.solve._stopping import criteria, sigmas_left
 from support.solving import fitted, solution_from
 
 SMALL = SimulationOptions(stops=2, pans=2, sweep_rad=0.8, points_per_image=12)
@@ -267,3 +267,38 @@ def test_gains_that_shrink_are_no_end_while_the_next_step_promises_more(
     )
     assert _is_settled(costs, 1e-7, lambda _: ahead, optimizer) == settled
     assert _is_settled(costs, 1e-7, None, optimizer)
+
+
+def test_a_small_share_of_a_large_cost_is_no_optimum() -> None:
+    """Sigmas told 50 times too small make the cost 8 million: a ten-millionth of it is 1.3 sigma.
+
+    The best cost is that of a solve without the criterion, which nothing but rounding ends.
+    """
+    options = SimulationOptions(
+        stops=2,
+        pans=4,
+        sweep_rad=2.5,
+        points_per_image=12,
+        noise_px=0.5,
+        spacing_m=0.3,
+        sigma_stop_m=1.0,
+        sigma_stop_rad=0.05,
+    )
+    t = simulate(mer_navcam(), options, seed=1).traverse
+    assert t.observations is not None
+    told = t.with_observations(replace(t.observations, sigma_px=0.01 * t.observations.sigma_px))
+    solution = solve(told, SolveOptions(model="free"))
+    best = solve(told, SolveOptions(model="free", relative_decrease=0.0))
+    assert solution.stop_reason == "relative decrease below 1e-07"
+    assert solution.cost_final - best.cost_final < 0.1**2 / 2
+    assert solution.verdict is not None
+    assert {test.name: test.passed for test in solution.verdict.tests}["optimum"]
+
+
+def test_steps_of_a_crawl_add_up() -> None:
+    """Each gains 0.81 of the one before, and is 0.9 times as long: ten of the next are left."""
+    costs = [100.0 + 0.81**k for k in range(40)]
+    ahead = 0.81**39 * (1 - 0.81)
+    assert sigmas_left(costs, ahead) == pytest.approx(10 * np.sqrt(2 * ahead), rel=1e-6)
+    assert sigmas_left(costs, None) == pytest.approx(10 * np.sqrt(2 * ahead), rel=1e-6)
+    assert sigmas_left([2.0, 1.0], 0.5) == pytest.approx(1.0)

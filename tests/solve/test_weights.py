@@ -20,6 +20,7 @@ from pancam_graph.initialise import Start
 from pancam_graph.results._residuals_csv import residuals_csv
 from pancam_graph.rigs import Eye, Rig, mer_navcam
 from pancam_graph.simulate import Simulation
+from pancam_graph.smoother import solve_incrementally
 from pancam_graph.solve import prepare
 from pancam_graph.solve._screen import ScreeningRounds
 from support.truth import errors_in_sigmas
@@ -361,3 +362,43 @@ def test_ellipses_10000_to_1_take_no_more_steps_than_round_ones(seed: int) -> No
     assert solution.iterations <= 6
     assert np.abs(angles).max() < 5
     assert stops.max() < 2.5
+
+
+def told_and_true(sure_px: float, rough_px: float) -> Simulation:
+    """A drive of which half of the observations are as sure as told, the others as rough."""
+    exact = simulate(mer_navcam(), replace(SMALL, noise_px=0.0, noise_stretch=1.0), seed=0)
+    o, rng = observed(exact.traverse), np.random.default_rng(0)
+    sigma = np.where(rng.random(len(o)) < 0.5, sure_px, rough_px)
+    uv = o.uv_px + rng.standard_normal(o.uv_px.shape) * sigma[:, None]
+    return replace(exact, traverse=exact.traverse.with_observations(replace(o, uv_px=uv, sigma_px=sigma)))
+
+
+@pytest.mark.parametrize(
+    ("sure_px", "rough_px", "share"), [(1e-6, 1e-6, 0.5), (1e-5, 0.9, 0.5), (1e-3, 1.0, 0.5)]
+)
+def test_sigmas_far_apart_and_far_below_a_pixel_are_borne(
+    sure_px: float, rough_px: float, share: float
+) -> None:
+    simulation = told_and_true(sure_px, rough_px, share)
+    solution = solve(simulation.traverse)
+    angles, _ = errors_in_sigmas(simulation, solution)
+    error = simulation.truth.world_T_mast[1].localCoordinates(solution.final.world_T_mast[1])
+    assert solution.converged
+    assert np.abs(angles).max() < 5
+    assert np.abs(error / np.sqrt(np.diag(solution.stop_covariance[1]))).max() < 4
+
+
+@pytest.mark.parametrize("way", [solve, solve_incrementally])
+def test_sigmas_a_million_apart_are_refused_in_a_sentence(way: Callable[[Traverse], Solution]) -> None:
+    """They ended in "converged", or after 100 steps, 7 sigma from the optimum."""
+    t = told_and_true(1e-6, 1.0).traverse
+    with pytest.raises(InputError, match=r"sigma_px: expected .* a factor of 1e\+05 .*, found 1e-06 \(row"):
+        way(t)
+
+
+def test_axes_of_ellipses_are_those_of_their_covariances() -> None:
+    turn = np.array([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]])
+    covariance = (turn @ np.diag([1e-4, 1.0]) ** 2 @ turn.T)[None]
+    short, long = PixelNoise(sigma_px=mean_sigma_px(covariance), covariance_px2=covariance).axes_px
+    assert short == pytest.approx(1e-4, rel=1e-6)
+    assert long == pytest.approx(1.0)
