@@ -216,7 +216,7 @@ def test_expected_score_with_own_cameras_is_the_redundancy(traverse: Traverse) -
 
 
 def test_what_nothing_holds_has_no_sigmas_but_differences(traverse: Traverse) -> None:
-    free = cross_validate(loosened(traverse, 1e4), PLAIN, halvings=1)
+    free = cross_validate(loosened(traverse, 1e9), PLAIN, halvings=1)
     assert free.warnings[0].startswith("no formal sigmas to compare with: nothing holds")
     assert free.warnings[1].startswith("first random half 1 has no formal sigmas: nothing holds")
     assert np.isnan(free.relative_pointing.honest).all()

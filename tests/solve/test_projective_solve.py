@@ -164,18 +164,21 @@ def disturbed(simulation: Simulation) -> FreeCameras:
     return cameras_of(simulation, turn_rad=2e-3, shift_m=0.01, focal=3e-3)
 
 
-def test_the_worlds_origin_matters_only_to_matrices_that_are_not_conditioned() -> None:
-    """A kilometre away the column of P that places the camera drowns the others in rounding."""
+def test_the_worlds_origin_does_not_matter() -> None:
+    """A kilometre away the column of P that places the camera is far larger than the others.
+
+    Without conditioning, Cholesky fails on that and QR goes on, with fewer digits.
+    """
     here, away = small(), elsewhere(small(), np.array([1000.0, -1000.0, 100.0]))
     options = SolveOptions(model="projective", loss="none", max_iterations=30)
     found = [
         solve(s.traverse, replace(options, normalise=n), start=telemetry(s, disturbed(s)))
         for s, n in ((here, True), (away, True), (away, False))
     ]
-    assert [s.converged for s in found] == [True, True, False]
+    assert [s.converged for s in found] == [True, True, True]
     assert found[1].iterations == found[0].iterations
     assert found[1].cost_final == pytest.approx(found[0].cost_final, rel=1e-6)
-    assert found[2].cost_final > 1.05 * found[0].cost_final
+    assert found[2].cost_final == pytest.approx(found[0].cost_final, rel=1e-5)
 
 
 # --- starts ---
