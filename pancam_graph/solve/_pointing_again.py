@@ -44,6 +44,8 @@ _STEPS = 8
 """Newton's steps for one observation; from 30 degrees off, five are enough."""
 _LONGEST_RAD = 0.3
 """Longest of these steps."""
+_NEAREST_M = 1e-9
+"""Least distance of a point from a camera."""
 _FURTHEST_M = 1e6
 """Where points at infinity are placed."""
 
@@ -211,7 +213,7 @@ class _Frame:
             head = t.rig.mast_T_head(angles[:, 0], angles[:, 1])
             R, centre = compose(*head, mount_R, mount_t)
             there = np.einsum("nij,ni->nj", R, in_mast - centre)
-            there /= np.linalg.norm(there, axis=1, keepdims=True)
+            there /= np.linalg.norm(there, axis=1, keepdims=True).clip(_NEAREST_M)
             return np.asarray(np.einsum("nij,nj->ni", across, there))
 
         angles, small = np.tile(now, (n, 1)), 1e-5

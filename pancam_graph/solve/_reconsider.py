@@ -38,22 +38,23 @@ def reconsidered(judged: Judged) -> Judged:
     Where more than a few parts of telemetry would have to go, or where another rig would explain more, none
     is: the verdict says why.
     """
-    now = judged
-    while _fails(now):
+    now, traverse = judged, judged.fitted.screened.prepared.traverse
+    most = most_let_go(2 * len(traverse.frames) + 6 * len(traverse.stops))
+    for _ in range(most):
+        if not _fails(now):
+            return now
         suspected = Suspected.of(now.regular, now.uncertainty)
         problem, errors = now.fitted.problem, _largest(suspected)
         if _is_of_rig(errors[0], now):
             return judged
-        more = letting_go(problem.template.traverse, errors)
-        let_go = problem.template.let_go + more
-        parts = parts_let_go(problem.template.traverse, let_go, now.state)
-        if len(parts) > most_let_go(suspected.n_entries) or not _adds(more, problem.template.let_go):
+        let_go = problem.template.let_go + letting_go(traverse, errors)
+        if len(parts_let_go(traverse, let_go, now.state)) > most:
             return judged
         try:
             now = judge(_fitted_again(now.fitted, let_go))
         except SolveError:
             return judged  # nothing but that telemetry holds a direction
-    return now
+    return judged if _fails(now) else now
 
 
 def _fails(judged: Judged) -> bool:
@@ -69,16 +70,6 @@ def _is_of_rig(error: Correction, judged: Judged) -> bool:
     is_single = error.frame is not None
     share = _OF_FRAME / len(judged.fitted.screened.prepared.traverse.frames) if is_single else 1.0
     return any(0.5 * error.sigmas**2 < share * gain for gain in gains)
-
-
-def _adds(more: LetGo, before: LetGo) -> bool:
-    """Whether something is let go further than it was."""
-    pairs = (
-        (more.angles_rad, before.angles_rad),
-        (more.common_rad, before.common_rad),
-        (more.stops, before.stops),
-    )
-    return any(bool((a > b).any()) for a, b in pairs)
 
 
 def _fitted_again(fitted: Fitted, let_go: LetGo) -> Fitted:

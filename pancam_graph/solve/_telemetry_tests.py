@@ -146,11 +146,6 @@ class Suspected:
         stops += leg_corrections(problem, telemetry, u.masts)
         return Suspected(telemetry=telemetry, angles=angles, stops=stops, root=u.masts.root)
 
-    @property
-    def n_entries(self) -> int:
-        """Number of entries of telemetry that are not held."""
-        return sum(len(one.entry) for one in self.telemetry)
-
 
 def telemetry_of(problem: Problem, covariance: Covariance) -> list[StopTelemetry]:
     """Corrections of all stops at a problem's values; `covariance` is that of its variables."""
