@@ -119,16 +119,15 @@ def _without_range_bias(fitted: Fitted) -> Fitted:
     if far is None:
         return fitted
     moved = _back(far, problem)
-    reason = outcome.reason if outcome.converged else "far terrain: corrections of the solution settled"
-    if not far.converged:
-        reason = "far terrain: corrections of the solution do not settle"
+    # Where least squares ended matters no more: it is only where corrections began.
+    reason = f"far terrain: corrections of the solution {'settled' if far.converged else 'do not settle'}"
     return replace(
         fitted,
         problem=moved,
         outcome=replace(
             outcome,
             values=moved.values,
-            converged=outcome.converged and far.converged,
+            converged=far.converged,
             reason=reason,
             costs=(*outcome.costs, moved.cost()),
         ),

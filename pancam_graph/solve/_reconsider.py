@@ -43,7 +43,7 @@ def reconsidered(judged: Judged) -> Judged:
     for _ in range(most):
         if not _fails(now):
             return now
-        suspected = Suspected.of(now.regular, now.uncertainty)
+        suspected = Suspected.of(now.regular, now.uncertainty, is_far=now.fitted.expected is not None)
         problem, errors = now.fitted.problem, _largest(suspected)
         if _is_of_rig(errors[0], now):
             return judged

@@ -36,6 +36,9 @@ MAST_ENTRIES = ("roll", "pitch", "heading", "x", "y", "z")
 """Entries of a mast pose's tangent, in the mast's own frame."""
 _BLIND = 1e-6
 """Share of an error that shows in the correction, below which images say nothing of it."""
+_HARDLY_SHOWN = 0.25
+"""The same share where ranges of far terrain are expected ones: the solution is then not of least variance,
+and S - C is not the covariance of small corrections."""
 _MOST_STOPS = 100
 """Legs are tested in drives of up to this many stops: the joint covariance of all stops is dense."""
 
@@ -135,15 +138,16 @@ class Suspected:
     """Square root of the system that the covariances are of."""
 
     @staticmethod
-    def of(problem: Problem, u: Uncertainty) -> "Suspected":
-        """Those of a solution whose covariances are known."""
+    def of(problem: Problem, u: Uncertainty, *, is_far: bool) -> "Suspected":
+        """Those of a solution whose covariances are known; `is_far`: at expected ranges of far terrain."""
         assert u.variables is not None  # the caller has looked
         assert u.masts is not None
         telemetry = telemetry_of(problem, u.variables)
-        single = list(corrections(telemetry))
+        least = _HARDLY_SHOWN if is_far else _BLIND
+        single = list(corrections(telemetry, least))
         angles = [c for c in single if c.entry in {"pan", "tilt"}]
         stops = [c for c in single if c.entry not in {"pan", "tilt"}]
-        stops += leg_corrections(problem, telemetry, u.masts)
+        stops += leg_corrections(problem, telemetry, u.masts, least)
         return Suspected(telemetry=telemetry, angles=angles, stops=stops, root=u.masts.root)
 
 
@@ -228,13 +232,16 @@ def _entries(template: FactorTemplate, keys: Sequence[int]) -> tuple[int, tuple[
     return int(template.traverse.frame_stop[frames[0]]), ("pan", "tilt") * len(frames), np.repeat(frames, 2)
 
 
-def corrections(telemetry: Sequence[StopTelemetry]) -> Iterator[Correction]:
-    """Each entry by itself, and a common offset of the pans, and of the tilts, of each stop."""
+def corrections(telemetry: Sequence[StopTelemetry], least: float = _BLIND) -> Iterator[Correction]:
+    """Each entry by itself, and a common offset of the pans, and of the tilts, of each stop.
+
+    Left out are errors of which no more than the share `least` shows in the correction.
+    """
     for one in telemetry:
         n, names = len(one.entry), np.array(one.entry)
         for i in range(n):
             frame = int(one.frame[i])
-            if found := _along(one, np.eye(n)[i]):
+            if found := _along(one, np.eye(n)[i], least):
                 yield Correction(
                     entry=one.entry[i],
                     stop=one.stop,
@@ -244,7 +251,7 @@ def corrections(telemetry: Sequence[StopTelemetry]) -> Iterator[Correction]:
                 )
         for name in ("pan", "tilt"):
             shape = (names == name).astype(float)
-            if shape.sum() > 1 and (found := _along(one, shape)):
+            if shape.sum() > 1 and (found := _along(one, shape, least)):
                 yield Correction(entry=name, stop=one.stop, frame=None, is_common=True, **found)
 
 
@@ -256,10 +263,10 @@ class _Found(TypedDict):
     along: Mapping[int, FloatArray]
 
 
-def _along(one: StopTelemetry, shape: FloatArray) -> _Found | None:
-    """The test of an error along a shape (n,) of one stop's entries; None where images say nothing of it."""
+def _along(one: StopTelemetry, shape: FloatArray, least: float) -> _Found | None:
+    """The test of an error along a shape (n,) of one stop's entries; None where too little of it shows."""
     shown = float(shape @ one.shown @ shape)
-    if shown <= _BLIND * float(shape @ one.told(shape)):
+    if shown <= least * float(shape @ one.told(shape)):
         return None
     pull = float(shape @ one.pull)
     return _Found(
@@ -287,11 +294,12 @@ def total(telemetry: Sequence[StopTelemetry]) -> tuple[float, float]:
 
 
 def leg_corrections(
-    problem: Problem, telemetry: Sequence[StopTelemetry], masts: JointCovariance
+    problem: Problem, telemetry: Sequence[StopTelemetry], masts: JointCovariance, least: float = _BLIND
 ) -> list[Correction]:
     """A shift of all stops after a leg against all before it, for each leg; the entries are `leg x` to `z`.
 
-    In the directions of the world's axes. None in drives of fewer than two stops, or of very many.
+    In the directions of the world's axes; `least` as for `corrections`. None in drives of fewer than two
+    stops, or of very many.
     """
     stops = problem.template.traverse.stops
     n = len(stops)
@@ -306,7 +314,7 @@ def leg_corrections(
             shift[:after] = 0.0
             h = np.divide(shift, sigma, out=np.zeros_like(shift), where=sigma > 0).ravel()
             variance, along = float(h @ D @ h), dict[int, FloatArray]()
-            if variance <= _BLIND * float(h @ h):
+            if variance <= least * float(h @ h):
                 continue
             for one in telemetry:
                 if shift[one.stop].any():

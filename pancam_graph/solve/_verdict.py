@@ -235,7 +235,7 @@ def _telemetry(at: Optimum) -> Iterator[VerdictTest]:
     u = at.uncertainty
     if u.variables is None or u.masts is None:
         return
-    suspected = Suspected.of(at.problem, u)
+    suspected = Suspected.of(at.problem, u, is_far=at.fitted.expected is not None)
     rms, freedom = total(suspected.telemetry)
     if freedom > 0:
         says = f"corrections of telemetry are {rms:.3g} times what its sigmas and the images allow (RMS)"
