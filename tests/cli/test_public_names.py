@@ -99,19 +99,25 @@ def test_everything_can_be_imported_at_once() -> None:
     assert set(names) >= PUBLIC
 
 
-@pytest.mark.parametrize(("name", "module"), [("solve", "_options"), ("simulate", "_simulation_options")])
+_BEFORE = (
+    "",
+    "import pancam_graph.{name}",
+    "import pancam_graph.{name}.{module}",
+    "from pancam_graph.{name} import {name}",
+    "import importlib; importlib.import_module('pancam_graph.{name}')",
+    "import pancam_graph; pancam_graph.{name}",
+    "from pancam_graph import {name}; import pancam_graph.{name}.{module}; import pancam_graph.{name}",
+    "import pancam_graph; from pancam_graph.{name} import {module}",
+    "import pancam_graph.cli; import pancam_graph.results; import pancam_graph.smoother",
+)
+"""What was imported first."""
+
+
 @pytest.mark.parametrize(
-    "before",
+    ("name", "module", "before"),
     [
-        "",
-        "import pancam_graph.{name}",
-        "import pancam_graph.{name}.{module}",
-        "from pancam_graph.{name} import {name}",
-        "import importlib; importlib.import_module('pancam_graph.{name}')",
-        "import pancam_graph; pancam_graph.{name}",
-        "from pancam_graph import {name}; import pancam_graph.{name}.{module}; import pancam_graph.{name}",
-        "import pancam_graph; from pancam_graph.{name} import {module}",
-        "import pancam_graph.cli; import pancam_graph.results; import pancam_graph.smoother",
+        *(("solve", "_options", before) for before in _BEFORE),
+        *(("simulate", "_simulation_options", before) for before in _BEFORE[:3]),
     ],
 )
 def test_no_room_hides_the_function_of_its_name(name: str, module: str, before: str) -> None:

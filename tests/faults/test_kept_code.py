@@ -123,6 +123,7 @@ def test_what_lies_where_code_should_be_is_no_fault(folder: Path, caplog: pytest
     assert caplog.text.count("compiled code cannot be written to") == 1
 
 
+@pytest.mark.slow
 def test_no_place_beside_the_source_nor_at_home(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "home").mkdir()
     (tmp_path / "temporary").mkdir()

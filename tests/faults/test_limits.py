@@ -82,6 +82,7 @@ def test_results_that_are_too_large_leave_the_older_ones(tmp_path: Path) -> None
     assert enough["beside"] == ["out"]
 
 
+@pytest.mark.slow
 def test_results_with_few_open_files_are_whole_or_the_older_ones(tmp_path: Path) -> None:
     *runs, enough = results_under("RLIMIT_NOFILE", [*range(3, 12), 256], tmp_path / "out")
     assert runs[0]["said"]

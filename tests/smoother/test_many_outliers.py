@@ -59,6 +59,7 @@ def test_a_drive_with_given_sigmas_is_solved() -> None:
     require_right(simulation, solve_incrementally(simulation.traverse))
 
 
+@pytest.mark.slow
 def test_a_drive_with_guessed_sigmas_is_solved() -> None:
     simulation = simulated(0.5, seed=12, min_views=3)
     require_right(simulation, solve_incrementally(with_guessed_sigmas(simulation.traverse)))

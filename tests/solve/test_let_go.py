@@ -90,6 +90,7 @@ def test_a_frame_that_points_elsewhere_is_let_go_and_named(how: Solve, pan: floa
     assert solution.traverse is wrong
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "named"), [("circle", True), ("free", False)])
 def test_in_other_models_it_does_no_harm(model: str, named: bool) -> None:
     """Independent cameras hardly follow telemetry, and take it for no more than the sigma of their tie."""

@@ -269,6 +269,7 @@ def test_gains_that_shrink_are_no_end_while_the_next_step_promises_more(
     assert _is_settled(costs, 1e-7, None, optimizer)
 
 
+@pytest.mark.slow
 def test_a_small_share_of_a_large_cost_is_no_optimum() -> None:
     """Sigmas told 50 times too small make the cost 8 million: a ten-millionth of it is 1.3 sigma.
 
