@@ -251,6 +251,7 @@ def test_vignetting_that_overlaps_do_not_tell_is_left_alone(tmp_path: Path) -> N
     assert mosaics.evening.sigma is None
 
 
+@pytest.mark.slow
 def test_samples_of_16_bits_are_those_of_the_scene(tmp_path: Path) -> None:
     solution = solved(Scene(pans_rad=FIVE, vignetting=0.2), tmp_path)
     mosaics = make_mosaics(solution, "A/1", "left", NEAR)

@@ -287,6 +287,7 @@ def test_verdicts_follow_the_figures() -> None:
     assert held(mast=math.inf, circle=2.0, free=math.inf) == [False, False]
 
 
+@pytest.mark.slow
 def test_results_are_complete(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     samples = run_tasks(
