@@ -24,6 +24,10 @@ _FREED: dict[Quantity, Freedom] = {
 }
 
 
+_ENOUGH = 3000
+"""Observations from which gains are estimated where a problem has more: those of every n-th landmark."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class HeldEntry:
     """A number of the rig that was held, and what the solution says of it."""
@@ -47,7 +51,8 @@ class HeldEntry:
 def held_entries(problem: Problem) -> list[HeldEntry]:
     """Every number of the rig that is held at a problem's optimum; none for models but the rigid mast.
 
-    None either where the images do not determine the system with these numbers free.
+    None either where the images do not determine the system with these numbers free. Of a large problem a
+    part of the landmarks serves, and gains are raised to the whole.
     """
     template = problem.template
     if not isinstance(template, HardTemplate):
@@ -57,10 +62,20 @@ def held_entries(problem: Problem) -> list[HeldEntry]:
     if not freed:
         return []
     wide = replace(sharing, **{q: _FREED[q] for q in freed})
+    part = _part(problem)
+    share = part.kept.sum() / max(problem.kept.sum(), 1)
     try:
-        return list(_scores(problem.on(HardTemplate(template.traverse, wide)), wide, freed))
+        entries = list(_scores(part.on(HardTemplate(template.traverse, wide)), wide, freed))
     except SolveError:
         return []
+    return [replace(e, gain=float(e.gain / share)) for e in entries]
+
+
+def _part(problem: Problem) -> Problem:
+    """The problem with about `_ENOUGH` of its observations."""
+    m = problem.measurements
+    every = max(int(problem.kept.sum()) // _ENOUGH, 1)
+    return replace(problem, accepted=problem.accepted & (m.landmark % every == 0))
 
 
 def _scores(problem: Problem, sharing: Sharing, freed: list[Quantity]) -> Iterator[HeldEntry]:
