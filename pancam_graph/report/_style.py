@@ -25,7 +25,7 @@ section { margin-top: 30px; }
 .verdict ul { margin: 4px 0 0; padding-left: 20px; overflow-wrap: anywhere; }
 .verdict summary { cursor: pointer; margin-top: 4px; }
 .verdict .scroll { margin-top: 8px; background: #ffffff; max-height: none; }
-.verdict td.text:last-child { white-space: normal; min-width: 22em; }
+.verdict td:nth-child(3) { white-space: normal; min-width: 22em; }
 .figures { display: grid; grid-template-columns: repeat(auto-fit, minmax(200px, 1fr)); gap: 12px; }
 .figures { margin: 14px 0 0; }
 .figures div { background: var(--soft);

@@ -4,15 +4,16 @@ from html import escape
 
 from pancam_graph.data import Verdict, VerdictTest
 from pancam_graph.report._numbers import short
+from pancam_graph.report._tables import table
 
 __all__ = ["verdict_section"]
 
 _COLUMNS = (
-    ("test", "text"),
-    ("value", "number"),
-    ("limit", "number"),
-    ("outcome", "text"),
-    ("what it says", "text"),
+    ("test", "name of the test"),
+    ("outcome", "advice: passed, with something to consider"),
+    ("what it says", "what was found"),
+    ("value", "what was tested; a dash where there was nothing to test"),
+    ("limit", "up to which it passes, or gives no advice"),
 )
 
 
@@ -27,32 +28,15 @@ def verdict_section(verdict: Verdict | None) -> str:
         else f"Failed {failed} of {total} tests: do not rely on these numbers before this is settled"
     )
     said = "".join(f"<li>{escape(f'{t.name}: {t.says}')}</li>" for t in (*verdict.failures, *verdict.notes))
+    tests = table("Tests of the solution", _COLUMNS, [_row(test) for test in verdict.tests], texts=3)
     points = f"<ul>{said}</ul>\n" if said else ""
     return (
         f'<div class="verdict{"" if verdict.passed else " bad"}" role="note">\n<h2>{escape(head)}</h2>\n'
-        f"{points}<details><summary>All tests</summary>\n{_table(verdict)}</details>\n</div>\n"
+        f"{points}<details><summary>All tests</summary>\n{tests}</details>\n</div>\n"
     )
 
 
-def _table(verdict: Verdict) -> str:
-    head = "".join(f'<th scope="col" class="{kind}">{escape(name)}</th>' for name, kind in _COLUMNS)
-    rows = "\n".join(_row(test) for test in verdict.tests)
-    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>\n{rows}\n</tbody></table></div>'
-
-
-def _row(test: VerdictTest) -> str:
+def _row(test: VerdictTest) -> tuple[str, ...]:
     outcome = "failed" if not test.passed else "advice" if test.is_note else "passed"
-    cells = (
-        test.name,
-        short(float("nan") if test.value is None else test.value),
-        short(test.limit),
-        outcome,
-        test.says,
-    )
-    return (
-        "<tr>"
-        + "".join(
-            f'<td class="{kind}">{escape(cell)}</td>' for cell, (_, kind) in zip(cells, _COLUMNS, strict=True)
-        )
-        + "</tr>"
-    )
+    value = float("nan") if test.value is None else test.value
+    return test.name, outcome, test.says, short(value), short(test.limit)
