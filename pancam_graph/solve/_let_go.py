@@ -55,9 +55,9 @@ def letting_go(traverse: Traverse, errors: Sequence[Correction]) -> LetGo:
     return out
 
 
-def most_let_go(n_entries: int) -> int:
-    """How many parts of telemetry may be let go before nothing of it is believed."""
-    return max(_FEW, int(_SHARE * n_entries))
+def most_let_go(traverse: Traverse) -> int:
+    """How many parts of a traverse's telemetry may be let go before nothing of it is believed."""
+    return max(_FEW, int(_SHARE * (2 * len(traverse.frames) + 6 * len(traverse.stops))))
 
 
 def parts_let_go(traverse: Traverse, let_go: LetGo, state: State) -> list[Part]:
@@ -87,14 +87,9 @@ def _angles(t: Traverse, let_go: LetGo, state: State) -> Iterator[Part]:
 
 
 def _stops(t: Traverse, let_go: LetGo, state: State) -> Iterator[Part]:
-    pairs = zip(t.stops, state.world_T_mast, strict=True)
-    moved = np.array([stop.world_T_mast.localCoordinates(pose) for stop, pose in pairs])
-    shift = np.array(
-        [
-            pose.translation() - s.world_T_mast.translation()
-            for s, pose in zip(t.stops, state.world_T_mast, strict=True)
-        ]
-    )
+    pairs = [(stop.world_T_mast, pose) for stop, pose in zip(t.stops, state.world_T_mast, strict=True)]
+    moved = np.array([told.localCoordinates(pose) for told, pose in pairs])
+    shift = np.array([pose.translation() - told.translation() for told, pose in pairs])
     for s, stop in enumerate(t.stops):
         for k in np.flatnonzero(let_go.stops[s, :3]):
             what = f"the {MAST_ENTRIES[k]} of {stop.id}"

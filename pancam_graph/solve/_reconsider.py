@@ -39,7 +39,7 @@ def reconsidered(judged: Judged) -> Judged:
     is: the verdict says why.
     """
     now, traverse = judged, judged.fitted.screened.prepared.traverse
-    most = most_let_go(2 * len(traverse.frames) + 6 * len(traverse.stops))
+    most = most_let_go(traverse)
     for _ in range(most):
         if not _fails(now):
             return now

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from pancam_graph.base.geometry import BoolArray, IntArray
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.data import VerdictTest
 from pancam_graph.solve._chances import CHANCE
 from pancam_graph.solve._problem import Problem
 
-__all__ = ["let_go_links", "links_of", "shares_in_use"]
+__all__ = ["in_use_by", "let_go_links", "links_of", "shares_in_use"]
 
 _LEFT_OUT = 0.9
 """Largest share of the observations that may be left out as outliers."""
@@ -90,6 +90,20 @@ def links_of(problem: Problem, owner: IntArray) -> tuple[IntArray, BoolArray]:
     return seen_by[rows], (in_use & joined[landmark])[rows]
 
 
+def in_use_by(
+    owner: IntArray, kept: BoolArray, n_owners: int
+) -> tuple[IntArray, FloatArray, float, FloatArray]:
+    """How many each owner has (owners,), how many of them are in use (owners,), and the share of all.
+
+    The last value (owners,) is the chance of no more, if its own were as good as all others: few are in use
+    by chance too, where few are owned. `owner` (n,) is of each thing, and `kept` (n,) whether it is in use.
+    """
+    usual = float(np.mean(kept)) if len(kept) else 1.0
+    n = np.bincount(owner, minlength=n_owners)
+    used = np.asarray(np.bincount(owner, kept, minlength=n_owners), dtype=float)
+    return n, used, usual, np.asarray(scipy.special.bdtr(used, n, usual), dtype=float)
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Fairness:
     """A test that no owner has much less in use than all others together."""
@@ -113,12 +127,9 @@ class _Fairness:
         is_tested = np.ones(len(self.ids), dtype=bool)
         if among is not None:
             is_tested = np.isin(np.arange(len(self.ids)), among)
-        usual = float(np.mean(kept)) if len(kept) else 1.0
-        n = np.bincount(owner, minlength=len(self.ids))
-        used = np.bincount(owner, kept, minlength=len(self.ids))
+        n, used, usual, chance = in_use_by(owner, kept, len(self.ids))
         share, limit = used / n.clip(1), 1 - self.fair * usual
-        # Few are in use by chance too, where few are owned.
-        is_sure = scipy.special.bdtr(used, n, usual) < CHANCE / len(self.ids)
+        is_sure = chance < CHANCE / len(self.ids)
         suspect = is_tested & (n >= self.least) & is_sure & (share < self.fair * usual)
         tested = np.flatnonzero(suspect if suspect.any() else is_tested & (n >= self.least))
         if not len(tested):

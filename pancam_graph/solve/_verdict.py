@@ -265,7 +265,7 @@ def _telemetry(at: Optimum) -> Iterator[VerdictTest]:
 
 def _let_go(at: Optimum) -> VerdictTest:
     """Parts of telemetry that were let go; too many fail."""
-    parts, most = at.let_go, most_let_go(2 * len(at.traverse.frames) + 6 * len(at.traverse.stops))
+    parts, most = at.let_go, most_let_go(at.traverse)
     if not parts:
         return VerdictTest.note("let go", 0.0, 0.0, "no telemetry was let go", "")
     some = "; ".join(sentence(part) for part in parts[:_NAMED])
