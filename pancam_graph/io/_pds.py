@@ -123,11 +123,13 @@ def read_pds(folder: Path | str) -> Traverse:
         for name, i in zip(frame_ids, frames_first, strict=True)
     )
     order = sorted(range(len(frames)), key=lambda r: (images[frames_first[r]].stop, r))
+    rig = fit.rig(f"{kinematics.name}-pds")
     rig = replace(
-        fit.rig(f"{kinematics.name}-pds"),
+        rig,
         pointing_sigma=sigma,
         mast_height_m=kinematics.mast_height_m,
         source=f"PDS labels of {visible(folder.resolve().name)}; {kinematics.source}",
+        uncertainty=images[0].rover.uncertainty_of(rig.longest_side_px),
     )
     return Traverse(
         name=visible(folder.resolve().name),

@@ -1,7 +1,7 @@
 """Labels of Perseverance. Source: the camera SIS of Mars 2020."""
 
 from pancam_graph.io._pds_rover import LabelledRover, named_joints
-from pancam_graph.rigs import MARS2020_MAST
+from pancam_graph.rigs import MARS2020_MAST, mars2020_uncertainty
 
 __all__ = ["MARS2020"]
 
@@ -10,6 +10,7 @@ MARS2020 = LabelledRover(
     named="M20",
     cameras=("NAVCAM", "NAV_", "MCZ_", "ZCAM", "SUPERCAM", "SCAM"),
     mast=MARS2020_MAST,
+    uncertainty_of=mars2020_uncertainty,
     joints_rad=named_joints(
         azimuth=("AZIMUTH FINAL-RESOLVER", "AZIMUTH-MEASURED", "AZIMUTH FINAL-ENCODER"),
         elevation=("ELEVATION FINAL-RESOLVER", "ELEVATION-MEASURED", "ELEVATION FINAL-ENCODER"),

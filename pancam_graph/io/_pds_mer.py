@@ -7,7 +7,7 @@ import numpy as np
 from pancam_graph.base.geometry import rotation_from_wxyz
 from pancam_graph.io._pds_label import PdsLabel
 from pancam_graph.io._pds_rover import ROVER_FRAMES, LabelledRover, reference_frame
-from pancam_graph.rigs import MER_MAST, MastKinematics
+from pancam_graph.rigs import MER_MAST, MastKinematics, mer_uncertainty
 
 __all__ = ["MER"]
 
@@ -37,6 +37,7 @@ MER = LabelledRover(
     named="MER1, MER2",
     cameras=("PANCAM", "NAVCAM"),
     mast=MER_MAST,
+    uncertainty_of=mer_uncertainty,
     joints_rad=_joints_rad,
     mast_of=_mast_of,
 )

@@ -1,7 +1,7 @@
 """Labels of Curiosity. Source: the camera SIS of MSL."""
 
 from pancam_graph.io._pds_rover import LabelledRover, named_joints
-from pancam_graph.rigs import MSL_MAST
+from pancam_graph.rigs import MSL_MAST, msl_uncertainty
 
 __all__ = ["MSL"]
 
@@ -10,6 +10,7 @@ MSL = LabelledRover(
     named="MSL",
     cameras=("NAV_", "NAVCAM", "MAST_", "CHEMCAM"),
     mast=MSL_MAST,
+    uncertainty_of=msl_uncertainty,
     joints_rad=named_joints(
         azimuth=("AZIMUTH-MEASURED", "AZIMUTH-FINAL"), elevation=("ELEVATION-MEASURED", "ELEVATION-FINAL")
     ),

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from pancam_graph.base.errors import InputError
 from pancam_graph.io._pds_label import LabelGroup, PdsLabel
-from pancam_graph.rigs import MastKinematics
+from pancam_graph.rigs import MastKinematics, RigUncertainty
 
 __all__ = ["ROVER_FRAMES", "LabelledRover", "named_joints", "reference_frame"]
 
@@ -26,6 +26,8 @@ class LabelledRover:
     """How the INSTRUMENT_ID of a camera on its mast may begin."""
     mast: MastKinematics
     """The mast as published."""
+    uncertainty_of: Callable[[int], RigUncertainty]
+    """How far cameras and axes of labels may be off, by the longer side of the images, pixels."""
     joints_rad: Callable[[PdsLabel], tuple[float, float]]
     """Measured readings of the azimuth and the elevation joint. Raises InputError naming the entry."""
     mast_of: Callable[[PdsLabel], MastKinematics] | None = None

@@ -1,7 +1,7 @@
 """The entries of `traverse.json`."""
 
 import math
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Tag
@@ -10,7 +10,7 @@ from pancam_graph.data import Freedom, Sharing
 from pancam_graph.io._camera_entry import AnyCamera, camera_entry
 from pancam_graph.io._entries import Entry, Label, PoseEntry, Text
 from pancam_graph.io._json import prefixed
-from pancam_graph.rigs import Rig, rig_template
+from pancam_graph.rigs import Rig, RigUncertainty, rig_template
 
 __all__ = [
     "FrameEntry",
@@ -24,15 +24,42 @@ __all__ = [
 ]
 
 
+class UncertaintyEntry(Entry):
+    """How far the numbers of a rig may be off; what is not named is that of the rig."""
+
+    focal: float | None = None
+    aspect: float | None = None
+    principal_point_px: float | None = None
+    skew_px: float | None = None
+    mount_rad: float | None = None
+    mount_m: float | None = None
+    tilt_axis_rad: float | None = None
+    tilt_axis_m: float | None = None
+    source: Text | None = None
+
+    def on(self, rig: Rig) -> Rig:
+        """The rig with this uncertainty. Raises InputError for a negative sigma."""
+        with prefixed("rig"):
+            return replace(rig, uncertainty=replace(rig.uncertainty, **self.model_dump(exclude_none=True)))
+
+    @staticmethod
+    def of(uncertainty: RigUncertainty) -> "UncertaintyEntry":
+        """The entry of an uncertainty."""
+        sigmas = {name: float(sigma) for name, sigma in uncertainty.sigmas.items()}
+        return UncertaintyEntry(**sigmas, source=uncertainty.source)
+
+
 class TemplateRigEntry(Entry):
     """A rig that ships with the package."""
 
     template: Label
+    uncertainty: UncertaintyEntry = UncertaintyEntry()
 
     def rig(self) -> Rig:
         """The rig. Raises InputError for an unknown template."""
         with prefixed("rig"):
-            return rig_template(self.template)
+            rig = rig_template(self.template)
+        return self.uncertainty.on(rig)
 
 
 class OwnRigEntry(Entry):
@@ -41,12 +68,13 @@ class OwnRigEntry(Entry):
     name: Text = "own rig"
     pan_T_tilt: PoseEntry
     cameras: list[AnyCamera]
+    uncertainty: UncertaintyEntry = UncertaintyEntry()
 
     def rig(self) -> Rig:
         """The rig. Raises InputError naming the entry."""
         pan_T_tilt = self.pan_T_tilt.pose("rig.pan_T_tilt")
         eyes = tuple(c.eye(f"rig.cameras[{i}]") for i, c in enumerate(self.cameras))
-        return Rig(name=self.name, pan_T_tilt=pan_T_tilt, eyes=eyes)
+        return self.uncertainty.on(Rig(name=self.name, pan_T_tilt=pan_T_tilt, eyes=eyes))
 
 
 def _rig_tag(value: Any) -> str:
@@ -160,4 +188,5 @@ def rig_entry(rig: Rig) -> OwnRigEntry:
         name=rig.name,
         pan_T_tilt=PoseEntry.of(rig.pan_T_tilt),
         cameras=[camera_entry(e) for e in rig.eyes],
+        uncertainty=UncertaintyEntry.of(rig.uncertainty),
     )

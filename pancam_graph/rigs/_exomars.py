@@ -1,10 +1,12 @@
 """ExoMars (Rosalind Franklin): PanCam. Offsets of eyes are in our head frame, z up."""
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 
 from pancam_graph.rigs._eyes import design_eye
-from pancam_graph.rigs._mer import MER_POINTING
+from pancam_graph.rigs._mer import MER_POINTING, mer_uncertainty
 from pancam_graph.rigs._rig import Rig
 
 __all__ = ["EXOMARS_TEMPLATES", "exomars_pancam"]
@@ -32,6 +34,11 @@ def exomars_pancam() -> Rig:
         pointing_sigma=MER_POINTING,
         mast_height_m=2.0,
         source="Coates et al. 2017; ESA ExoMars frame and structure kernels",
+        uncertainty=replace(
+            mer_uncertainty(1024),
+            source="that of a calibrated unit of MER stands in; documents differ by 10 mm in the baseline of "
+            "the WACs, which a unit's own calibration will settle",
+        ),
     )
 
 

@@ -1,5 +1,7 @@
 """Eyes on a rover's mast: from camera models of documents and labels, and from design values."""
 
+from collections.abc import Callable
+
 import gtsam
 import numpy as np
 
@@ -7,6 +9,7 @@ from pancam_graph.base.geometry import HEAD_R_FORWARD_CAMERA, FloatArray, rz
 from pancam_graph.cameras import CAHV, Pinhole
 from pancam_graph.rigs._mast import MastKinematics
 from pancam_graph.rigs._rig import Eye, Rig
+from pancam_graph.rigs._uncertainty import RigUncertainty
 from pancam_graph.rigs._z_down import camera_z_up
 
 __all__ = ["design_eye", "document_eye", "label_eye", "mast_rig"]
@@ -40,8 +43,15 @@ def design_eye(
     return Eye(name=name, camera=camera, head_T_camera=gtsam.Pose3(gtsam.Rot3(rotation), np.array(offset_m)))
 
 
-def mast_rig(name: str, mast: MastKinematics, eyes: tuple[Eye, ...], source: str) -> Rig:
-    """A rig on a mast with published axes."""
+def mast_rig(
+    name: str,
+    mast: MastKinematics,
+    eyes: tuple[Eye, ...],
+    source: str,
+    uncertainty_of: Callable[[int], RigUncertainty],
+) -> Rig:
+    """A rig on a mast with published axes, and its uncertainty, given by the longer side of its images."""
+    side_px = max(max(e.camera.width_px, e.camera.height_px) for e in eyes)
     return Rig(
         name=name,
         pan_T_tilt=mast.chain()[1],
@@ -49,4 +59,5 @@ def mast_rig(name: str, mast: MastKinematics, eyes: tuple[Eye, ...], source: str
         pointing_sigma=mast.pointing_sigma,
         mast_height_m=mast.mast_height_m,
         source=f"{source}; {mast.source}",
+        uncertainty=uncertainty_of(side_px),
     )

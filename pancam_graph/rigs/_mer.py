@@ -3,14 +3,17 @@
 Offsets of eyes are in our head frame, z up. Where sources disagree the docstring says so.
 """
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 
 from pancam_graph.rigs._eyes import design_eye
 from pancam_graph.rigs._mast import MastKinematics
 from pancam_graph.rigs._rig import PointingSigma, Rig
+from pancam_graph.rigs._uncertainty import RigUncertainty
 
-__all__ = ["MER_MAST", "MER_POINTING", "MER_TEMPLATES", "mer_navcam", "mer_pancam"]
+__all__ = ["MER_MAST", "MER_POINTING", "MER_TEMPLATES", "mer_navcam", "mer_pancam", "mer_uncertainty"]
 
 MER_POINTING = PointingSigma(
     pan_rad=float(np.deg2rad(0.077)), tilt_rad=float(np.deg2rad(0.077)), twist_rad=float(np.deg2rad(0.06))
@@ -33,6 +36,25 @@ MER_MAST = MastKinematics(
 """Pancam mast assembly. Both axes meet in one pivot, which each label gives to the millimetre."""
 
 
+def mer_uncertainty(side_px: int) -> RigUncertainty:
+    """Uncertainty of one unit's own calibration, as its labels have it.
+
+    The templates below are designs: the eyes of the flight units sit centimetres from them, which this does
+    not cover. Only labels say where.
+    """
+    return replace(
+        RigUncertainty.usual(side_px),
+        focal=3e-3,
+        mount_rad=5e-4,
+        mount_m=5e-4,
+        tilt_axis_rad=5e-4,
+        tilt_axis_m=1e-3,
+        source="focal length: those published of one Pancam, 3571 to 3583 px; principal point: the left "
+        "Navcam of Opportunity is 10 px off its label; mounts and axes: our stated assumption for a "
+        "calibrated unit",
+    )
+
+
 def mer_pancam() -> Rig:
     """Pancam of the Mars Exploration Rovers: two eyes 0.30 m apart, 16 degrees, 0.28 mrad per pixel.
 
@@ -52,6 +74,7 @@ def mer_pancam() -> Rig:
         pointing_sigma=MER_POINTING,
         mast_height_m=1.54,
         source="Bell et al. 2003; Albl, PanCam Bundle Adjustment; VICAR PigPointMER",
+        uncertainty=mer_uncertainty(1024),
     )
 
 
@@ -71,6 +94,7 @@ def mer_navcam() -> Rig:
         pointing_sigma=MER_POINTING,
         mast_height_m=1.54,
         source="Maki et al. 2003; VICAR PigPointMER",
+        uncertainty=mer_uncertainty(1024),
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray, IntArray, compose, pan_tilt_rotation, pose_arrays
 from pancam_graph.cameras import CAHV, Camera, Pinhole
+from pancam_graph.rigs._uncertainty import RigUncertainty
 
 __all__ = ["Eye", "PointingSigma", "Rig"]
 
@@ -73,9 +74,11 @@ class Rig:
     simulations only: a traverse says so by the sigmas of its frames."""
     source: str = ""
     """Where the numbers come from."""
+    uncertainty: RigUncertainty = None  # type: ignore[assignment]  # __post_init__ puts the default there
+    """How far the numbers may be off; default: `RigUncertainty.usual` of the largest image."""
 
     def __post_init__(self) -> None:
-        """Check that there are eyes, with different names."""
+        """Check that there are eyes, with different names; state an uncertainty."""
         if not self.eyes:
             raise InputError(f"rig {self.name}: expected at least one camera, found none")
         names = [e.name for e in self.eyes]
@@ -83,6 +86,13 @@ class Rig:
             if names.count(name) > 1:
                 found = f"{name!r} {names.count(name)} times"
                 raise InputError(f"rig {self.name}: expected different camera names, found {found}")
+        if self.uncertainty is None:
+            object.__setattr__(self, "uncertainty", RigUncertainty.usual(self.longest_side_px))
+
+    @property
+    def longest_side_px(self) -> int:
+        """Longer side of the largest image."""
+        return max(max(e.camera.width_px, e.camera.height_px) for e in self.eyes)
 
     def eye_index(self, name: str) -> int:
         """Index of an eye by name. Raises InputError for an unknown one."""

@@ -6,6 +6,7 @@ import numpy as np
 from pancam_graph.base.geometry import HEAD_R_FORWARD_CAMERA, FloatArray, rz
 from pancam_graph.cameras import Pinhole
 from pancam_graph.rigs._rig import Eye, PointingSigma, Rig
+from pancam_graph.rigs._uncertainty import RigUncertainty
 
 __all__ = ["RING_TEMPLATES", "ladybug3", "ladybug5"]
 
@@ -66,6 +67,18 @@ def _ladybug(*, name: str, radius_m: float, top_m: float, camera: Pinhole, sourc
         mast_height_m=2.0,
         turns=False,
         source=source,
+        uncertainty=RigUncertainty(
+            focal=1e-2,
+            aspect=5e-4,
+            principal_point_px=25.0,
+            skew_px=0.5,
+            mount_rad=5e-3,
+            mount_m=5e-4,
+            tilt_axis_rad=0.0,
+            tilt_axis_m=0.0,
+            source="published calibration files: focal lengths within 2 %, principal points within 50 px, "
+            "radii within 1 mm; turns, aspect and skew: our stated assumption",
+        ),
     )
 
 

@@ -1,0 +1,65 @@
+"""How far the numbers of a rig may be off."""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from pancam_graph.base.errors import InputError
+
+__all__ = ["RigUncertainty"]
+
+_PRINCIPAL_POINT = 5e-3
+_SKEW = 2e-4
+"""Usual sigmas of principal point and skew, as shares of the image's longer side."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigUncertainty:
+    """Standard deviations of a rig's numbers about the values that it states; 0: known exactly.
+
+    Errors of different eyes, and of different entries, are independent. The defaults are our stated
+    assumption for a calibrated rig of which nothing more is known, with images of 1024 px; `usual` scales
+    them to other images. Raises InputError for a negative sigma, and for one that is not finite.
+    """
+
+    focal: float = 5e-3
+    """Of each eye's focal length, as a share of it."""
+    aspect: float = 5e-4
+    """Of each eye's ratio fy / fx, as a share of it."""
+    principal_point_px: float = _PRINCIPAL_POINT * 1024
+    """Of each coordinate of each eye's principal point."""
+    skew_px: float = _SKEW * 1024
+    """Of each eye's skew."""
+    mount_rad: float = 1e-3
+    """Of each eye's `head_T_camera`: each component of its turn, in the camera's frame."""
+    mount_m: float = 1e-3
+    """Of each component of its shift."""
+    tilt_axis_rad: float = 1e-3
+    """Of `pan_T_tilt`: each component of its turn, in the tilt frame."""
+    tilt_axis_m: float = 2e-3
+    """Of each component of its shift."""
+    source: str = "our stated assumption for a calibrated rig"
+    """Where the numbers come from."""
+
+    def __post_init__(self) -> None:
+        """Check the sigmas."""
+        for name, sigma in self.sigmas.items():
+            if not (np.isfinite(sigma) and sigma >= 0):
+                raise InputError(
+                    f"uncertainty: {name}: expected 0 (exact) or a positive number, found {sigma}"
+                )
+
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """The standard deviations by name."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "source"}
+
+    @staticmethod
+    def usual(side_px: int) -> "RigUncertainty":
+        """The defaults for images whose longer side has so many pixels.
+
+        Principal point: 0.5 % of that side (the principal points of the two Mars 2020 Navcams differ by
+        0.35 % of it, that of Opportunity's left Navcam is 1 % off its label). Skew: 0.02 % (image axes of
+        CAHV labels are off a right angle by up to 0.012 degrees).
+        """
+        return RigUncertainty(principal_point_px=_PRINCIPAL_POINT * side_px, skew_px=_SKEW * side_px)
