@@ -83,6 +83,12 @@ def add_drive_options(
         help="error of the turns of mounts that it claims (0)",
     )
     add("--mount-error-m", type=float, default=0.0, help="error of the places of mounts that it claims (0)")
+    add(
+        "--rig-error",
+        choices=("none", "drawn"),
+        default="none",
+        help="drawn: all numbers of the rig that it claims are off, as far as its uncertainty says (none)",
+    )
     add("--radius-error-m", type=float, default=0.0, help="error of the radii of eyes that it claims (0)")
 
 

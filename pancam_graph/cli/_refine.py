@@ -24,8 +24,8 @@ which), 2 bad input or a fault (nothing is written), 130 interrupted.
 """
 _SHARING_HELP = (
     "what of the rig is estimated, and who shares it, in one or more WORDs: "
-    "QUANTITY=SCOPE[:ENTRY[~SIGMA],...] with quantities calibration (fx_px fy_px skew_px cx_px cy_px, or "
-    "focal), mounts and pan_T_tilt (rx_rad ry_rad rz_rad "
+    "QUANTITY=SCOPE[:ENTRY[~SIGMA],...] with quantities calibration (fx_px fy_px skew_px cx_px cy_px; focal "
+    "and aspect, factors, in place of fx_px fy_px), mounts and pan_T_tilt (rx_rad ry_rad rz_rad "
     "x_m y_m z_m), radius (radius_m; model circle) and scopes fixed, all, eye, stop, image; without entries "
     "all are free; SIGMA is the prior's, inf for none; what traverse.json says of a quantity is overridden; "
     "for example calibration=eye:focal mounts=eye"
@@ -83,6 +83,14 @@ def _add_options(parser: CommandParser) -> None:
         help="when the final iterations end; one or more of max_iterations (default 100), "
         "relative_decrease (of the cost, 1e-7), relative_step, max_gradient, residual_sigmas; 0: not used",
     )
+    add(
+        "--rig",
+        choices=("estimated", "held", "considered"),
+        default="held",
+        help="estimated: what images say of cameras, mounts and tilt axis is estimated, within the rig's "
+        "uncertainty; held: the rig counts as exact (default); considered: it is not moved, but its "
+        "uncertainty is in every sigma",
+    )
     add("--sharing", action=Several, type=Assignment(), default=(), metavar="WORD", help=_SHARING_HELP)
     add(
         "--incremental",
@@ -126,7 +134,9 @@ def _work(call: Invocation) -> int:
     from pancam_graph.solve import COMPILING, criteria
 
     arguments, progress = call.arguments, call.progress
-    chosen: dict[str, Any] = {n: getattr(arguments, n) for n in ("model", "landmarks", "method", "loss")}
+    chosen: dict[str, Any] = {
+        n: getattr(arguments, n) for n in ("model", "landmarks", "method", "loss", "rig")
+    }
     chosen.update(criteria(arguments.stop))
     chosen["rescale_noise"] = None if arguments.noise is None else arguments.noise == "estimated"
     sharing = parse_sharing(arguments.sharing)

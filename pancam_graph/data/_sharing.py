@@ -27,10 +27,12 @@ ENTRIES: Mapping[Quantity, tuple[str, ...]] = {
     "pan_T_tilt": _POSE,
     "radius": ("radius_m",),
 }
-"""Names of the entries of each quantity. `calibration` has one more, `focal`: a common factor on fx and fy.
-Entries of a pose are a rotation vector and a shift in the pose's own frame (geometry.corrected_poses)."""
+"""Names of the entries of each quantity. `calibration` has two more: `focal`, a common factor on fx and fy,
+and `aspect`, a factor on fy alone, so that priors of the two are independent. Entries of a pose are a
+rotation vector and a shift in the pose's own frame (geometry.corrected_poses)."""
 
 FOCAL = "focal"
+ASPECT = "aspect"
 
 _SCOPES: Mapping[Quantity, tuple[Scope, ...]] = {
     "calibration": ("fixed", "all", "eye", "stop", "image"),
@@ -65,6 +67,8 @@ _OTHERWISE: Mapping[tuple[str, str], str] = {
 _DEFAULT_SIGMA = {
     # Published focal lengths of one MER Pancam: 3571 to 3583 px.
     FOCAL: 3e-3,
+    # fx and fy of published CAHV models differ by up to this share.
+    ASPECT: 5e-4,
     # A CAHV label's image axes are off a right angle by up to 0.012 degrees.
     "skew_px": 2e-4,
     # Principal points of the two Mars 2020 Navcams, and of the two Mastcam-Z, differ by 0.2 to 0.7 %.
@@ -77,7 +81,7 @@ _DEFAULT_SIGMA = {
     # The circle of Opportunity's five Navcam centres misses them by up to a millimetre.
     "radius_m": 1e-3,
 }
-"""Standard deviations of the priors; entries in pixels as shares of the focal length, `focal` as a share."""
+"""Standard deviations of the priors; entries in pixels as shares of the focal length, factors as shares."""
 
 
 def default_sigma(entry: str, focal_px: float) -> float:
@@ -168,7 +172,7 @@ class Sharing:
 
 
 def _known(quantity: Quantity) -> tuple[str, ...]:
-    return (FOCAL, *ENTRIES[quantity]) if quantity == "calibration" else ENTRIES[quantity]
+    return (FOCAL, ASPECT, *ENTRIES[quantity]) if quantity == "calibration" else ENTRIES[quantity]
 
 
 def _check(quantity: Quantity, freedom: Freedom) -> None:
@@ -197,8 +201,9 @@ def _check(quantity: Quantity, freedom: Freedom) -> None:
     entries = freedom.entries(quantity)
     if not entries:
         raise InputError(f"{where}: free: expected one entry or more, found none; fixed holds them all")
-    if FOCAL in entries and not {"fx_px", "fy_px"}.isdisjoint(entries):
-        raise InputError(f"{where}: free: expected either {FOCAL} or fx_px and fy_px, found both")
+    for factor in (FOCAL, ASPECT):
+        if factor in entries and not {"fx_px", "fy_px"}.isdisjoint(entries):
+            raise InputError(f"{where}: free: expected either {factor} or fx_px and fy_px, found both")
     for name, sigma in freedom.sigma.items():
         if name not in entries:
             raise InputError(

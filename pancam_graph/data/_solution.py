@@ -67,7 +67,7 @@ class Refined:
     """Id of the image that the entry belongs to; None if all images of the eye, or of the eye at the stop,
     share it."""
     nominal: float | None
-    """Value in the rig: 0 for entries of a pose, 1 for `focal`; None if images that share the entry
+    """Value in the rig: 0 for entries of a pose, 1 for a factor; None if images that share the entry
     differ."""
     change: float
     """Estimated difference from the rig's value."""

@@ -21,6 +21,7 @@ from pancam_graph.base.geometry import (
 )
 from pancam_graph.cameras import CALIBRATION_ENTRIES, Camera
 from pancam_graph.data import (
+    ASPECT,
     ENTRIES,
     FOCAL,
     Freedom,
@@ -145,13 +146,15 @@ class RigVariables:
         if FOCAL in free:
             # A factor 1 + f on both focal lengths changes each by f times its value in the rig.
             out[:, :2, free.index(FOCAL)] = self._K[:, [0, 1], [0, 1]]
+        if ASPECT in free:
+            out[:, 1, free.index(ASPECT)] = self._K[:, 1, 1]
         return out
 
     def _nominal(self, quantity: Quantity, free: tuple[str, ...], n_sites: int) -> FloatArray:
         """(sites, columns) values of the rig of the free entries; 0 for an entry that is a correction."""
         out: FloatArray = np.zeros((n_sites, len(free)))
         for j, entry in enumerate(free):
-            if entry == FOCAL:
+            if entry in {FOCAL, ASPECT}:
                 out[:, j] = 1.0
             elif quantity == "calibration":
                 row, column = (at[ENTRIES[quantity].index(entry)] for at in CALIBRATION_ENTRIES)
@@ -386,7 +389,9 @@ class RigVariables:
         half = np.array([max(e.camera.width_px, e.camera.height_px) / 2 for e in t.rig.eyes])[t.image_eye]
         one = np.ones(len(focal))
         # Motion of pixels by a unit of an entry; by one of a calibration, at the edge of the image.
-        weight = {"cx_px": one, "cy_px": one, FOCAL: half} | dict.fromkeys(ENTRIES["mounts"][:3], focal)
+        weight = {"cx_px": one, "cy_px": one, FOCAL: half, ASPECT: half} | dict.fromkeys(
+            ENTRIES["mounts"][:3], focal
+        )
         square_px, square_m = np.zeros(len(t.images)), np.zeros(len(t.images))
         for v in self.variables:
             if v.quantity == "radius":  # calibration, mounts and pan_T_tilt alone count

@@ -50,8 +50,8 @@ def mer_uncertainty(side_px: int) -> RigUncertainty:
         tilt_axis_rad=5e-4,
         tilt_axis_m=1e-3,
         source="focal length: those published of one Pancam, 3571 to 3583 px; principal point: the left "
-        "Navcam of Opportunity is 10 px off its label; mounts and axes: our stated assumption for a "
-        "calibrated unit",
+        "Navcam of Opportunity is 7 px off its label, 10 px where nothing else is free; mounts and axes: "
+        "our stated assumption for a calibrated unit",
     )
 
 

@@ -11,7 +11,7 @@ from pancam_graph.cameras import Camera
 from pancam_graph.data import Frame, Image, Observations, Stop, Traverse
 from pancam_graph.rigs import Rig
 from pancam_graph.simulate._simulation_options import DriveOptions
-from pancam_graph.simulate._wrong_rig import wrong_rig
+from pancam_graph.simulate._wrong_rig import drawn_rig, wrong_rig
 
 __all__ = [
     "TelemetryStart",
@@ -126,7 +126,7 @@ def panorama(
 
 def claimed_rig(rig: Rig, options: DriveOptions, angles_rad: FloatArray, rng: np.random.Generator) -> Rig:
     """The rig that the traverse claims: with errors where the options say so."""
-    return wrong_rig(
+    wrong = wrong_rig(
         rig,
         rng,
         focal=options.focal_error,
@@ -135,6 +135,7 @@ def claimed_rig(rig: Rig, options: DriveOptions, angles_rad: FloatArray, rng: np
         radius_m=options.radius_error_m,
         tilt_rad=float(np.mean(angles_rad[:, 1])),
     )
+    return drawn_rig(wrong, rng) if options.rig_error == "drawn" else wrong
 
 
 def telemetry(

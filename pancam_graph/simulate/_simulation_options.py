@@ -52,6 +52,8 @@ class DriveOptions:
     """Standard deviation of each component of the position of each mount in that rig."""
     radius_error_m: float = 0.0
     """Standard deviation of the radius of each eye's circle in that rig, at the mean tilt."""
+    rig_error: Literal["none", "drawn"] = "none"
+    """Errors of that rig beside these: "none", or "drawn" from its own uncertainty (`Rig.uncertainty`)."""
 
     def __post_init__(self) -> None:
         """Check ranges."""
@@ -73,6 +75,7 @@ class DriveOptions:
             "radius_error_m",
         ):
             self._require(name, 0 <= getattr(self, name) < np.inf, "a number of 0 or above")
+        self._require("rig_error", self.rig_error in {"none", "drawn"}, "'none' or 'drawn'")
         sweep = self.sweep_rad
         self._require("sweep_rad", sweep is None or 0 < sweep <= 2 * np.pi, "an angle above 0, up to 2 pi")
 

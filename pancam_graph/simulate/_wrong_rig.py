@@ -1,14 +1,14 @@
-"""A rig with errors, as a simulated traverse may claim it beside the true one that made its images."""
+"""Rigs with errors, as a simulated traverse may claim them beside the true one that made its images."""
 
 from dataclasses import replace
 
 import gtsam
 import numpy as np
 
-from pancam_graph.base.geometry import corrected_poses, rz
+from pancam_graph.base.geometry import FloatArray, corrected_poses, rz
 from pancam_graph.rigs import Rig
 
-__all__ = ["wrong_rig"]
+__all__ = ["drawn_rig", "wrong_rig"]
 
 
 def wrong_rig(
@@ -41,8 +41,30 @@ def wrong_rig(
             shift = radius_m * draw[1] * (head_R[0].T @ rz(phase_rad)[:, 0])
             mount = gtsam.Pose3(mount.rotation(), mount.translation() + shift)
         if sigmas.any():
-            nominal = mount.rotation().matrix(), mount.translation()
-            rotation, translation = corrected_poses(*nominal, sigmas * draw[2:])
-            mount = gtsam.Pose3(gtsam.Rot3(rotation), translation)
+            mount = _corrected(mount, sigmas * draw[2:])
         eyes.append(replace(eye, camera=camera, head_T_camera=mount))
     return replace(rig, eyes=tuple(eyes))
+
+
+def drawn_rig(rig: Rig, rng: np.random.Generator) -> Rig:
+    """The rig with gaussian errors in all its numbers, as large as its own uncertainty says."""
+    u = rig.uncertainty
+    turn_shift = np.repeat([u.mount_rad, u.mount_m], 3)
+    eyes = []
+    for eye in rig.eyes:
+        focal, aspect, skew, cx, cy, *mount = rng.standard_normal(11)
+        K = eye.camera.pinhole.calibration_matrix
+        K[0, 0] *= 1 + u.focal * focal
+        K[1, 1] *= 1 + u.focal * focal + u.aspect * aspect
+        K[0, 1] += u.skew_px * skew
+        K[:2, 2] += u.principal_point_px * np.array([cx, cy])
+        head_T_camera = _corrected(eye.head_T_camera, turn_shift * mount)
+        eyes.append(replace(eye, camera=eye.camera.with_calibration(K), head_T_camera=head_T_camera))
+    axis = np.repeat([u.tilt_axis_rad, u.tilt_axis_m], 3) * rng.standard_normal(6)
+    return replace(rig, eyes=tuple(eyes), pan_T_tilt=_corrected(rig.pan_T_tilt, axis))
+
+
+def _corrected(pose: gtsam.Pose3, correction: FloatArray) -> gtsam.Pose3:
+    """A pose turned and shifted in its own frame by a correction (6,), rotation first."""
+    rotation, translation = corrected_poses(pose.rotation().matrix(), pose.translation(), correction)
+    return gtsam.Pose3(gtsam.Rot3(rotation), translation)

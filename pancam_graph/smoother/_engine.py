@@ -182,7 +182,12 @@ class Engine:
         Blocks that share stops with these are added where their other stops would stay too far behind.
         """
         o, moved, blocks = self._options, self._tree.moved, self._drive.blocks
-        limit = {Kind.ANGLES: o.relinearise_rad, Kind.CALIBRATION: _PIXELS * o.relinearise_rig}
+        entries = self._drive.sharing.calibration.entries("calibration")
+        in_pixels = np.array([entry.endswith("_px") for entry in entries])
+        limit = {
+            Kind.ANGLES: o.relinearise_rad,
+            Kind.CALIBRATION: np.where(in_pixels, _PIXELS, 1.0) * o.relinearise_rig,
+        }
         far = {
             key
             for key, delta in moved.items()

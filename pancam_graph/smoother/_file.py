@@ -89,6 +89,8 @@ class _Options(Entry):
     """`SmootherOptions`, entry by entry."""
 
     telemetry: Literal["absolute", "odometry"]
+    rig: Literal["estimated", "held"] = "held"
+    """Older files do not say: with these the rig was held."""
     sharing: SharingEntry | None
     relinearise_rad: float
     relinearise_m: float

@@ -16,7 +16,6 @@ from pancam_graph.data import (
     Incremental,
     Observations,
     Seconds,
-    Sharing,
     Solution,
     Stop,
     Traverse,
@@ -29,6 +28,7 @@ from pancam_graph.smoother._smoother_options import SmootherOptions, Update
 from pancam_graph.solve import (
     SolveOptions,
     fitted_elsewhere,
+    free_numbers,
     judge,
     prepare,
     reconsidered,
@@ -90,6 +90,8 @@ def solve_incrementally(
     smoother = TraverseSmoother(
         traverse.rig,
         SmootherOptions(
+            # What is considered enters sigmas alone, and these are `solve`'s.
+            rig="estimated" if options.rig == "estimated" else "held",
             sharing=options.sharing or traverse.sharing,
             outlier_sigma=None if options.loss == "none" else options.outlier_sigma,
         ),
@@ -103,8 +105,7 @@ def solve_incrementally(
         if on_stop is not None:
             on_stop(updates[-1])
     if factors is not None:
-        sharing = (options.sharing or traverse.sharing or Sharing()).for_model("mast")
-        smoother.add_factors_of(HardTemplate(traverse, sharing), factors)
+        smoother.add_factors_of(HardTemplate(traverse, free_numbers(traverse, options)), factors)
     solved = time.perf_counter()
     solution = _as_solution(traverse, options, smoother, [i for i, _ in order], updates, factors)
     done = time.perf_counter()

@@ -73,7 +73,7 @@ def judged_together(
         pan_tilt_rad=np.concatenate([s.pan_tilt_rad(values) for s in members]),
     )
     assert options.outlier_sigma is not None  # without a cutoff nothing is an outlier
-    wanted = SolveOptions(outlier_sigma=options.outlier_sigma, sharing=options.sharing)
+    wanted = SolveOptions(outlier_sigma=options.outlier_sigma, sharing=options.sharing, rig=options.rig)
     try:
         screened = screen(prepare(traverse, wanted, start))
     except SolveError:

@@ -10,7 +10,7 @@ from pancam_graph.base.errors import InputError, SolveError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.base.threads import blas_on_one_thread
 from pancam_graph.cameras import carry_to_pinhole
-from pancam_graph.data import DrivePart, Frame, Image, Observations, Sharing, Stop, Traverse
+from pancam_graph.data import DrivePart, Frame, Image, Observations, Stop, Traverse
 from pancam_graph.graph import GraphKeys, HardTemplate, UserFactors, read_variable
 from pancam_graph.io import prefixed
 from pancam_graph.landmarks import Landmarks
@@ -45,7 +45,7 @@ class TraverseSmoother:
     def __init__(self, rig: Rig, options: SmootherOptions | None = None) -> None:
         """Begin an empty drive of a rover with this rig."""
         self.rig, self.options = rig, options or SmootherOptions()
-        self._sharing = (self.options.sharing or Sharing()).for_model("mast")
+        self._sharing = self.options.sharing_of(rig)
         self._drive = DriveMap(rig, self._sharing, self.options.outlier_sigma)
         self._engine = Engine(self._drive, self.options)
         self._stop: dict[str, Station] = {}

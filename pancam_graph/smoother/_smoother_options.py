@@ -8,7 +8,8 @@ import numpy as np
 
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray
-from pancam_graph.data import Sharing
+from pancam_graph.data import Sharing, sharing_for
+from pancam_graph.rigs import Rig
 
 __all__ = ["Closure", "Estimate", "SmootherOptions", "Update"]
 
@@ -21,9 +22,11 @@ class SmootherOptions:
     """Meaning of the stops' poses and sigmas: "absolute": each is a prior on its mast pose, as in `solve`;
     "odometry": after the first stop a pose counts only by the motion from the stop before, and the sigmas are
     those of that motion, in the body frame of the later stop."""
+    rig: Literal["estimated", "held"] = "held"
+    """What becomes of the rig's uncertainty, as for `solve`, which alone has "considered" too."""
     sharing: Sharing | None = None
-    """Free entries of the rig and who shares them, as for `solve` with the model `mast`; None: the rig is
-    fixed."""
+    """Free entries of the rig and who shares them, as for `solve` with the model `mast`, in place of those
+    that `rig` makes free."""
     relinearise_rad: float = 1e-3
     """Change of an angle, or of the rotation between two masts of a block, radians, beyond which the block is
     linearised again."""
@@ -46,6 +49,8 @@ class SmootherOptions:
         """Check the choices."""
         if self.telemetry not in {"absolute", "odometry"}:
             raise InputError(f"telemetry: expected one of absolute, odometry; found {self.telemetry!r}")
+        if self.rig not in {"estimated", "held"}:
+            raise InputError(f"rig: expected one of estimated, held; found {self.rig!r}")
         for name in ("relinearise_rad", "relinearise_m", "relinearise_rig", "outlier_sigma"):
             value = getattr(self, name)
             if value is not None and not (np.isfinite(value) and value > 0):
@@ -58,6 +63,10 @@ class SmootherOptions:
             raise InputError(f"max_rounds: expected 1 or more, found {self.max_rounds}")
         if self.sharing is not None:
             self.sharing.for_model("mast")
+
+    def sharing_of(self, rig: Rig) -> Sharing:
+        """Free entries of a drive's rig, as `Sharing.for_model` returns them."""
+        return sharing_for(rig, "mast", self.rig, self.sharing)
 
 
 @dataclass(frozen=True, kw_only=True)

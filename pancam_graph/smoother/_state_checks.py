@@ -79,8 +79,7 @@ def _require_landmarks(state: SmootherState) -> None:
 
 def _require_variables(state: SmootherState) -> None:
     """The variables are those of the drive, with as many numbers each as they have."""
-    sharing = state.options.sharing
-    template = HardTemplate(state.traverse, None if sharing is None else sharing.for_model("mast"))
+    template = HardTemplate(state.traverse, state.options.sharing_of(state.traverse.rig))
     posed = template.values(_telemetry(state.traverse))
     wanted = {key: len(SmootherState.numbers(posed, key)) for key in posed.keys()}  # noqa: SIM118  not a dictionary
     _require(

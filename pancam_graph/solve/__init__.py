@@ -16,6 +16,7 @@ from pancam_graph.solve._optimise import Iteration as Iteration
 from pancam_graph.solve._optimise import OnGraph as OnGraph
 from pancam_graph.solve._optimise import optimise as optimise
 from pancam_graph.solve._prepare import Prepared as Prepared
+from pancam_graph.solve._prepare import free_numbers as free_numbers
 from pancam_graph.solve._prepare import prepare as prepare
 from pancam_graph.solve._problem import Problem as Problem
 from pancam_graph.solve._reconsider import reconsidered as reconsidered

@@ -6,12 +6,12 @@ import gtsam
 
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import BoolArray
-from pancam_graph.data import Sharing, Traverse
+from pancam_graph.data import Traverse
 from pancam_graph.graph import ExplicitLandmarks, GraphKeys, RigVariables, SoftTemplate, whole_graph
 from pancam_graph.initialise import Start
 from pancam_graph.landmarks import SQUARED, loss_of
 from pancam_graph.solve._options import SolveOptions
-from pancam_graph.solve._prepare import prepare
+from pancam_graph.solve._prepare import free_numbers, prepare
 from pancam_graph.solve._screen import screened_elsewhere
 
 __all__ = ["build_graph", "graph_keys"]
@@ -20,12 +20,11 @@ __all__ = ["build_graph", "graph_keys"]
 def graph_keys(traverse: Traverse, options: SolveOptions | None = None) -> GraphKeys:
     """Keys of masts, angles and free entries of the rig, for factors that `solve` is given and `build_graph`.
 
-    The options determine the free entries of the rig, or else the traverse. Raises InputError for a sharing
-    that the model does not take.
+    The options determine the free entries of the rig, or else the traverse. Raises InputError as
+    `solve` does for these.
     """
     options = options or SolveOptions()
-    sharing = (options.sharing or traverse.sharing or Sharing()).for_model(options.model)
-    return GraphKeys(traverse, RigVariables(traverse, sharing))
+    return GraphKeys(traverse, RigVariables(traverse, free_numbers(traverse, options)))
 
 
 def build_graph(

@@ -9,6 +9,7 @@ from pancam_graph.base.geometry import BoolArray
 from pancam_graph.data import State, Verdict
 from pancam_graph.landmarks import refine
 from pancam_graph.solve._carrying import carried_again
+from pancam_graph.solve._considered import considered
 from pancam_graph.solve._covariance import Uncertainty, uncertainty
 from pancam_graph.solve._diagnose import connection_warnings, listed
 from pancam_graph.solve._fit import Fitted, regular
@@ -29,6 +30,9 @@ class Judged:
     state: State
     """Poses, angles and landmarks at the optimum."""
     uncertainty: Uncertainty
+    """As the problem has it, for tests; a rig that was held counts as exact."""
+    stated: Uncertainty
+    """As the solution states it: with the uncertainty of a rig that is considered; else the same."""
     used: BoolArray
     """(observations,) whether each took part in the fit."""
     regular: Problem
@@ -49,11 +53,16 @@ def judge(fitted: Fitted) -> Judged:
     used = np.zeros(len(prepared.observations), dtype=bool)
     used[problem.measurements.row[problem.kept]] = True
     first = _first(fitted)
+    stated = covariances
+    if prepared.options.rig == "considered" and reduced is not None:
+        places = problem.landmarks if prepared.options.landmark_covariances else None
+        stated = considered(fitted, regular, state, covariances, landmarks=places)
     let_go = parts_let_go(prepared.traverse, problem.template.let_go, state)
     return Judged(
         fitted=fitted,
         state=state,
         uncertainty=covariances,
+        stated=stated,
         used=used,
         regular=regular,
         first=first,

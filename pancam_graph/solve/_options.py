@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from pancam_graph.base.errors import InputError
-from pancam_graph.data import Sharing
+from pancam_graph.data import RigTreatment, Sharing
 from pancam_graph.graph import DEFAULT_FLEX, Flex, Model, Tie
 from pancam_graph.landmarks import LossName, loss_of
 from pancam_graph.solve._stopping import StopRule
@@ -38,9 +38,13 @@ class SolveOptions(StopRule):
     variables that a sigma holds near there. Default: hard for "mast", soft for the others."""
     flex: Flex | None = None
     """Sigma of a soft tie; default: the model's own (graph.DEFAULT_FLEX)."""
+    rig: RigTreatment = "held"
+    """What becomes of the rig's uncertainty (`Rig.uncertainty`): "estimated": what images say of the rig's
+    numbers is estimated, with these sigmas as priors; "held": the rig counts as exact; "considered": it is
+    not moved, but its uncertainty is in every sigma of the solution (model "mast" only)."""
     sharing: Sharing | None = None
-    """Free numbers of the rig, and images that share them; default: the traverse's own, or else nothing but
-    the radii of the model "circle"."""
+    """Free numbers of the rig, and images that share them, in place of those that `rig` makes free; default:
+    the traverse's own."""
     normalise: bool = True
     """Whether the model "projective" uses conditioned matrices (thesis 5.2); False serves as a comparison,
     with the same optimum."""
@@ -62,6 +66,7 @@ class SolveOptions(StopRule):
             ("landmarks", self.landmarks, ("eliminated", "explicit")),
             ("method", self.method, get_args(Method)),
             ("tie", self.tie or "soft", ("hard", "soft")),
+            ("rig", self.rig, get_args(RigTreatment)),
         ):
             if value not in choices:
                 raise InputError(f"{name}: expected one of {', '.join(choices)}; found {value!r}")
@@ -82,6 +87,11 @@ class SolveOptions(StopRule):
             )
         if self.sharing is not None:
             self.sharing.for_model(self.model)
+        if self.rig == "considered" and self.model != "mast":
+            raise InputError(
+                f"rig: expected estimated or held with the model {self.model}, found considered: only the "
+                "cameras of the model mast hang on the rig alone"
+            )
         if self.flex is not None and self.firm_tie == "hard":
             raise InputError("flex: expected none with a hard tie, which has no sigma")
         if not self.outlier_sigma > 0:

@@ -9,7 +9,15 @@ from numpy.typing import NDArray
 
 from pancam_graph.base.errors import InputError, SolveError
 from pancam_graph.base.geometry import BoolArray, IntArray
-from pancam_graph.data import Observations, PixelNoise, RigCorrection, Sharing, State, Traverse
+from pancam_graph.data import (
+    Observations,
+    PixelNoise,
+    RigCorrection,
+    Sharing,
+    State,
+    Traverse,
+    sharing_for,
+)
 from pancam_graph.graph import (
     RIGID,
     Factors,
@@ -31,7 +39,15 @@ from pancam_graph.solve._optimise import Iteration
 from pancam_graph.solve._options import Method, SolveOptions
 from pancam_graph.solve._problem import Problem, Solver, reach_m
 
-__all__ = ["Prepared", "Reasons", "prepare", "solver_for", "triangulated"]
+__all__ = [
+    "Prepared",
+    "Reasons",
+    "free_numbers",
+    "prepare",
+    "solver_for",
+    "template_for",
+    "triangulated",
+]
 
 Reasons = NDArray[np.object_]
 """(observations,) why each was left out, in the words of `Solution.reason`; "" where it was not."""
@@ -99,8 +115,8 @@ def prepare(
     traverse.observations.noise.require_even()
     start = in_turns_of_telemetry(start, traverse) if start else start_from_telemetry(traverse)
     cameras = start.cameras if options.model in {"free", "projective"} else None
-    sharing = (options.sharing or traverse.sharing or Sharing()).for_model(options.model)
-    template = _template(traverse, options, sharing)
+    sharing = free_numbers(traverse, options)
+    template = template_for(traverse, options, sharing)
     solver_for(options).require(template)
     values = template.values(_first_state(traverse, start, cameras))
     measurements, track, reason = _measure(traverse.observations, template, values)
@@ -155,7 +171,22 @@ def triangulated(problem: Problem) -> Problem:
     return replace(problem, landmarks=replace(landmarks, vector=vector))
 
 
-def _template(traverse: Traverse, options: SolveOptions, sharing: Sharing) -> FactorTemplate:
+def free_numbers(traverse: Traverse, options: SolveOptions) -> Sharing:
+    """Which numbers of the rig are free, as the model takes them.
+
+    Raises InputError for a sharing that the model does not take, and for a rig that is to be considered where
+    numbers of it are free.
+    """
+    given = options.sharing or traverse.sharing
+    if options.rig == "considered" and given is not None and given.any_free:
+        raise InputError(
+            "rig: expected estimated or held where a sharing says what is free, found considered: it counts "
+            "numbers that are not moved"
+        )
+    return sharing_for(traverse.rig, options.model, options.rig, given)
+
+
+def template_for(traverse: Traverse, options: SolveOptions, sharing: Sharing) -> FactorTemplate:
     """The rig as variables and factors, as the options have it."""
     if options.model == "projective":
         return ProjectiveTemplate(traverse, options.firm_flex, normalise=options.normalise)

@@ -17,6 +17,7 @@ __all__ = [
     "held_columns",
     "joint_panels",
     "joint_root",
+    "landmark_panels",
     "loosened_root",
     "panels_of",
 ]
@@ -46,9 +47,7 @@ class ReducedSystem:
         takes part.
         """
         system, rows = arranged or system_of(problem)
-        panels = _panels_of(problem, system)
-        for group, information in (without or {}).items():
-            panels.panel[group][:, : len(information)] -= information
+        panels = landmark_panels(problem, system, without=without)
         return ReducedSystem(system=system, rows=rows, root=panels.root()).firm(problem)
 
     def firm(self, problem: Problem) -> "ReducedSystem":
@@ -63,12 +62,21 @@ def panels_of(problem: Problem) -> Panels:
 
     Raises SolveError where no observation takes part.
     """
-    return _panels_of(problem, system_of(problem)[0])
+    return landmark_panels(problem, system_of(problem)[0])
 
 
-def _panels_of(problem: Problem, system: LandmarkSystem) -> Panels:
+def landmark_panels(
+    problem: Problem, system: LandmarkSystem, *, without: Mapping[int, FloatArray] | None = None
+) -> Panels:
+    """The same, of a landmark system that exists already and is linearised again.
+
+    `without` is information (n, n) by group that is taken off.
+    """
     panels = system.linearise(problem.template.posture(problem.values))
-    return joint_panels(problem.template, problem.factors, problem.values, panels)
+    panels = joint_panels(problem.template, problem.factors, problem.values, panels)
+    for group, information in (without or {}).items():
+        panels.panel[group][:, : len(information)] -= information
+    return panels
 
 
 def joint_root(template: FactorTemplate, factors: Factors, values: gtsam.Values, panels: Panels) -> Root:

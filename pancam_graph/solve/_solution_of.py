@@ -13,7 +13,7 @@ __all__ = ["solution_of"]
 
 def solution_of(judged: Judged) -> Solution:
     """The solution, without the seconds that it took."""
-    fitted, outcome, covariances = judged.fitted, judged.fitted.outcome, judged.uncertainty
+    fitted, outcome, covariances = judged.fitted, judged.fitted.outcome, judged.stated
     screened, problem = fitted.screened, fitted.problem
     prepared, first = screened.prepared, judged.first
     n, present = len(prepared.observations), problem.present

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pancam_graph.base.geometry import BoolArray, IntArray
-from pancam_graph.data import Traverse, Verdict, VerdictTest
+from pancam_graph.data import Refined, Traverse, Verdict, VerdictTest
 from pancam_graph.solve._chances import CHANCE, rms_limit, two_sided_limit
 from pancam_graph.solve._covariance import Uncertainty
 from pancam_graph.solve._fit import Fitted
@@ -35,6 +35,8 @@ _UNEVEN = 2.0
 """Largest ratio of an image's, or a camera's, residuals to those of all."""
 _NAMED = 6
 """Parts of telemetry let go that are named."""
+_BEATEN = 3.0
+"""Change of an entry of the rig in sigmas of its prior from which it is said."""
 _HELD_GAIN = 25.0
 """Decrease of the cost from which a held number of the rig is named, if it is also this ..."""
 _HELD_SHARE = 0.02
@@ -302,6 +304,8 @@ def _describe(c: Correction, t: Traverse) -> str:
 def _freed(at: Optimum) -> Iterator[VerdictTest]:
     """Entries of the rig that were free, against their priors."""
     refined = at.problem.template.refined(at.problem.values, at.uncertainty.rig_sigmas)
+    if refined:
+        yield _against_uncertainty(refined)
     some = []
     for r in refined:
         told = r.prior_sigma**2 - r.sigma**2
@@ -318,6 +322,22 @@ def _freed(at: Optimum) -> Iterator[VerdictTest]:
             f"{says}, {worst:.3g} times what its prior allows: the rig is probably another one, or needs "
             "more of its numbers free",
         )
+
+
+def _against_uncertainty(refined: Sequence[Refined]) -> VerdictTest:
+    """The entry that left its prior by most of the prior's own sigmas."""
+    worst = max(refined, key=lambda r: abs(r.change) / r.prior_sigma)
+    sigmas = abs(worst.change) / worst.prior_sigma
+    whose = f" of {worst.camera}" if worst.camera else ""
+    says = f"{worst.entry} of {worst.quantity}{whose} moved by {worst.change:+.3g}, {sigmas:.2g} times its "
+    return VerdictTest.note(
+        "rig uncertainty",
+        sigmas,
+        _BEATEN,
+        f"the rig stays within its uncertainty: {says}sigma at most",
+        f"{says}uncertainty: the rig is probably off there; state a larger one (rig: uncertainty in "
+        "traverse.json), or look for a better calibration",
+    )
 
 
 def _held(at: Optimum) -> Iterator[VerdictTest]:

@@ -55,7 +55,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     ),
     "unknown entry": (
         lambda: Sharing(calibration=Freedom(scope="eye", free=("fx",))),
-        r"calibration: free: expected entries of focal, fx_px, fy_px, skew_px, cx_px, cy_px; found 'fx'",
+        r"calibration: free: expected entries of focal, aspect, fx_px, .*, cy_px; found 'fx'",
     ),
     "entry of another": (lambda: Sharing(mounts=Freedom(scope="eye", free=("focal",))), r"found 'focal'"),
     "entry twice": (lambda: Sharing(mounts=Freedom(scope="eye", free=("x_m", "x_m"))), r"found x_m twice"),
@@ -66,6 +66,10 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "focal twice": (
         lambda: Sharing(calibration=Freedom(scope="all", free=("fy_px", "focal"))),
         r"either focal or fx_px and fy_px, found both",
+    ),
+    "aspect twice": (
+        lambda: Sharing(calibration=Freedom(scope="all", free=("fy_px", "aspect"))),
+        r"either aspect or fx_px and fy_px, found both",
     ),
     "sigma of what is held": (
         lambda: Sharing(mounts=Freedom(scope="eye", free=("x_m",), sigma={"y_m": 1.0})),

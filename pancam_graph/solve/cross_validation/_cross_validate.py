@@ -23,8 +23,9 @@ from pancam_graph.data import (
     rms_px,
 )
 from pancam_graph.elimination import Covariance
-from pancam_graph.graph import UserFactors
+from pancam_graph.graph import FactorTemplate, UserFactors
 from pancam_graph.initialise import Start
+from pancam_graph.solve._considered import with_rig
 from pancam_graph.solve._covariance import covariance_of
 from pancam_graph.solve._diagnose import listed
 from pancam_graph.solve._fit import fit, refitted
@@ -182,9 +183,10 @@ class _Whole:
         self.cliques = reduced.system.structure.after
         try:
             self.sigma = self.sigmas(covariance_of(self.regular.template, reduced))
+            self.formal = self._formal()
         except SolveError as error:
             self.warnings.append(f"no formal sigmas to compare with: {error}")
-            self.sigma = np.full(self.n_quantities, np.nan)
+            self.sigma = self.formal = np.full(self.n_quantities, np.nan)
 
     @property
     def n_quantities(self) -> int:
@@ -202,9 +204,22 @@ class _Whole:
         p = self.regular
         return replace(p, accepted=p.accepted & landmarks[p.measurements.landmark])
 
-    def sigmas(self, covariance: Covariance) -> FloatArray:
-        """Formal sigmas (quantities,)."""
-        template, state = self.regular.template, self.state
+    def _formal(self) -> FloatArray:
+        """Formal sigmas (quantities,) as a solution states them: with the uncertainty of a considered rig.
+
+        Halves have the same rig, so it is the sigmas without that their differences tell of.
+        """
+        if self.fitted.screened.prepared.options.rig != "considered":
+            return self.sigma
+        system = with_rig(self.fitted, self.regular)
+        if system is None:
+            return self.sigma
+        wide, reduced = system
+        return self.sigmas(covariance_of(wide.template, reduced), wide.template)
+
+    def sigmas(self, covariance: Covariance, template: FactorTemplate | None = None) -> FloatArray:
+        """Formal sigmas (quantities,), of the problem that covariances are taken from or on a template."""
+        template, state = template or self.regular.template, self.state
         stops = np.diagonal(template.stop_covariance(covariance), axis1=1, axis2=2)
         return _vector(
             template.angle_sigma_rad(covariance, state),
@@ -312,7 +327,7 @@ def _sigmas(whole: _Whole, verdicts: _Verdicts) -> tuple[Sigmas, Sigmas, Sigmas]
     def part(begin: int, n: int, k: int) -> Sigmas:
         rows = slice(begin, begin + n * k)
         return Sigmas(
-            formal=whole.sigma[rows].reshape(n, k),
+            formal=whole.formal[rows].reshape(n, k),
             random=spread["random"].part(rows, (n, k)),
             upper_lower=spread["upper_lower"].part(rows, (n, k)),
         )

@@ -1,0 +1,55 @@
+"""What a solve makes of a rig's uncertainty."""
+
+from collections.abc import Mapping
+from typing import Literal
+
+from pancam_graph.data._sharing import ASPECT, ENTRIES, FIXED, FOCAL, Freedom, Quantity, Sharing
+from pancam_graph.rigs import Rig, RigUncertainty
+
+__all__ = ["RigTreatment", "sharing_for", "sharing_within"]
+
+RigTreatment = Literal["estimated", "held", "considered"]
+"""What becomes of a rig's uncertainty: "estimated": it is the prior of what is estimated; "held": the rig
+counts as exact; "considered": the rig is not moved, but its uncertainty is in every sigma."""
+
+
+def sharing_within(uncertainty: RigUncertainty, model: str) -> Sharing:
+    """All numbers of a rig that a model has, free about their values with the rig's own uncertainty.
+
+    An entry whose sigma is 0 is held. The model `projective` has no number of the rig.
+    """
+    u, mast = uncertainty, model == "mast"
+    calibration = {
+        FOCAL: u.focal,
+        ASPECT: u.aspect,
+        "skew_px": u.skew_px,
+        "cx_px": u.principal_point_px,
+        "cy_px": u.principal_point_px,
+    }
+    return Sharing(
+        calibration=FIXED if model == "projective" else _freedom("calibration", calibration),
+        mounts=_pose("mounts", u.mount_rad, u.mount_m) if mast else FIXED,
+        pan_T_tilt=_pose("pan_T_tilt", u.tilt_axis_rad, u.tilt_axis_m) if mast else FIXED,
+    )
+
+
+def sharing_for(rig: Rig, model: str, treatment: RigTreatment, given: Sharing | None) -> Sharing:
+    """The sharing of a solve, as `Sharing.for_model` returns it.
+
+    What is `given` counts; where nothing is, an estimated rig has `sharing_within`, and another is fixed.
+    Raises InputError as `Sharing.for_model` does.
+    """
+    if given is None and treatment == "estimated":
+        given = sharing_within(rig.uncertainty, model)
+    return (given or Sharing()).for_model(model)
+
+
+def _pose(quantity: Quantity, turn_rad: float, shift_m: float) -> Freedom:
+    return _freedom(quantity, dict(zip(ENTRIES[quantity], (turn_rad,) * 3 + (shift_m,) * 3, strict=True)))
+
+
+def _freedom(quantity: Quantity, sigma: Mapping[str, float]) -> Freedom:
+    free = {entry: value for entry, value in sigma.items() if value > 0}
+    if not free:
+        return FIXED
+    return Freedom(scope="all" if quantity == "pan_T_tilt" else "eye", free=tuple(free), sigma=free)
