@@ -16,7 +16,7 @@ from pancam_graph import SolveOptions, Traverse, simulate
 from pancam_graph.base.errors import InputError, PancamGraphError
 from pancam_graph.base.geometry import FloatArray, IntArray, wrap_angle
 from pancam_graph.cli import Progress, ScriptParser, run
-from pancam_graph.rigs import Rig, rig_template
+from pancam_graph.rigs import Rig, RigUncertainty, rig_template
 from pancam_graph.simulate import Simulation, SimulationOptions
 from pancam_graph.solve import fit, judge, prepare, reconsidered, screen
 
@@ -78,7 +78,9 @@ ERRORS: dict[str, Callable[[Rig], Rig]] = {
     "roll 0.5 mrad": _eye(-1, turn={2: 5e-4}),
     "baseline 1 mm": _eye(-1, shift_m=1e-3),
     "axis 2 mm": _axis(2e-3),
+    "flex 0.2 mrad": _same,
 }
+_FLEX_ALONE = replace(RigUncertainty.exact(), flex_rad=2e-4)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,9 +95,12 @@ class Outcome:
 
 def measure(rig: Rig, error: str, options: SimulationOptions, seed: int, solving: SolveOptions) -> Outcome:
     """Simulate, claim another rig, solve, compare with the truth; without errors where nothing was solved."""
-    drawn: dict[str, object] = {"rig_error": "drawn"} if error == "drawn" else {}
-    simulation = simulate(rig, replace(options, **drawn), seed=seed)  # type: ignore[arg-type]  # by name
-    traverse = replace(simulation.traverse, rig=ERRORS[error](simulation.traverse.rig))
+    flexes = error == "flex 0.2 mrad"
+    drawn = replace(options, rig_error="drawn") if flexes or error == "drawn" else options
+    true = replace(rig, uncertainty=_FLEX_ALONE) if flexes else rig
+    simulation = simulate(true, drawn, seed=seed)
+    claimed = rig if flexes else ERRORS[error](simulation.traverse.rig)
+    traverse = replace(simulation.traverse, rig=claimed)
     try:
         return _compared(traverse, simulation, solving)
     except PancamGraphError as refused:

@@ -26,7 +26,8 @@ _SHARING_HELP = (
     "what of the rig is estimated, and who shares it, in one or more WORDs: "
     "QUANTITY=SCOPE[:ENTRY[~SIGMA],...] with quantities calibration (fx_px fy_px skew_px cx_px cy_px; focal "
     "and aspect, factors, in place of fx_px fy_px), mounts and pan_T_tilt (rx_rad ry_rad rz_rad "
-    "x_m y_m z_m), radius (radius_m; model circle) and scopes fixed, all, eye, stop, image; without entries "
+    "x_m y_m z_m), radius (radius_m; model circle), flex (twist_rad forward_m left_m up_m; scope frame) "
+    "and scopes fixed, all, eye, stop, image; without entries "
     "all are free; SIGMA is the prior's, inf for none; what traverse.json says of a quantity is overridden; "
     "for example calibration=eye:focal mounts=eye"
 )

@@ -20,6 +20,7 @@ from pancam_graph.data._sharing import FIXED as FIXED
 from pancam_graph.data._sharing import FOCAL as FOCAL
 from pancam_graph.data._sharing import Freedom as Freedom
 from pancam_graph.data._sharing import Quantity as Quantity
+from pancam_graph.data._sharing import Scope as Scope
 from pancam_graph.data._sharing import Sharing as Sharing
 from pancam_graph.data._sharing import default_sigma as default_sigma
 from pancam_graph.data._sharing import parse_sharing as parse_sharing

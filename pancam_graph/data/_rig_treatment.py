@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Literal
 
-from pancam_graph.data._sharing import ASPECT, ENTRIES, FIXED, FOCAL, Freedom, Quantity, Sharing
+from pancam_graph.data._sharing import ASPECT, ENTRIES, FIXED, FOCAL, Freedom, Quantity, Scope, Sharing
 from pancam_graph.rigs import Rig, RigUncertainty
 
 __all__ = ["RigTreatment", "sharing_for", "sharing_within"]
@@ -11,6 +11,9 @@ __all__ = ["RigTreatment", "sharing_for", "sharing_within"]
 RigTreatment = Literal["estimated", "held", "considered"]
 """What becomes of a rig's uncertainty: "estimated": it is the prior of what is estimated; "held": the rig
 counts as exact; "considered": the rig is not moved, but its uncertainty is in every sigma."""
+
+_SCOPE: Mapping[Quantity, Scope] = {"pan_T_tilt": "all", "flex": "frame"}
+"""Who shares a correction, where it is not the images of an eye."""
 
 
 def sharing_within(uncertainty: RigUncertainty, model: str) -> Sharing:
@@ -26,7 +29,9 @@ def sharing_within(uncertainty: RigUncertainty, model: str) -> Sharing:
         "cx_px": u.principal_point_px,
         "cy_px": u.principal_point_px,
     }
+    shifts = dict.fromkeys(ENTRIES["flex"][1:], u.flex_m)
     return Sharing(
+        flex=_freedom("flex", {"twist_rad": u.flex_rad} | shifts) if mast else FIXED,
         calibration=FIXED if model == "projective" else _freedom("calibration", calibration),
         mounts=_pose("mounts", u.mount_rad, u.mount_m) if mast else FIXED,
         pan_T_tilt=_pose("pan_T_tilt", u.tilt_axis_rad, u.tilt_axis_m) if mast else FIXED,
@@ -52,4 +57,4 @@ def _freedom(quantity: Quantity, sigma: Mapping[str, float]) -> Freedom:
     free = {entry: value for entry, value in sigma.items() if value > 0}
     if not free:
         return FIXED
-    return Freedom(scope="all" if quantity == "pan_T_tilt" else "eye", free=tuple(free), sigma=free)
+    return Freedom(scope=_SCOPE.get(quantity, "eye"), free=tuple(free), sigma=free)

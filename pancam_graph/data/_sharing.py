@@ -13,12 +13,12 @@ from pancam_graph.base.errors import InputError
 
 __all__ = ["ENTRIES", "Freedom", "Quantity", "Scope", "Sharing", "default_sigma", "parse_sharing"]
 
-Scope = Literal["fixed", "all", "eye", "stop", "image"]
+Scope = Literal["fixed", "all", "eye", "stop", "image", "frame"]
 """Images that share one correction: "fixed" none (there is no correction), "all" all images, "eye" the images
 of an eye, "stop" the images of an eye at a stop, "image" each image alone. `pan_T_tilt` belongs to no eye:
-"all" is one for the traverse, "stop" one per stop."""
+"all" is one for the traverse, "stop" one per stop. `flex` has one for each "frame"."""
 
-Quantity = Literal["calibration", "mounts", "pan_T_tilt", "radius"]
+Quantity = Literal["calibration", "mounts", "pan_T_tilt", "radius", "flex"]
 
 _POSE = ("rx_rad", "ry_rad", "rz_rad", "x_m", "y_m", "z_m")
 ENTRIES: Mapping[Quantity, tuple[str, ...]] = {
@@ -26,6 +26,7 @@ ENTRIES: Mapping[Quantity, tuple[str, ...]] = {
     "mounts": _POSE,
     "pan_T_tilt": _POSE,
     "radius": ("radius_m",),
+    "flex": ("twist_rad", "forward_m", "left_m", "up_m"),
 }
 """Names of the entries of each quantity. `calibration` has two more: `focal`, a common factor on fx and fy,
 and `aspect`, a factor on fy alone, so that priors of the two are independent. Entries of a pose are a
@@ -39,6 +40,7 @@ _SCOPES: Mapping[Quantity, tuple[Scope, ...]] = {
     "mounts": ("fixed", "eye", "stop", "image"),
     "pan_T_tilt": ("fixed", "all", "stop"),
     "radius": ("fixed", "all", "eye", "stop", "image"),
+    "flex": ("fixed", "frame"),
 }
 _WHY_NOT: Mapping[tuple[str, str], str] = {
     ("mounts", "all"): "each eye has its own mount",
@@ -50,6 +52,7 @@ _MODELS: Mapping[Quantity, tuple[str, ...]] = {
     "mounts": ("mast",),
     "pan_T_tilt": ("mast",),
     "radius": ("circle",),
+    "flex": ("mast",),
 }
 _OTHERWISE: Mapping[tuple[str, str], str] = {
     ("mounts", "circle"): "whose cameras turn freely and whose centres hang on circles",
@@ -58,6 +61,9 @@ _OTHERWISE: Mapping[tuple[str, str], str] = {
     ("pan_T_tilt", "free"): "whose cameras hang on no axis",
     ("radius", "mast"): "whose circles follow from its mounts",
     ("radius", "free"): "whose cameras run on no circle",
+    ("flex", "circle"): "whose cameras turn freely",
+    ("flex", "free"): "whose cameras turn freely",
+    ("flex", "projective"): "whose cameras turn freely",
     ("calibration", "projective"): "whose matrices have calibrations of their own",
     ("mounts", "projective"): "whose cameras hang on no mount",
     ("pan_T_tilt", "projective"): "whose cameras hang on no axis",
@@ -80,6 +86,9 @@ _DEFAULT_SIGMA = {
     **dict.fromkeys(_POSE[3:], 2e-3),
     # The circle of Opportunity's five Navcam centres misses them by up to a millimetre.
     "radius_m": 1e-3,
+    # Our stated assumption for a mast that stands on its rover.
+    "twist_rad": 2e-4,
+    **dict.fromkeys(("forward_m", "left_m", "up_m"), 1e-4),
 }
 """Standard deviations of the priors; entries in pixels as shares of the focal length, factors as shares."""
 
@@ -134,6 +143,10 @@ class Sharing:
     """Pose of the tilt axis on the pan axis, corrected in the tilt frame; model `mast`."""
     radius: Freedom | None = None
     """Radius of the circles of model `circle`; None means free per eye there, with the default prior."""
+    flex: Freedom = FIXED
+    """How each frame's head stands off the rigid mast: turned about its forward axis (`twist_rad`), and
+    shifted along its own axes; model `mast` with a hard tie. Its pan and tilt are those of the head as it
+    stood, whose priors are widened by the sigma of the twist."""
 
     def __post_init__(self) -> None:
         """Check scopes, entries and sigmas."""
@@ -146,6 +159,7 @@ class Sharing:
             ("mounts", self.mounts),
             ("pan_T_tilt", self.pan_T_tilt),
             ("radius", self.radius),
+            ("flex", self.flex),
         ]
         return [(quantity, freedom) for quantity, freedom in freedoms if freedom is not None]
 

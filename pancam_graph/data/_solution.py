@@ -33,6 +33,9 @@ class RigCorrection:
     """(stops, 6) correction of the tilt axis, in the same form, in its own frame."""
     radius_m: FloatArray
     """(images,) metres added to the radius of the image's circle; model `circle`."""
+    flex: FloatArray | None = None
+    """(frames, 4) turn of each frame's head about its forward axis, radians, and shift along its own axes,
+    metres; None where the mast is rigid."""
 
     @staticmethod
     def to_calibrations(traverse: Traverse, calibration: FloatArray) -> "RigCorrection":

@@ -243,15 +243,18 @@ class Traverse:
         self,
         world_T_mast: Sequence[gtsam.Pose3] | None = None,
         pan_tilt_rad: FloatArray | None = None,
+        flex: FloatArray | None = None,
     ) -> tuple[FloatArray, FloatArray]:
         """`world_R_camera` (images, 3, 3) and centres (images, 3), metres, of all images by the mast chain.
 
-        `world_T_mast` (one a stop) and `pan_tilt_rad` (frames, 2) default to telemetry.
+        `world_T_mast` (one a stop) and `pan_tilt_rad` (frames, 2) default to telemetry, `flex` (frames, 4),
+        as `Rig.mast_T_camera` takes it, to a rigid mast.
         """
         poses = world_T_mast if world_T_mast is not None else [s.world_T_mast for s in self.stops]
         angles = pan_tilt_rad if pan_tilt_rad is not None else self.pan_tilt_rad
         stops_R, stops_t = pose_arrays(poses)
-        mast_T_camera = self.rig.mast_T_camera(angles[self.image_frame], self.image_eye)
+        of_image = None if flex is None else flex[self.image_frame]
+        mast_T_camera = self.rig.mast_T_camera(angles[self.image_frame], self.image_eye, of_image)
         return compose(stops_R[self.image_stop], stops_t[self.image_stop], *mast_T_camera)
 
     def with_observations(

@@ -1,7 +1,8 @@
 """Camera poses computed from the mast: the rig as a factor template without flex.
 
-Variables: `M` mast pose per stop (Pose3), `A` pan and tilt of a stop's frames, stacked (vector), and the free
-entries of the rig (`_rig_variables`). Quantities that telemetry holds (sigma 0) are not variables.
+Variables: `M` mast pose per stop (Pose3), `A` pan and tilt of a stop's frames, stacked (vector), `F` how the
+heads of these frames stand off the rigid mast, stacked (vector), where that is free, and the free entries of
+the rig (`_rig_variables`). Quantities that telemetry holds (sigma 0) are not variables.
 """
 
 from dataclasses import dataclass, replace
@@ -15,11 +16,22 @@ from pancam_graph.base.geometry import (
     FloatArray,
     IntArray,
     compose,
+    corrected_poses,
+    correction_twists,
     pan_tilt_rotation,
     pose_arrays,
     twists_in_parent,
 )
-from pancam_graph.data import FIXED, Quantity, Sharing, State, Traverse
+from pancam_graph.data import (
+    ENTRIES,
+    FIXED,
+    Quantity,
+    RigCorrection,
+    Sharing,
+    State,
+    Traverse,
+    default_sigma,
+)
 from pancam_graph.elimination import Covariance, Linkage, Posture
 from pancam_graph.factors import Key
 from pancam_graph.graph._factors import FactorList
@@ -30,7 +42,7 @@ from pancam_graph.landmarks import CameraViews
 
 __all__ = ["HardTemplate"]
 
-_ANGLES, _MAST, _AXIS, _MOUNT, _CALIBRATION = range(5)
+_ANGLES, _MAST, _FLEX, _AXIS, _MOUNT, _CALIBRATION = range(6)
 """Kinds of segments, in their order within a unit."""
 _TILT = np.array([[0.0], [-1.0], [0.0], [0.0], [0.0], [0.0]])
 """Twist of the tilt axis's own frame: about minus its y."""
@@ -40,10 +52,12 @@ class HardTemplate(FactorTemplate):
     """The rigid mast: world_T_camera = world_T_mast . Rz(pan) . pan_T_tilt . Ry(-tilt) . head_T_camera."""
 
     def __init__(self, traverse: Traverse, sharing: Sharing | None = None) -> None:
-        """Of `sharing`, calibration, mounts and pan_T_tilt count; circles follow from the mounts."""
+        """Of `sharing`, calibration, mounts, pan_T_tilt and flex count; circles follow from the mounts."""
         super().__init__(traverse, "mast", replace(sharing or Sharing(), radius=FIXED))
         sigmas = np.array([[f.sigma_pan_rad, f.sigma_tilt_rad] for f in traverse.frames]).reshape(-1, 2)
         self._sigmas = sigmas
+        self._flex = self.rig_variables.sharing.flex.entries("flex")
+        self._flex_columns = np.array([(0, 3, 4, 5)[ENTRIES["flex"].index(e)] for e in self._flex], dtype=int)
         free = sigmas.any(axis=1)
         self._frames = tuple(
             np.flatnonzero((traverse.frame_stop == stop) & free) for stop in range(len(traverse.stops))
@@ -53,6 +67,23 @@ class HardTemplate(FactorTemplate):
     def angles_key(stop: int) -> int:
         """Key of the pan and tilt of those frames of a stop that are not held."""
         return key_of(Kind.ANGLES, stop)
+
+    @staticmethod
+    def flex_key(stop: int) -> int:
+        """Key of how the heads of those frames stand off the rigid mast."""
+        return key_of(Kind.FLEX, stop)
+
+    @cached_property
+    def angle_sigmas_rad(self) -> FloatArray:
+        """As in the base class, widened where heads may flex about the pan and the tilt axis."""
+        twist = self._flex_sigma[0] if "twist_rad" in self._flex else 0.0
+        return np.where(self._sigmas > 0, np.hypot(self._sigmas, twist), 0.0)
+
+    @cached_property
+    def _flex_sigma(self) -> FloatArray:
+        """(entries,) of the priors of a frame's flex."""
+        stated = self.rig_variables.sharing.flex.sigma
+        return np.array([stated.get(entry, default_sigma(entry, 1.0)) for entry in self._flex])
 
     @cached_property
     def linkage(self) -> Linkage:
@@ -74,6 +105,8 @@ class HardTemplate(FactorTemplate):
                 add(slot.key, 6, stop)
             for v in free.of_stop(stop):
                 add(v.key, len(v.entries), stop)
+            if self._flex and len(frames):
+                add(self.flex_key(stop), len(self._flex) * len(frames), stop)
         for v in free.of_stop(None):
             add(v.key, len(v.entries), len(t.stops))
 
@@ -89,7 +122,9 @@ class HardTemplate(FactorTemplate):
         column[:, _ANGLES] = 2 * place[seg.frame]
         variable[:, _ANGLES] = np.array([row.get(self.angles_key(stop), -1) for stop in stops])[stop_of]
         variable[:, _MAST] = np.array([-1 if key is None else row[key] for key in masts])[stop_of]
-        width[:, _ANGLES], width[:, _MAST] = 2, 6
+        width[:, _ANGLES], width[:, _MAST], width[:, _FLEX] = 2, 6, len(self._flex)
+        column[:, _FLEX] = len(self._flex) * place[seg.frame]
+        variable[:, _FLEX] = np.array([row.get(self.flex_key(stop), -1) for stop in stops])[stop_of]
         sites: tuple[tuple[int, Quantity, IntArray], ...] = (
             (_AXIS, "pan_T_tilt", stop_of),
             (_MOUNT, "mounts", seg.image),
@@ -121,10 +156,11 @@ class HardTemplate(FactorTemplate):
     def _segments(self) -> "_Segments":
         t, free = self.traverse, self.rig_variables
         frame = t.image_frame if self._by_image else np.arange(len(t.frames))
-        present = np.zeros((len(frame), 5), dtype=bool)
+        present = np.zeros((len(frame), 6), dtype=bool)
         present[:, _ANGLES] = np.any(self._sigmas, axis=1)[frame]
         moved = np.array([isinstance(self.mast(stop), Key) for stop in range(len(t.stops))])
         present[:, _MAST] = moved[t.frame_stop[frame]]
+        present[:, _FLEX] = present[:, _ANGLES] & bool(self._flex)
         present[:, _AXIS] = bool(free.of["pan_T_tilt"])
         present[:, _MOUNT] = bool(free.of["mounts"])
         present[:, _CALIBRATION] = bool(free.of["calibration"])
@@ -135,12 +171,12 @@ class HardTemplate(FactorTemplate):
     def posture(self, values: gtsam.Values) -> Posture:
         """Cameras at the values; a unit's base is the mast of its stop."""
         t, free, seg = self.traverse, self.rig_variables, self._segments
-        angles, axes = self._angles(values), free.axes(values)
+        angles, axes, flex = self._angles(values), free.axes(values), self._flexes(values)
         masts = pose_arrays(self.masts(values))
         frame, stop = seg.frame, t.frame_stop[seg.frame]
         widest = max([6, *(len(v.entries) for v in free.variables)])
         rows = 11 if free.of["calibration"] else 6
-        chain = np.zeros((len(seg.present), 5, rows, widest))
+        chain = np.zeros((len(seg.present), 6, rows, widest))
         chain[:, _ANGLES, :6, :2] = self._angle_twists(angles, axes)[frame]
         chain[:, _MAST, :6, :6] = np.eye(6)
         if axes is not None:
@@ -148,8 +184,12 @@ class HardTemplate(FactorTemplate):
             pose = compose(pan_R, np.zeros(3), axes[0][stop], axes[1][stop])
             twists = free.axis_twists(values)[stop]
             chain[:, _AXIS, :6, : twists.shape[2]] = twists_in_parent(*pose, twists)
+        if flex is not None:
+            pose = self._mast_T_head(angles, axes, flex)
+            moved = correction_twists(flex)[:, :, self._flex_columns]
+            chain[:, _FLEX, :6, : len(self._flex)] = twists_in_parent(*pose, moved)[frame]
         if free.of["mounts"]:
-            head_R, head_t = self._mast_T_head(angles, axes)
+            head_R, head_t = self._mast_T_head(angles, axes, flex)
             pose = compose(head_R[frame], head_t[frame], *free.mounts(values))
             twists = free.mount_twists(values)
             chain[:, _MOUNT, :6, : twists.shape[2]] = twists_in_parent(*pose, twists)
@@ -190,17 +230,45 @@ class HardTemplate(FactorTemplate):
     ) -> CameraViews:
         t, free = self.traverse, self.rig_variables
         # Once per frame, not once per image: the eyes share their head.
-        mast_T_head = self._mast_T_head(angles, free.axes(values))
+        mast_T_head = self._mast_T_head(angles, free.axes(values), self._flexes(values))
         head = compose(masts[0][t.frame_stop], masts[1][t.frame_stop], *mast_T_head)
         image = t.image_frame
         return self.views_of(*compose(head[0][image], head[1][image], *free.mounts(values)), values)
 
     def _mast_T_head(
-        self, angles: FloatArray, axes: tuple[FloatArray, FloatArray] | None
+        self, angles: FloatArray, axes: tuple[FloatArray, FloatArray] | None, flex: FloatArray | None
     ) -> tuple[FloatArray, FloatArray]:
         t = self.traverse
         axis_of_frame = None if axes is None else (axes[0][t.frame_stop], axes[1][t.frame_stop])
-        return t.rig.mast_T_head(angles[:, 0], angles[:, 1], axis_of_frame)
+        head = t.rig.mast_T_head(angles[:, 0], angles[:, 1], axis_of_frame)
+        return head if flex is None else corrected_poses(*head, flex)
+
+    def _flexes(self, values: gtsam.Values) -> FloatArray | None:
+        """Corrections (frames, 6) of the heads, in their own frames; None where the mast is rigid."""
+        if not self._flex:
+            return None
+        out = np.zeros((len(self.traverse.frames), 6))
+        for stop, frames in enumerate(self._frames):
+            if len(frames):
+                flex = values.atVector(self.flex_key(stop)).reshape(len(frames), -1)
+                out[np.ix_(frames, self._flex_columns)] = flex
+        return out
+
+    def correction(self, values: gtsam.Values) -> RigCorrection | None:
+        """As in the base class, with the flex of frames."""
+        found, flex = super().correction(values), self._flexes(values)
+        if flex is None:
+            return found
+        found = found or RigCorrection.to_calibrations(self.traverse, self.traverse.calibration)
+        return replace(found, flex=flex[:, [0, 3, 4, 5]])
+
+    def flex_factors(self, stop: int | None) -> FactorList:
+        """The prior of how a stop's heads stand off the rigid mast, if they may."""
+        if stop is None or not self._flex or not len(self._frames[stop]):
+            return []
+        sigmas = np.tile(self._flex_sigma, len(self._frames[stop]))
+        noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+        return [gtsam.PriorFactorVector(self.flex_key(stop), np.zeros(len(sigmas)), noise)]
 
     def _angles(self, values: gtsam.Values) -> FloatArray:
         angles: FloatArray = self.traverse.pan_tilt_rad.copy()
@@ -228,6 +296,11 @@ class HardTemplate(FactorTemplate):
         for stop, frames in enumerate(self._frames):
             if len(frames):
                 values.insert(self.angles_key(stop), state.pan_tilt_rad[frames].ravel())
+                if self._flex:
+                    known = None if state.rig is None else state.rig.flex
+                    flex = np.zeros((len(self.traverse.frames), 6))
+                    flex[:, [0, 3, 4, 5]] = 0.0 if known is None else known
+                    values.insert(self.flex_key(stop), flex[np.ix_(frames, self._flex_columns)].ravel())
             if isinstance(slot := self.mast(stop), Key):
                 values.insert(slot.key, state.world_T_mast[stop])
         self.rig_variables.insert(values, state.rig)
@@ -262,7 +335,7 @@ class HardTemplate(FactorTemplate):
         t = self.traverse
         out: dict[tuple[str, ...], int] = {}
         for key in self.linkage.key:
-            if kind_of(key) in {Kind.MAST, Kind.ANGLES}:
+            if kind_of(key) in {Kind.MAST, Kind.ANGLES, Kind.FLEX}:
                 out[kind_of(key).value, t.stops[index_of(key)].id] = key
         for v in self.rig_variables.variables:
             out[v.quantity, self.rig_variables.owner(v)] = v.key
@@ -314,7 +387,7 @@ class _Segments:
     """Variables that each unit depends on; a unit is a frame, or an image (see `_by_image`)."""
 
     present: BoolArray
-    """(units, 5) whether it depends on angles, mast, tilt axis, mount and calibration"""
+    """(units, 6) whether it depends on angles, mast, flex, tilt axis, mount and calibration"""
     frame: IntArray
     """(units,) row of the frame of each unit"""
     image: IntArray

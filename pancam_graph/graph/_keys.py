@@ -15,6 +15,8 @@ class Kind(Enum):
     """Mast pose of a stop (Pose3)."""
     ANGLES = "A"
     """Pan and tilt: of one frame (vector of 2), or stacked of all frames of a stop that are not held."""
+    FLEX = "F"
+    """How the heads of all frames of a stop that are not held stand off the rigid mast, stacked (vector)."""
     CAMERA = "X"
     """Camera pose of an image (Pose3)."""
     PROJECTION = "P"

@@ -84,12 +84,15 @@ class FactorTemplate(ABC):
         template lacks. `apart` as for `ties`: it keeps the graph sparse for elimination by GTSAM.
         """
         seats = self.seats(given, present)
-        owners = (*range(len(self.traverse.stops)), None)
+        owners: tuple[int | None, ...] = (*range(len(self.traverse.stops)), None)
         placed = (seated(one, seats) for one in given)
         return Factors(
             telemetry=tuple(self.telemetry_priors()),
             ties=tuple(self.ties(apart=apart)),
-            rig=tuple(factor for owner in owners for factor in self.rig_variables.prior_factors(owner)),
+            rig=(
+                *(factor for owner in owners for factor in self.rig_variables.prior_factors(owner)),
+                *(factor for stop in owners[:-1] for factor in self.flex_factors(stop)),
+            ),
             given=tuple(given),
             seated=tuple(factor for factor in placed if factor is not None),
         )
@@ -197,12 +200,21 @@ class FactorTemplate(ABC):
 
     def angle_noise(self, stop: int, frames: IntArray) -> gtsam.noiseModel.Base:
         """Noise of the pan and tilt of some frames of a stop, one after the other."""
-        stated = np.array([self.traverse.frames[f].sigmas_rad for f in frames])
+        stated = self.angle_sigmas_rad[frames]
         extra = self.let_go.angles_rad[frames]
         covariance = self.let_go.angle_covariance(stop, stated, extra)
         if covariance is None:
             return diagonal_noise(self.let_go.widened(stated, extra).ravel())
         return gtsam.noiseModel.Gaussian.Covariance(covariance)
+
+    def flex_factors(self, stop: int | None) -> FactorList:
+        """The prior of how a stop's heads stand off the rigid mast; none here."""
+        return []
+
+    @cached_property
+    def angle_sigmas_rad(self) -> FloatArray:
+        """(frames, 2) sigmas of the priors of pan and tilt; 0 where held."""
+        return np.array([frame.sigmas_rad for frame in self.traverse.frames]).reshape(-1, 2)
 
     def held_of_stops(self) -> dict[int, IntArray]:
         """`held_columns` of the masts."""

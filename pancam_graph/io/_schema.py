@@ -35,6 +35,8 @@ class UncertaintyEntry(Entry):
     mount_m: float | None = None
     tilt_axis_rad: float | None = None
     tilt_axis_m: float | None = None
+    flex_rad: float | None = None
+    flex_m: float | None = None
     source: Text | None = None
 
     def on(self, rig: Rig) -> Rig:
@@ -146,6 +148,7 @@ class SharingEntry(Entry):
     mounts: FreedomEntry | None = None
     pan_T_tilt: FreedomEntry | None = None
     radius: FreedomEntry | None = None
+    flex: FreedomEntry | None = None
 
     def sharing(self) -> Sharing:
         """The sharing. Raises InputError for entries that contradict each other."""

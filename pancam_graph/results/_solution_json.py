@@ -85,7 +85,7 @@ class SolvedImageEntry(Entry):
 class RefinedEntry(Entry):
     """An entry of the rig that was free. Null: the entry has no such owner, or the number is not finite."""
 
-    quantity: Literal["calibration", "mounts", "pan_T_tilt", "radius"]
+    quantity: Literal["calibration", "mounts", "pan_T_tilt", "radius", "flex"]
     entry: str
     camera: str | None
     stop: str | None

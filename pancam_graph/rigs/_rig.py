@@ -7,7 +7,14 @@ import gtsam
 import numpy as np
 
 from pancam_graph.base.errors import InputError
-from pancam_graph.base.geometry import FloatArray, IntArray, compose, pan_tilt_rotation, pose_arrays
+from pancam_graph.base.geometry import (
+    FloatArray,
+    IntArray,
+    compose,
+    corrected_poses,
+    pan_tilt_rotation,
+    pose_arrays,
+)
 from pancam_graph.cameras import CAHV, Camera, Pinhole
 from pancam_graph.rigs._uncertainty import RigUncertainty
 
@@ -124,10 +131,18 @@ class Rig:
         pan_R, tilt_R = pan_tilt_rotation(pan_rad, 0.0), pan_tilt_rotation(0.0, tilt_rad)
         return pan_R @ axis_R @ tilt_R, (pan_R @ axis_t[..., None])[..., 0]
 
-    def mast_T_camera(self, pan_tilt_rad: FloatArray, eye: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Camera poses in the mast frame for n images: pan and tilt (n, 2), eye index (n,)."""
+    def mast_T_camera(
+        self, pan_tilt_rad: FloatArray, eye: IntArray, flex: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Camera poses in the mast frame for n images: pan and tilt (n, 2), eye index (n,).
+
+        `flex` (n, 4) is how the heads stand off the rigid mast: turned about their forward axis, radians, and
+        shifted along their own axes, metres.
+        """
         mounts_R, mounts_t = self._mounts
         head = self.mast_T_head(pan_tilt_rad[:, 0], pan_tilt_rad[:, 1])
+        if flex is not None:
+            head = corrected_poses(*head, np.insert(flex, [1, 1], 0.0, axis=1))
         return compose(*head, mounts_R[eye], mounts_t[eye])
 
     def circle(self, eye: int, tilt_rad: float) -> tuple[float, float, float]:

@@ -76,6 +76,7 @@ def _ladybug(*, name: str, radius_m: float, top_m: float, camera: Pinhole, sourc
             mount_m=5e-4,
             tilt_axis_rad=0.0,
             tilt_axis_m=0.0,
+            flex_rad=0.0,
             source="published calibration files: focal lengths within 2 %, principal points within 50 px, "
             "radii within 1 mm; turns, aspect and skew: our stated assumption",
         ),

@@ -1,6 +1,6 @@
 """How far the numbers of a rig may be off."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -38,6 +38,11 @@ class RigUncertainty:
     """Of `pan_T_tilt`: each component of its turn, in the tilt frame."""
     tilt_axis_m: float = 2e-3
     """Of each component of its shift."""
+    flex_rad: float = 2e-4
+    """Of each frame: how far the head stands turned from where the joints put it, about each of the pan axis,
+    the tilt axis and its forward axis."""
+    flex_m: float = 0.0
+    """Of each frame: how far the head stands shifted, along each of its own axes."""
     source: str = "our stated assumption for a calibrated rig"
     """Where the numbers come from."""
 
@@ -53,6 +58,12 @@ class RigUncertainty:
     def sigmas(self) -> dict[str, float]:
         """The standard deviations by name."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "source"}
+
+    @staticmethod
+    def exact() -> "RigUncertainty":
+        """Of a rig whose numbers are all known."""
+        zero = {f.name: 0.0 for f in fields(RigUncertainty) if f.name != "source"}
+        return replace(RigUncertainty(), **zero, source="exact")
 
     @staticmethod
     def usual(side_px: int) -> "RigUncertainty":

@@ -11,13 +11,14 @@ from pancam_graph.cameras import Camera
 from pancam_graph.data import Frame, Image, Observations, Stop, Traverse
 from pancam_graph.rigs import Rig
 from pancam_graph.simulate._simulation_options import DriveOptions
-from pancam_graph.simulate._wrong_rig import drawn_rig, wrong_rig
+from pancam_graph.simulate._wrong_rig import drawn_flex, drawn_rig, wrong_rig
 
 __all__ = [
     "TelemetryStart",
     "Truth",
     "claimed_rig",
     "fields_rad",
+    "flexed",
     "make_traverse",
     "panorama",
     "path",
@@ -42,6 +43,9 @@ class Truth:
     """(observations, 2) pixels without noise, of outliers too."""
     outlier: BoolArray
     """(observations,) which are a random pixel."""
+    flex: FloatArray | None = None
+    """(frames, 4) how heads stood off the mast (`Rig.mast_T_camera`); pan and tilt are theirs. None: not at
+    all."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -136,6 +140,19 @@ def claimed_rig(rig: Rig, options: DriveOptions, angles_rad: FloatArray, rng: np
         tilt_rad=float(np.mean(angles_rad[:, 1])),
     )
     return drawn_rig(wrong, rng) if options.rig_error == "drawn" else wrong
+
+
+def flexed(
+    rig: Rig, options: DriveOptions, pan_tilt_rad: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray | None]:
+    """Pan and tilt (frames, 2) of heads that flex from where the joints stand, and what else they flex.
+
+    Where rigs are drawn with errors; else the joints' own angles, and None.
+    """
+    if options.rig_error != "drawn" or not rig.turns:
+        return pan_tilt_rad, None
+    flex = drawn_flex(rig, len(pan_tilt_rad), rng)
+    return pan_tilt_rad + flex[:, :2], flex[:, 2:]
 
 
 def telemetry(

@@ -18,6 +18,7 @@ from pancam_graph.simulate._drive import (
     TelemetryStart,
     Truth,
     claimed_rig,
+    flexed,
     make_traverse,
     panorama,
     path,
@@ -66,9 +67,9 @@ def simulate(rig: Rig, options: SimulationOptions | None = None, *, seed: int = 
     options = options if options is not None else SimulationOptions()
     if seed < 0:
         raise InputError(f"simulation: seed: expected 0 or more, found {seed}")
-    streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(9)]
+    streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(10)]
     rng_terrain, rng_drive, rng_sight, rng_detection, rng_noise, rng_outlier, *streams = streams
-    rng_telemetry, rng_ellipse, rng_rig = streams
+    rng_telemetry, rng_ellipse, rng_rig, rng_flex = streams
 
     terrain, world_T_mast = _drive(rig, options, rng_terrain, rng_drive)
     angles = panorama(
@@ -77,13 +78,15 @@ def simulate(rig: Rig, options: SimulationOptions | None = None, *, seed: int = 
         overlap=_OVERLAP,
         rows=lambda down: (-_HORIZON * down, -(_HORIZON + 1 - _OVERLAP) * down),
     )
-    pan_tilt = np.tile(angles, (options.stops, 1))
+    joints = np.tile(angles, (options.stops, 1))
+    pan_tilt, flex = flexed(rig, options, joints, rng_flex)
     n_eyes = len(rig.eyes)
     image_frame = np.repeat(np.arange(len(pan_tilt)), n_eyes)
     image_eye = np.tile(np.arange(n_eyes), len(pan_tilt))
     image_stop = image_frame // len(angles)
     stops_R, stops_t = pose_arrays(world_T_mast)
-    mast_T_camera = rig.mast_T_camera(pan_tilt[image_frame], image_eye)
+    of_image = None if flex is None else flex[image_frame]
+    mast_T_camera = rig.mast_T_camera(pan_tilt[image_frame], image_eye, of_image)
     camera_R, camera_t = compose(stops_R[image_stop], stops_t[image_stop], *mast_T_camera)
 
     points, finder = _find_points(rig, options, terrain, (camera_R, camera_t), image_eye, rng_sight)
@@ -117,7 +120,7 @@ def simulate(rig: Rig, options: SimulationOptions | None = None, *, seed: int = 
         noisy = uv + observations.noise.to_pixels(rng_noise.standard_normal(uv.shape))
     observations = replace(observations, uv_px=np.where(outlier[:, None], anywhere, noisy))
 
-    start = telemetry(rig, options, world_T_mast, pan_tilt, rng_telemetry)
+    start = telemetry(rig, options, world_T_mast, joints, rng_telemetry)
     truth = PointsTruth(
         rig=rig,
         world_T_mast=world_T_mast,
@@ -125,6 +128,7 @@ def simulate(rig: Rig, options: SimulationOptions | None = None, *, seed: int = 
         landmarks_m=points[kept],
         uv_px=uv,
         outlier=outlier,
+        flex=flex,
         terrain=terrain,
     )
     centre = truth if options.prior == "truth" else start

@@ -15,6 +15,7 @@ from pancam_graph.simulate._drive import (
     TelemetryStart,
     Truth,
     claimed_rig,
+    flexed,
     make_traverse,
     panorama,
     path,
@@ -183,7 +184,9 @@ class Rendering:
     def _camera(self, row: int) -> tuple[FloatArray, FloatArray]:
         """world_R_camera and the camera's place, in truth."""
         true = replace(self.traverse, rig=self.truth.rig)
-        rotation, centre = true.camera_poses(self.truth.world_T_mast, self.truth.pan_tilt_rad)
+        rotation, centre = true.camera_poses(
+            self.truth.world_T_mast, self.truth.pan_tilt_rad, self.truth.flex
+        )
         return np.ascontiguousarray(rotation[row]), np.ascontiguousarray(centre[row])
 
     def _deck(self, row: int) -> Deck:
@@ -232,15 +235,16 @@ def render(rig: Rig, options: RenderOptions | None = None, *, seed: int = 0) -> 
     options = options if options is not None else RenderOptions()
     if seed < 0:
         raise InputError(f"simulation: seed: expected 0 or more, found {seed}")
-    streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)]
-    rng_world, rng_drive, rng_telemetry, rng_rig = streams
+    streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(5)]
+    rng_world, rng_drive, rng_telemetry, rng_rig, rng_flex = streams
     xy, heading = path(options, rng_drive)
     scene = make_scene(options, xy, rng_world)
     ground, slope = slopes(scene, xy)
     world_T_mast = stand(rig, xy, heading, ground, slope)
     angles = panorama(rig, options, overlap=_OVERLAP, rows=lambda down: (-_BELOW_HORIZON * down,))
-    pan_tilt = np.tile(angles, (options.stops, 1))
-    start = telemetry(rig, options, world_T_mast, pan_tilt, rng_telemetry)
+    joints = np.tile(angles, (options.stops, 1))
+    pan_tilt, flex = flexed(rig, options, joints, rng_flex)
+    start = telemetry(rig, options, world_T_mast, joints, rng_telemetry)
     traverse = make_traverse(
         claimed_rig(rig, options, angles, rng_rig),
         options,
@@ -257,6 +261,7 @@ def render(rig: Rig, options: RenderOptions | None = None, *, seed: int = 0) -> 
         landmarks_m=np.zeros((0, 3)),
         uv_px=np.zeros((0, 2)),
         outlier=np.zeros(0, dtype=bool),
+        flex=flex,
     )
     return Rendering(
         traverse=traverse, truth=truth, telemetry_start=start, options=options, seed=seed, _scene=scene

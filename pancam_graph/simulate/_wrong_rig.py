@@ -8,7 +8,7 @@ import numpy as np
 from pancam_graph.base.geometry import FloatArray, corrected_poses, rz
 from pancam_graph.rigs import Rig
 
-__all__ = ["drawn_rig", "wrong_rig"]
+__all__ = ["drawn_flex", "drawn_rig", "wrong_rig"]
 
 
 def wrong_rig(
@@ -62,6 +62,16 @@ def drawn_rig(rig: Rig, rng: np.random.Generator) -> Rig:
         eyes.append(replace(eye, camera=eye.camera.with_calibration(K), head_T_camera=head_T_camera))
     axis = np.repeat([u.tilt_axis_rad, u.tilt_axis_m], 3) * rng.standard_normal(6)
     return replace(rig, eyes=tuple(eyes), pan_T_tilt=_corrected(rig.pan_T_tilt, axis))
+
+
+def drawn_flex(rig: Rig, n_frames: int, rng: np.random.Generator) -> FloatArray:
+    """How heads of frames stand off the joints (frames, 6), as far as the rig's uncertainty says.
+
+    Turns about the pan axis, the tilt axis and the head's forward axis, radians, then shifts along the head's
+    own axes, metres.
+    """
+    sigmas = np.repeat([rig.uncertainty.flex_rad, rig.uncertainty.flex_m], 3)
+    return np.asarray(sigmas * rng.standard_normal((n_frames, 6)))
 
 
 def _corrected(pose: gtsam.Pose3, correction: FloatArray) -> gtsam.Pose3:

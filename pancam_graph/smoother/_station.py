@@ -124,11 +124,13 @@ class Station:
     def other_priors(self, *, firm: bool) -> list[gtsam.NonlinearFactor]:
         """The priors of `factors` that are not on the mast."""
         t, out = self.traverse, list[gtsam.NonlinearFactor]()
-        sigmas = np.array([[f.sigma_pan_rad, f.sigma_tilt_rad] for f in t.frames]).reshape(-1, 2)
+        sigmas = self.template.angle_sigmas_rad
         free = sigmas.any(axis=1)
         if free.any():
             noise = _noise(sigmas[free].ravel(), firm=firm)
             out.append(gtsam.PriorFactorVector(self.angles, t.pan_tilt_rad[free].ravel(), noise))
+        for factor in self.template.flex_factors(0):
+            out.append(factor.rekey([self.global_key[key] for key in factor.keys()]))  # noqa: SIM118  a gtsam factor
         return out + self._rig_priors(0)
 
     def shared_priors(self, keys: Collection[int]) -> list[gtsam.NonlinearFactor]:

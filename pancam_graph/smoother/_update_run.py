@@ -62,7 +62,7 @@ class UpdateRun:
             moved = self._station.start(
                 judgement.world_T_mast[self._station.number], judgement.pan_tilt_rad[self._station.number]
             )
-            own = [k for k in self._station.own_keys if kind_of(k) in {Kind.MAST, Kind.ANGLES}]
+            own = [k for k in self._station.own_keys if kind_of(k) in {Kind.MAST, Kind.ANGLES, Kind.FLEX}]
             values = gtsam.Values(values)
             values.update(copied(moved, own))
         drive.use(judgement.rows, judgement.accepted, judgement.by_chance, Postures(values), change)

@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 import scipy
 
-from pancam_graph.data import State, sharing_within
+from pancam_graph.data import FIXED, State, sharing_within
 from pancam_graph.graph import HardTemplate
 from pancam_graph.landmarks import Landmarks
 from pancam_graph.solve._covariance import Uncertainty, uncertainty
@@ -52,6 +52,7 @@ def with_rig(fitted: Fitted, problem: Problem) -> tuple[Problem, ReducedSystem] 
     """
     prepared = fitted.screened.prepared
     sharing = sharing_within(prepared.traverse.rig.uncertainty, prepared.options.model)
+    sharing = replace(sharing, flex=FIXED)  # not of the rig, but of each frame
     if not sharing.any_free:
         return None
     if isinstance(problem.template, HardTemplate):

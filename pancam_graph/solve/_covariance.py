@@ -144,5 +144,7 @@ def _name(template: FactorTemplate, free: FreeDirectionError) -> str:
             if v.key == key:
                 name = template.rig_variables.name(v, v.entries[component])
                 return f"{name} of the rig, with what moves along"
+        if kind is Kind.FLEX:
+            return f"the flex of a frame at {t.stops[free.group].id}"
         return f"pan or tilt at {t.stops[free.group].id}"
     return "a direction of the solution"

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pancam_graph.base.errors import InputError, SolveError
 from pancam_graph.base.geometry import BoolArray, IntArray
 from pancam_graph.data import (
+    FIXED,
     Observations,
     PixelNoise,
     RigCorrection,
@@ -183,7 +184,15 @@ def free_numbers(traverse: Traverse, options: SolveOptions) -> Sharing:
             "rig: expected estimated or held where a sharing says what is free, found considered: it counts "
             "numbers that are not moved"
         )
-    return sharing_for(traverse.rig, options.model, options.rig, given)
+    sharing = sharing_for(traverse.rig, options.model, options.rig, given)
+    if sharing.flex == FIXED or (options.firm_tie == "hard" and options.landmarks == "eliminated"):
+        return sharing
+    if given is not None:
+        raise InputError(
+            "sharing: flex: expected fixed with a soft tie, whose sigma is another flex, and with explicit "
+            f"landmarks; found {sharing.flex.scope}"
+        )
+    return replace(sharing, flex=FIXED)
 
 
 def template_for(traverse: Traverse, options: SolveOptions, sharing: Sharing) -> FactorTemplate:

@@ -75,7 +75,7 @@ def landmark_panels(
     panels = system.linearise(problem.template.posture(problem.values))
     panels = joint_panels(problem.template, problem.factors, problem.values, panels)
     for group, information in (without or {}).items():
-        panels.panel[group][:, : len(information)] -= information
+        panels.panel[group][: len(information), : len(information)] -= information
     return panels
 
 

@@ -112,6 +112,11 @@ SHARINGS: dict[str, Sharing] = {
     "mounts": free("mounts", "eye"),
     "axis": free("pan_T_tilt", "all", "rx_rad", "rz_rad", "y_m"),
 }
+FLEXING: dict[str, Sharing] = {
+    "twist alone": free("flex", "frame", "twist_rad"),
+    "flex and all": replace(ALL, flex=Freedom(scope="frame")),
+}
+"""Sharings of a mast with a hard tie."""
 
 
 def off(t: Traverse, state: State, seed: int = 2) -> State:
@@ -123,6 +128,7 @@ def off(t: Traverse, state: State, seed: int = 2) -> State:
         mount=rng.normal(0, 0.3, (n, 6)),
         pan_T_tilt=rng.normal(0, 0.3, (len(t.stops), 6)),
         radius_m=rng.normal(0, 0.01, n),
+        flex=rng.normal(0, 0.3, (len(t.frames), 4)),
     )
     return replace(state, rig=rig)
 
@@ -143,6 +149,7 @@ def templates(t: Traverse, sharing: Sharing | None = None) -> dict[str, FactorTe
         *((name, "hard", "nothing") for name in TRAVERSES),
         *((name, "hard", "all") for name in TRAVERSES),
         *(("all free", "hard", sharing) for sharing in SHARINGS),
+        *((name, "hard", sharing) for name in TRAVERSES for sharing in FLEXING),
         *(("all free", "mast", sharing) for sharing in SHARINGS),
         ("a stop held", "circle", "nothing"),
         ("all free", "projective", "nothing"),
@@ -155,7 +162,7 @@ def test_chains_move_cameras_as_values_do(name: str, kind: str, sharing: str) ->
     Calibrations move by the rows after it. The rig is far off, where a derivative at zero would be wrong.
     """
     t = TRAVERSES[name]()
-    template = templates(t, SHARINGS[sharing])[kind]
+    template = templates(t, (SHARINGS | FLEXING)[sharing])[kind]
     link, values = template.linkage, template.values(off(t, state_of(t)))
     posture = template.posture(values)
     n_rows, h = posture.chain.shape[1], 1e-6
@@ -409,3 +416,32 @@ def test_sigma_of_a_difference_is_that_of_draws(kind: str) -> None:
         angles = rows_i @ draws[columns_i], rows_j @ draws[columns_j]
         assert sigma == pytest.approx((angles[1] - angles[0]).std(axis=1), rel=0.02)
         assert single[[i, j]] == pytest.approx(np.std(angles, axis=2), rel=0.02)
+
+
+@pytest.mark.parametrize("name", TRAVERSES)
+@pytest.mark.parametrize("sharing", FLEXING)
+def test_a_state_keeps_how_heads_flex(sharing: str, name: str) -> None:
+    t = TRAVERSES[name]()
+    template = HardTemplate(t, FLEXING[sharing])
+    values = template.values(off(t, state_of(t)))
+    state = template.state(values, np.zeros((0, 3)))
+    assert state.rig is not None
+    assert state.rig.flex is not None
+    again = template.values(state)
+    for stop, frames in enumerate(t.frame_stop[None, :] == np.arange(len(t.stops))[:, None]):
+        key = gtsam.symbol("F", stop)
+        moves = frames & np.array([f.sigmas_rad.any() for f in t.frames])
+        assert (key in template.linkage.row) == moves.any()
+        if moves.any():
+            assert again.atVector(key) == pytest.approx(values.atVector(key))
+            assert np.all(state.rig.flex[moves, 0] != 0)
+        assert not np.any(state.rig.flex[frames & ~moves])
+
+
+def test_priors_of_pan_and_tilt_are_widened_by_the_flex_about_these_axes() -> None:
+    t = TRAVERSES["a tilt held"]()
+    sharing = Sharing(flex=Freedom(scope="frame", free=("twist_rad",), sigma={"twist_rad": 2e-3}))
+    widened = HardTemplate(t, sharing).angle_sigmas_rad
+    stated = np.array([f.sigmas_rad for f in t.frames])
+    assert np.allclose(widened[stated > 0], np.hypot(stated[stated > 0], 2e-3))
+    assert np.all(widened[stated == 0] == 0)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pancam_graph import SimulationOptions, TraverseSmoother, simulate
+from pancam_graph import SimulationOptions, SmootherOptions, TraverseSmoother, simulate
 from pancam_graph.base.errors import InputError
 from pancam_graph.rigs import mer_navcam
 from pancam_graph.smoother._incremental import stops_of
@@ -22,7 +22,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
         stops=3, spacing_m=3.0, pans=2, tilts_rad=(-0.2,), sweep_rad=0.8, points_per_image=12, noise_px=0.3
     )
     traverse = simulate(mer_navcam(), options).traverse
-    smoother = TraverseSmoother(traverse.rig)
+    smoother = TraverseSmoother(traverse.rig, SmootherOptions(rig="held"))
     for part in stops_of(traverse):
         smoother.add_stop(*part)
     path = tmp_path_factory.mktemp("saved") / "drive.npz"
@@ -126,3 +126,36 @@ def test_a_state_in_memory_is_checked_too(saved: Path) -> None:
     state = TraverseSmoother.load(saved).state()
     with pytest.raises(InputError, match="home, row 0: expected the number of a stop"):
         TraverseSmoother.of(replace(state, home=state.home + 100))
+
+
+def test_a_drive_is_saved_with_what_becomes_of_its_rig(tmp_path: Path) -> None:
+    options = SimulationOptions(
+        stops=3, spacing_m=3.0, pans=2, tilts_rad=(-0.2,), sweep_rad=0.8, points_per_image=12
+    )
+    traverse = simulate(mer_navcam(), options).traverse
+    parts = list(stops_of(traverse))
+    whole = TraverseSmoother(traverse.rig, SmootherOptions(rig="estimated"))
+    for part in parts[:2]:
+        whole.add_stop(*part)
+    whole.save(tmp_path / "drive.npz")
+    read = TraverseSmoother.load(tmp_path / "drive.npz")
+    assert read.options.rig == "estimated"
+    assert read.rig.uncertainty == traverse.rig.uncertainty
+    for smoother in (whole, read):
+        smoother.add_stop(*parts[2])
+    found, expected = read.estimate().pan_tilt_rad, whole.estimate().pan_tilt_rad
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_a_drive_of_an_older_version_goes_on_with_its_rig_held(saved: Path, tmp_path: Path) -> None:
+    with np.load(saved) as archive:
+        arrays: Arrays = dict(archive)
+    data: Any = json.loads(arrays["header"].tobytes())
+    held = TraverseSmoother.load(saved)
+    del data["options"]["rig"], data["traverse"]["rig"]["uncertainty"]
+    arrays["header"] = np.frombuffer(json.dumps(data).encode(), dtype=np.uint8)
+    path = tmp_path / "drive.npz"
+    path.write_bytes(packed(arrays))
+    older = TraverseSmoother.load(path)
+    assert older.options.rig == "held"
+    np.testing.assert_array_equal(older.estimate().pan_tilt_rad, held.estimate().pan_tilt_rad)

@@ -16,16 +16,7 @@ from pancam_graph.smoother._incremental import solve_incrementally
 from pancam_graph.solve import judge
 from support.solving import fitted
 
-EXACT = RigUncertainty(
-    focal=0.0,
-    aspect=0.0,
-    principal_point_px=0.0,
-    skew_px=0.0,
-    mount_rad=0.0,
-    mount_m=0.0,
-    tilt_axis_rad=0.0,
-    tilt_axis_m=0.0,
-)
+EXACT = RigUncertainty.exact()
 TO_THE_END = SolveOptions(loss="none", relative_decrease=1e-12)
 
 
@@ -76,7 +67,7 @@ def test_other_models_have_only_what_they_depend_on() -> None:
     for model in ("circle", "free"):
         sharing = sharing_within(RigUncertainty(), model)
         assert sharing.calibration.scope == "eye"
-        assert sharing.mounts == sharing.pan_T_tilt == FIXED
+        assert sharing.mounts == sharing.pan_T_tilt == sharing.flex == FIXED
     assert not sharing_within(RigUncertainty(), "projective").any_free
     assert not sharing_within(EXACT, "mast").any_free
     assert sharing_within(ladybug3().uncertainty, "mast").pan_T_tilt == FIXED
