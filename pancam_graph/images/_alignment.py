@@ -1,12 +1,12 @@
 """Where a stop stands relative to another, from terrain points of the one and pixels of the other."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
-from pancam_graph.data import Refusal
+from pancam_graph.data import Refusal, mean_sigma_px
 from pancam_graph.images._features import Features
 from pancam_graph.images._front_end_options import FrontEndOptions
 from pancam_graph.images._match import beyond_chance, match_in_windows
@@ -48,8 +48,8 @@ class Ties:
     """(n,) row of the image that shows it."""
     uv_px: FloatArray
     """(n, 2) where the image shows it, raw pixels."""
-    sigma_px: FloatArray
-    """(n,) standard deviation of each coordinate."""
+    covariance_px2: FloatArray
+    """(n, 2, 2) its covariance."""
 
     @staticmethod
     def concatenate(parts: "list[Ties]") -> "Ties":
@@ -59,7 +59,7 @@ class Ties:
             row=np.concatenate([empty, *(p.row for p in parts)]),
             image=np.concatenate([empty, *(p.image for p in parts)]),
             uv_px=np.concatenate([np.empty((0, 2)), *(p.uv_px for p in parts)]),
-            sigma_px=np.concatenate([np.empty(0), *(p.sigma_px for p in parts)]),
+            covariance_px2=np.concatenate([np.empty((0, 2, 2)), *(p.covariance_px2 for p in parts)]),
         )
 
     def select(self, rows: BoolArray | IntArray) -> "Ties":
@@ -68,8 +68,17 @@ class Ties:
             row=self.row[rows],
             image=self.image[rows],
             uv_px=self.uv_px[rows],
-            sigma_px=self.sigma_px[rows],
+            covariance_px2=self.covariance_px2[rows],
         )
+
+    def scaled(self, factor: FloatArray) -> "Ties":
+        """The ties with their standard deviations multiplied by factors (n,)."""
+        return replace(self, covariance_px2=self.covariance_px2 * np.square(factor)[:, None, None])
+
+    @property
+    def sigma_px(self) -> FloatArray:
+        """(n,) root of the mean variance of each."""
+        return mean_sigma_px(self.covariance_px2)
 
     def __len__(self) -> int:
         """Number of ties."""
@@ -155,7 +164,7 @@ def _matched(
                     row=rows[matches.a],
                     image=np.full(len(matches), j, dtype=np.int64),
                     uv_px=other.uv_px[matches.b],
-                    sigma_px=np.maximum(seen.zoom[matches.a], 1.0),
+                    covariance_px2=np.maximum(seen.zoom[matches.a], 1.0)[:, None, None] ** 2 * np.eye(2),
                 )
             )
             widths.append(radius[matches.a])
@@ -190,8 +199,7 @@ def _whitened(
 ) -> tuple[FloatArray, FloatArray, Sighting]:
     """Residuals (n, 2) in pixels, and the matrices (n, 2, 2) that take them to unit covariance."""
     seen = terrain.sighting(ties.row, ties.image, world_T_mast)
-    noise = np.square(ties.sigma_px)[:, None, None] * np.eye(2)
-    covariance = noise + seen.covariance_px2(np.zeros((6, 6)), terrain.sigma_inverse_m[ties.row])
+    covariance = ties.covariance_px2 + seen.covariance_px2(np.zeros((6, 6)), terrain.sigma_inverse_m[ties.row])
     return ties.uv_px - seen.uv_px, np.linalg.inv(np.linalg.cholesky(covariance)), seen
 
 

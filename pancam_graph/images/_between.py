@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.base.threads import in_parallel
-from pancam_graph.data import Observations, Refusal, StopMatching, Traverse
+from pancam_graph.data import Observations, Refusal, StopMatching, Traverse, mean_sigma_px
 from pancam_graph.images._alignment import (
     Alignment,
     Ties,
@@ -22,7 +22,14 @@ from pancam_graph.images._alignment import (
 from pancam_graph.images._features import Features
 from pancam_graph.images._front_end_options import FrontEndOptions
 from pancam_graph.images._masks import pixels_at
-from pancam_graph.images._patches import HALF_WIDTH_PX, MAX_REACH_PX, Coefficients, align_patches
+from pancam_graph.images._patch_noise import patch_covariance_px2
+from pancam_graph.images._patches import (
+    HALF_WIDTH_PX,
+    MAX_REACH_PX,
+    QUALITIES,
+    Coefficients,
+    align_patches,
+)
 from pancam_graph.images._splines import Splines
 from pancam_graph.images._terrain import Sighting, StopTerrain
 
@@ -86,7 +93,7 @@ class StopTies:
         counts = dict(zip(_COUNTS, arrays["counts"].tolist(), strict=True))
         refusal, noise_px = Refusal(counts.pop("refusal")), float(arrays["noise_px"])
         return StopTies(
-            ties=Ties(**{name: arrays[name] for name in ("row", "image", "uv_px", "sigma_px")}),
+            ties=Ties(**{name: arrays[name] for name in ("row", "image", "uv_px", "covariance_px2")}),
             report=StopMatching(**counts, noise_px=noise_px, refusal=refusal),
         )
 
@@ -143,7 +150,7 @@ class StopMatcher:
         )
         # Ties of one point in several images err alike, by the point's own patch: they count as one.
         _, of, times = np.unique(ties.row, return_inverse=True, return_counts=True)
-        return StopTies(ties=replace(ties, sigma_px=ties.sigma_px * np.sqrt(times[of])), report=report)
+        return StopTies(ties=ties.scaled(np.sqrt(times[of])), report=report)
 
     @cached_property
     def _chosen(self) -> BoolArray:
@@ -194,23 +201,24 @@ def _spread(terrain: StopTerrain) -> BoolArray:
 def _measured(
     terrain: StopTerrain, ties: Ties, stops: tuple[int, int], alignment: Alignment, options: FrontEndOptions
 ) -> Ties:
-    """The ties that agree with the pose of most ties, with standard deviations from their scatter.
+    """The ties that agree with the pose of most ties, with covariances whose size is from their scatter.
 
-    Of `ties.sigma_px` only the order matters. Far terrain looks the same from both stops and gives ties
-    several times better than near terrain, but near terrain is what places the stop: the scatter is therefore
-    measured in groups of ties of about the same quality.
+    Far terrain looks the same from both stops and gives ties several times better than near terrain, but near
+    terrain is what places the stop: the scatter is therefore measured in groups of ties of about the same
+    quality. Within a group the covariances keep their shapes and relative sizes.
     """
     prior, n = telemetry_alignment(terrain, *stops), len(ties)
-    groups = np.array_split(np.argsort(ties.sigma_px, kind="stable"), np.clip(n // _GROUP, 1, _MOST_GROUPS))
-    worse = np.maximum(ties.sigma_px / max(float(np.median(ties.sigma_px)), 1e-12), 1.0)
-    ties = replace(ties, sigma_px=options.max_epipolar_px / options.epipolar_scales * worse)
+    quality = ties.sigma_px
+    groups = np.array_split(np.argsort(quality, kind="stable"), np.clip(n // _GROUP, 1, _MOST_GROUPS))
+    start_px = options.max_epipolar_px / options.epipolar_scales
+    ties = ties.scaled(start_px / np.minimum(quality, max(float(np.median(quality)), 1e-12)))
     for _ in range(_FITS):
         alignment = fit_pose(terrain, ties, prior, alignment, _FIT_SCALE)
-        distance, sigma_px = whitened_distance(terrain, ties, alignment.world_T_mast), ties.sigma_px.copy()
+        distance, factor = whitened_distance(terrain, ties, alignment.world_T_mast), np.ones(n)
         for group in groups:
             # The median length of a Gaussian residual (2,) is 1.177 sigma; wrong ties do not widen it.
-            sigma_px[group] *= min(1.0, float(np.median(distance[group])) / 1.177)
-        ties = replace(ties, sigma_px=np.maximum(sigma_px, _LEAST_NOISE_PX))
+            factor[group] = min(1.0, float(np.median(distance[group])) / 1.177)
+        ties = ties.scaled(np.maximum(factor, _LEAST_NOISE_PX / ties.sigma_px))
     distance = whitened_distance(terrain, ties, alignment.world_T_mast)
     return ties.select(distance < options.epipolar_scales)
 
@@ -236,7 +244,7 @@ def _found(
     rows, seen = rows[inside], seen.select(inside)
     if not len(rows):
         return _Sought(), Ties.concatenate([])
-    affine = terrain.affine(rows, image, alignment.world_T_mast)
+    affine, bend = terrain.local_map(rows, image, alignment.world_T_mast)
     finite: BoolArray = np.asarray(np.isfinite(affine).all(axis=(1, 2)))
     stretch = np.linalg.svd(np.where(finite[:, None, None], affine, 0.0), compute_uv=False)
     usable = finite & (stretch[:, 0] < _LARGEST_STRETCH)
@@ -249,13 +257,13 @@ def _found(
     if not len(k):
         return _Sought(), Ties.concatenate([])
     level = np.clip(np.rint(2 * np.log2(np.sqrt(stretch[k, 0] * stretch[k, 1]))), 0, 4).astype(np.int64)
-    start, uv, fit = terrain.uv_px[rows[k]], seen.uv_px[k].copy(), np.empty((len(k), 5))
+    start, uv, fit = terrain.uv_px[rows[k]], seen.uv_px[k].copy(), np.empty((len(k), QUALITIES))
     first, second_at = spline(int(terrain.image[rows[0]])), partial(spline, image)
     for blur in np.unique(level).tolist():
         part = np.flatnonzero(level == blur)
-        patches = start[part], affine[k[part]], reach[k[part]], uv[part]
+        patches = start[part], affine[k[part]], bend[k[part]], reach[k[part]], uv[part]
         uv[part], fit[part] = _aligned(first, second_at(blur), patches)
-    at_start, correlation, second, moved, spread = fit.T
+    at_start, correlation, second, moved = fit[:, :4].T
     alike = (correlation > _MIN_CORRELATION) & (correlation >= at_start)
     only = alike & (correlation - second > _MIN_LEAD)
     good = only & (moved < _MAX_MOVE_PX * stretch[k, 0])
@@ -264,7 +272,8 @@ def _found(
     for blur in np.unique(level[good]).tolist():
         part = np.flatnonzero(good & (level == blur))
         inverse: FloatArray = np.asarray(np.linalg.inv(affine[k[part]]))
-        patches = uv[part], inverse, np.zeros((len(part), 2), dtype=np.int64), start[part]
+        no_bend, nowhere = np.zeros((len(part), 2, 3)), np.zeros((len(part), 2), dtype=np.int64)
+        patches = uv[part], inverse, no_bend, nowhere, start[part]
         back, _ = _aligned(second_at(blur), first, patches)
         good[part] = np.linalg.norm(back - start[part], axis=1) < _MAX_RETURN_PX
     count = [int(np.count_nonzero(x)) for x in (alike, only, good)]
@@ -275,9 +284,15 @@ def _found(
         row=rows[k[good]],
         image=np.full(count[2], image, dtype=np.int64),
         uv_px=uv[good],
-        sigma_px=spread[good],
+        covariance_px2=patch_covariance_px2(fit[good, 4:], _lines(seen.select(k[good]))),
     )
     return sought, ties
+
+
+def _lines(seen: Sighting) -> FloatArray:
+    """Unit vectors (n, 2) of the epipolar lines; 0 for a point at infinity."""
+    length = np.linalg.norm(seen.d_inverse_depth, axis=1, keepdims=True)
+    return np.asarray(np.where(length > 0, seen.d_inverse_depth / np.maximum(length, 1e-300), 0.0))
 
 
 def _reach(
@@ -301,14 +316,14 @@ def _reach(
 def _aligned(
     image_a: Coefficients,
     image_b: Coefficients,
-    patches: tuple[FloatArray, FloatArray, IntArray, FloatArray],
+    patches: tuple[FloatArray, FloatArray, FloatArray, IntArray, FloatArray],
 ) -> tuple[FloatArray, FloatArray]:
-    """Pixels in b (n, 2) and their quality (n, 5); see `align_patches` for these and the arguments."""
-    uv_a, affine, reach, start = patches
-    uv_b, fit = start.copy(), np.empty((len(uv_a), 5))
+    """Pixels in b (n, 2) and their quality (n, 7); see `align_patches` for these and the arguments."""
+    uv_a, affine, bend, reach, start = patches
+    uv_b, fit = start.copy(), np.empty((len(uv_a), QUALITIES))
     in_parallel(
         lambda first, last: align_patches(
-            first, last, image_a, image_b, uv_a, affine, reach, _STEPS, uv_b, fit
+            first, last, image_a, image_b, uv_a, affine, bend, reach, _STEPS, uv_b, fit
         ),
         len(uv_a),
         grain=_GRAIN,
@@ -316,15 +331,18 @@ def _aligned(
     return uv_b, fit
 
 
-def joined(obs: Observations, terrain: StopTerrain, ties: Ties, sigma_px: FloatArray) -> Observations:
-    """Observations with the ties added to their points' tracks."""
+def joined(obs: Observations, terrain: StopTerrain, ties: Ties) -> Observations:
+    """Observations, which have covariances, with the ties added to their points' tracks."""
+    assert obs.covariance_px2 is not None
     image = np.concatenate([obs.image, ties.image])
     track = np.concatenate([obs.track, terrain.track[ties.row]])
     order = np.lexsort((image, track))
+    covariance = np.concatenate([obs.covariance_px2, ties.covariance_px2])[order]
     return replace(
         obs,
         image=image[order],
         track=track[order],
         uv_px=np.concatenate([obs.uv_px, ties.uv_px])[order],
-        sigma_px=np.concatenate([obs.sigma_px, sigma_px])[order],
+        sigma_px=mean_sigma_px(covariance),
+        covariance_px2=covariance,
     )

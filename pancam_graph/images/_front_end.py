@@ -15,7 +15,7 @@ from pancam_graph.images._match_pair import PairMatches
 from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._read import image_name, listed
 from pancam_graph.images._steps import Progress, Steps
-from pancam_graph.images._tracks import Links, join_tracks, spread_tracks
+from pancam_graph.images._tracks import Links, apart_tracks, join_tracks, spread_tracks
 
 __all__ = ["find_masks", "find_observations"]
 
@@ -87,20 +87,17 @@ def find_observations(
         rows = image == i
         uv_px[rows] = work.features[i].uv_px[feature[rows]]
         size_px[rows] = work.features[i].size_px[feature[rows]]
+    kept = np.flatnonzero(apart_tracks(image, track, uv_px, options.min_apart_px))
     cameras = [traverse.rig.eyes[eye].camera for eye in traverse.image_eye]
     extent_px = np.array([[c.width_px, c.height_px] for c in cameras])
-    spread = spread_tracks(image, track, uv_px, extent_px, options.max_ties)
-    image, feature, uv_px, size_px = image[spread], feature[spread], uv_px[spread], size_px[spread]
-    track = np.unique(track[spread], return_inverse=True)[1]
-    uv_px, refined = work.refined(image, track, uv_px)
-    as_found = np.hypot(options.sigma_px, options.sigma_per_size * size_px)
+    kept = kept[spread_tracks(image[kept], track[kept], uv_px[kept], extent_px, options.max_ties)]
+    image, feature, uv_px, size_px = image[kept], feature[kept], uv_px[kept], size_px[kept]
+    track = np.unique(track[kept], return_inverse=True)[1]
+    as_found_px = np.hypot(options.sigma_px, options.sigma_per_size * size_px)
+    refined = work.refined(image, track, uv_px, as_found_px)
     observations = Observations(
-        image=image,
-        track=track,
-        uv_px=uv_px,
-        sigma_px=np.where(refined, options.refined_sigma_px, as_found),
-        origin="images",
-    )
+        image=image, track=track, uv_px=refined.uv_px, sigma_px=as_found_px, origin="images"
+    ).with_covariance(refined.covariance_px2)
     stops: list[StopMatching] = []
     if work.stop_pairs:
         observations, stops = work.tied(observations, feature)

@@ -28,6 +28,9 @@ class FrontEndOptions:
     max_ties: int = 2_500
     """If an image shares more points with others, the points that most images see are kept, evenly over a
     grid of cells. A point is kept in all its images if one of them keeps it."""
+    min_apart_px: float = 8.0
+    """Points of an image that are nearer to each other are not both kept: their patches overlap, and so do their
+    errors."""
     min_depth_m: float = 0.5
     """Nothing nearer than this is matched."""
     min_overlap: float = 0.05
@@ -58,9 +61,6 @@ class FrontEndOptions:
     """Standard deviation of each coordinate of a feature of size 0. A solve rescales this guess."""
     sigma_per_size: float = 0.03
     """What a feature's diameter adds to its standard deviation, in quadrature, as a share of the diameter."""
-    refined_sigma_px: float = 0.12
-    """Standard deviation of positions that least-squares matching refined."""
-
     masks: Literal["automatic", "user"] = "automatic"
     """Whether sky, saturated pixels and the rover are left out too, or only what the user's masks cover."""
 

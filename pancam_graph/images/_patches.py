@@ -1,10 +1,13 @@
 """Least-squares matching of patches (Gruen 1985), after a search by correlation: the compiled loop.
 
-A patch of image a is compared with image b under an affine map from a to b, and any gain and offset. Images
-are given by their cubic spline coefficients.
+A patch of image a is compared with image b under a map from a to b, and any gain and offset. The map is affine,
+with second derivatives that are given and stay: what the perspective of two images does to a patch beyond an
+affine map moves all patches the same way, and would look like a turn of the camera. Images are given by their
+cubic spline coefficients.
 """
 
 import math
+from collections.abc import Callable
 from typing import TypeAlias
 
 import numpy as np
@@ -13,7 +16,7 @@ from numpy.typing import NDArray
 from pancam_graph.base.compiled import entry, inlined, part
 from pancam_graph.base.geometry import FloatArray, IntArray
 
-__all__ = ["HALF_WIDTH_PX", "MAX_REACH_PX", "Coefficients", "align_patches"]
+__all__ = ["HALF_WIDTH_PX", "MAX_REACH_PX", "QUALITIES", "Coefficients", "align_patches", "local_map"]
 
 Coefficients: TypeAlias = NDArray[np.float32]
 """Coefficients (height, width) of cubic splines."""
@@ -23,12 +26,32 @@ HALF_WIDTH_PX = 6
 MAX_REACH_PX = 12
 """The furthest that a search goes along u or v of image a."""
 
+QUALITIES = 7
+"""How many numbers `align_patches` says of each patch."""
+
 _WEIGHT_PX = 4.0
 _SIDE = 2 * HALF_WIDTH_PX + 1
 _CONVERGED_PX = 0.01
 _MAX_STEP_PX = 1.0
 _MAX_AFFINE_STEP = 0.1
 _SAME_PEAK_PX = 2
+
+
+def local_map(moved: Callable[[float, float], FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """First (n, 2, 2) and second derivatives (n, 2, 3: uu, uv, vv) of a map of n patches, over their width.
+
+    `moved(du, dv)` is where the map takes the pixels (n, 2) that lie by that beside the patches' middles. Second
+    derivatives are 0 where the map is not defined over the whole patch.
+    """
+    h = float(HALF_WIDTH_PX)
+    middle, near = moved(0.0, 0.0), [moved(*d) for d in ((-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0))]
+    affine = np.stack([near[1] - near[0], near[3] - near[2]], axis=-1) / 2
+    left, right, up, down = (moved(*d) for d in ((-h, 0.0), (h, 0.0), (0.0, -h), (0.0, h)))
+    corners = moved(h, h) + moved(-h, -h) - moved(h, -h) - moved(-h, h)
+    second = [left + right - 2 * middle, corners / 4, up + down - 2 * middle]
+    bend = np.stack(second, axis=-1) / h**2
+    whole = np.isfinite(bend).all(axis=(1, 2))
+    return affine, np.where(whole[:, None, None], bend, 0.0)
 
 
 @part
@@ -159,6 +182,7 @@ def align_patches(
     image_b: Coefficients,
     uv_a: FloatArray,
     affine: FloatArray,
+    bend: FloatArray,
     reach: IntArray,
     steps: int,
     uv_b: FloatArray,
@@ -167,11 +191,13 @@ def align_patches(
     """Where the patches around pixels of a lie in b, for rows `first` to `last`.
 
     `uv_a` (n, 2); `affine` (n, 2, 2) is the derivative of the pixel in b by that in a, and `uv_b` (n, 2) the
-    pixel in b, both at the start; `uv_b` is moved. `reach` (n, 2) is how many pixels of a the search by
-    correlation goes from the start to either side, along u and v. `quality` (n, 5) gets: the correlation
-    where the least-squares matching starts; that where it ends; the second best of the search; the distance
-    between start and end, in pixels of b; and the standard deviation of the end, in pixels of b times a
-    factor that is the same for all patches, from how much the patches still differ.
+    pixel in b, both at the start; `uv_b` is moved. `bend` (n, 2, 3) are the second derivatives of u and v in
+    b by uu, uv and vv in a. `reach` (n, 2) is how many pixels of a the search by
+    correlation goes from the start to either side, along u and v; it does without the bend. `quality` (n, 7)
+    gets: the correlation where the least-squares matching starts; that where it ends; the second best of the
+    search; the distance between start and end, in pixels of b; and the covariance of the end (uu, uv, vv), in
+    squared pixels of b times a factor that is the same for all patches: the squared difference that is left
+    between the patches, through the inverse of the normal matrix (Cramer and Rao).
     """
     n_taps = _SIDE * _SIDE
     offset, weight = np.empty((n_taps, 2)), np.empty(n_taps)
@@ -181,6 +207,7 @@ def align_patches(
     weight /= weight.sum()
     widest = _SIDE + 2 * MAX_REACH_PX
     template, patch, jacobian = np.empty(n_taps), np.empty(n_taps), np.empty((n_taps, 6))
+    bent = np.empty((n_taps, 2))
     around, scores = np.empty((widest, widest)), np.empty((widest, widest))
     change = np.empty(6)
     for row in range(first, last):
@@ -189,6 +216,11 @@ def align_patches(
             template[k] = _at(image_a, u + offset[k, 0], v + offset[k, 1])
         contrast = _standardise(template, weight)
         m00, m01, m10, m11 = affine[row, 0, 0], affine[row, 0, 1], affine[row, 1, 0], affine[row, 1, 1]
+        for k in range(n_taps):
+            du, dv = offset[k, 0], offset[k, 1]
+            for c in range(2):
+                second_order = bend[row, c, 0] * du * du + bend[row, c, 2] * dv * dv
+                bent[k, c] = 0.5 * second_order + bend[row, c, 1] * du * dv
         x, y = uv_b[row]
 
         rx, ry = reach[row]
@@ -218,7 +250,9 @@ def align_patches(
         for step in range(steps + 1):
             for k in range(n_taps):
                 du, dv = offset[k, 0], offset[k, 1]
-                patch[k] = _at(image_b, x + m00 * du + m01 * dv, y + m10 * du + m11 * dv)
+                patch[k] = _at(
+                    image_b, x + m00 * du + m01 * dv + bent[k, 0], y + m10 * du + m11 * dv + bent[k, 1]
+                )
             _standardise(patch, weight)
             correlation = np.sum(weight * patch * template)
             if step == 0:
@@ -241,5 +275,7 @@ def align_patches(
         uv_b[row, 0], uv_b[row, 1] = x, y
         quality[row, 0], quality[row, 1], quality[row, 2] = at_start, correlation, second
         quality[row, 3] = math.hypot(x - x_start, y - y_start)
-        # The patches' mean squared difference is 2 (1 - correlation): the variance of the noise.
-        quality[row, 4] = math.sqrt(max(1.0 - correlation, 0.0) * (inverse[0, 0] + inverse[1, 1]))
+        # The patches' mean squared difference is 2 (1 - correlation).
+        left = max(1.0 - correlation, 0.0)
+        quality[row, 4], quality[row, 5] = left * inverse[0, 0], left * inverse[0, 1]
+        quality[row, 6] = left * inverse[1, 1]

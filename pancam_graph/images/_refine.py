@@ -1,5 +1,8 @@
 """Sub-pixel positions by least-squares matching of the patches around the features of a track."""
 
+from dataclasses import dataclass
+from typing import NamedTuple
+
 import numpy as np
 
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
@@ -8,17 +11,37 @@ from pancam_graph.cameras import Camera
 from pancam_graph.data import Traverse
 from pancam_graph.images._front_end_options import FrontEndOptions
 from pancam_graph.images._pairs import FAR_M, PairGeometry
-from pancam_graph.images._patches import HALF_WIDTH_PX, align_patches
+from pancam_graph.images._patch_noise import (
+    patch_covariance_px2,
+    pulled_back,
+    shared_by_tracks,
+    unlike_covariance_px2,
+)
+from pancam_graph.images._patches import HALF_WIDTH_PX, QUALITIES, align_patches, local_map
 from pancam_graph.images._splines import Splines
 from pancam_graph.images._verify import epipolar_px
 
-__all__ = ["refine_tracks"]
+__all__ = ["RefinedTracks", "refine_tracks"]
 
 _STEPS = 6
 _GRAIN = 256
 _MAX_SHIFT_PX = 1.0
 _MIN_CORRELATION = 0.8
 _MAX_MAGNIFICATION = 2.0
+_LEAST_PARALLAX_PX = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RefinedTracks:
+    """Positions after least-squares matching, in columns sorted by track."""
+
+    uv_px: FloatArray
+    """(n, 2) pixels."""
+    refined: BoolArray
+    """(n,) which observations were fitted to the first of their track, or are a first that others fit."""
+    covariance_px2: FloatArray
+    """(n, 2, 2) noise of those refined; of others that the first of their track was compared with and looks
+    unlike; 0 where the features' own places count."""
 
 
 def refine_tracks(
@@ -27,66 +50,104 @@ def refine_tracks(
     image: IntArray,
     track: IntArray,
     uv_px: FloatArray,
+    as_found_px: FloatArray,
     options: FrontEndOptions,
-) -> tuple[FloatArray, BoolArray]:
-    """Better positions (n, 2), and which observations (n,) have one, in columns sorted by track.
+) -> RefinedTracks:
+    """Better positions and their noise, for columns (n,) sorted by track.
 
     The first observation of each track stays; the others move so that the brightness around them fits
     that around the first, under an affine map that starts from the camera models, and any gain and offset
-    (least-squares matching: Gruen 1985). A feature stays as it was found where the patches look unlike,
-    where it would move by more than a pixel, near the image's edge, and between images whose scales
-    differ by more than a factor of 2.
+    (least-squares matching: Gruen 1985). A feature stays as it was found, to `as_found_px` (n,), where the
+    patches look unlike, where it would move by more than a pixel, near the image's edge, and between images
+    whose scales differ by more than a factor of 2.
     """
     refined = np.zeros(len(image), dtype=bool)
-    refined_px = uv_px.copy()
+    refined_px, covariance, in_first = uv_px.copy(), np.zeros((len(image), 2, 2)), np.zeros((len(image), 2, 2))
+    track = np.unique(track, return_inverse=True)[1]
     first = np.searchsorted(track, track)
     other = np.flatnonzero(first != np.arange(len(track)))
     pairs = np.column_stack([image[first[other]], image[other]])
     for a, b in np.unique(pairs, axis=0):
         pair = PairGeometry(traverse, int(a), int(b), options.mount_sigma_rad)
         rows = other[(pairs[:, 0] == a) & (pairs[:, 1] == b)]
-        uv_b, good = _refine_pair(pair, spline, uv_px[first[rows]], uv_px[rows], options)
-        refined_px[rows[good]] = uv_b[good]
-        refined[rows[good]] = refined[first[rows[good]]] = True
-    return refined_px, refined
+        fit = _refine_pair(pair, spline, uv_px[first[rows]], uv_px[rows], options)
+        good, unlike = rows[fit.good], rows[fit.compared & ~fit.good]
+        refined_px[good] = fit.uv_px[fit.good]
+        refined[good] = refined[first[good]] = True
+        covariance[good] = patch_covariance_px2(fit.fit_px2[fit.good], fit.along[fit.good])
+        in_first[good] = pulled_back(covariance[good], fit.affine[fit.good])
+        covariance[unlike] = unlike_covariance_px2(as_found_px[unlike], fit.along[fit.compared & ~fit.good])
+    frame = traverse.image_frame[image]
+    covariance = shared_by_tracks(covariance, in_first, refined, track, frame)
+    return RefinedTracks(uv_px=refined_px, refined=refined, covariance_px2=covariance)
+
+
+class _PairFit(NamedTuple):
+    """Patches of one image fitted into another: n rows."""
+
+    uv_px: FloatArray
+    """(n, 2) pixels in the other image."""
+    compared: BoolArray
+    """(n,) which patches lie in both images, at scales that can be compared."""
+    good: BoolArray
+    """(n,) which of these were found."""
+    fit_px2: FloatArray
+    """(n, 3) covariance of the fit up to a factor: uu, uv, vv."""
+    along: FloatArray
+    """(n, 2) unit vectors along the epipolar lines; 0 where there is none."""
+    affine: FloatArray
+    """(n, 2, 2) derivative of the pixel by that in the first image."""
 
 
 def _refine_pair(
     pair: PairGeometry, spline: Splines, uv_a: FloatArray, uv_b: FloatArray, options: FrontEndOptions
-) -> tuple[FloatArray, BoolArray]:
-    affine = _affine(pair, uv_a, uv_b, options)
+) -> _PairFit:
+    affine, bend, along = _local_map(pair, uv_a, uv_b, options)
     magnification = np.sqrt(np.abs(np.linalg.det(affine)))
     usable = (magnification < _MAX_MAGNIFICATION) & (magnification > 1 / _MAX_MAGNIFICATION)
     usable &= _inside(uv_a, pair.camera_a) & _inside(uv_b, pair.camera_b)
     rows = np.flatnonzero(usable)
     image_a, image_b = spline(pair.a), spline(pair.b)
-    own_a, own_affine, position = uv_a[rows], affine[rows], uv_b[rows]
-    reach, fit = np.zeros((len(rows), 2), dtype=np.int64), np.empty((len(rows), 5))
+    own_a, own_affine, own_bend, position = uv_a[rows], affine[rows], bend[rows], uv_b[rows]
+    reach, fit = np.zeros((len(rows), 2), dtype=np.int64), np.empty((len(rows), QUALITIES))
     in_parallel(
         lambda first, last: align_patches(
-            first, last, image_a, image_b, own_a, own_affine, reach, _STEPS, position, fit
+            first, last, image_a, image_b, own_a, own_affine, own_bend, reach, _STEPS, position, fit
         ),
         len(rows),
         grain=_GRAIN,
     )
-    at_start, correlation, _, moved, _ = fit.T
+    at_start, correlation, _, moved = fit[:, :4].T
     good = moved < _MAX_SHIFT_PX * np.maximum(magnification[rows], 1.0)
     good &= (correlation > _MIN_CORRELATION) & (correlation >= at_start)
-    matched_px, refined = uv_b.copy(), np.zeros(len(uv_b), dtype=bool)
-    matched_px[rows], refined[rows] = position, good
-    return matched_px, refined
+    matched_px, refined, fit_px2 = uv_b.copy(), np.zeros(len(uv_b), dtype=bool), np.zeros((len(uv_b), 3))
+    matched_px[rows], refined[rows], fit_px2[rows] = position, good, fit[:, 4:]
+    return _PairFit(matched_px, usable, refined, fit_px2, along, affine)
 
 
-def _affine(pair: PairGeometry, uv_a: FloatArray, uv_b: FloatArray, options: FrontEndOptions) -> FloatArray:
-    """Derivative (n, 2, 2) of the pixel in b by that in a, on a sphere around camera a through each point."""
+def _local_map(
+    pair: PairGeometry, uv_a: FloatArray, uv_b: FloatArray, options: FrontEndOptions
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """How the pixel in b moves with that in a: first derivatives (n, 2, 2) and second ones (n, 2, 3).
+
+    On a sphere around camera a through each point. The third are unit vectors (n, 2) along which the pixel in b
+    moves with the depth, 0 where it does not.
+    """
     b_T_a = pair.b_T_a(pair.no_correction)
     _, inverse_depth = epipolar_px(pair, pair.no_correction, uv_a, uv_b, options)
     depth_m = 1 / np.maximum(inverse_depth, 1 / FAR_M)
-    pixels = []
-    for shift in ([0.0, 0.0], [1.0, 0.0], [0.0, 1.0]):
-        rays = pair.camera_a.unproject(uv_a + shift)
-        pixels.append(pair.transfer(rays.origin_m + depth_m[:, None] * rays.direction, b_T_a)[0])
-    return np.stack([pixels[1] - pixels[0], pixels[2] - pixels[0]], -1)
+
+    def moved(du: float, dv: float) -> FloatArray:
+        rays = pair.camera_a.unproject(uv_a + np.array([du, dv]))
+        return pair.transfer(rays.origin_m + depth_m[:, None] * rays.direction, b_T_a)[0]
+
+    affine, bend = local_map(moved)
+    rays = pair.camera_a.unproject(uv_a)
+    at = rays.origin_m + depth_m[:, None] * rays.direction
+    _, d_uv, _ = pair.camera_b.project_with_jacobian(b_T_a.of(at))
+    along = depth_m[:, None] * np.einsum("nij,nj->ni", d_uv, rays.direction @ b_T_a.R.T)
+    length = np.linalg.norm(along, axis=1, keepdims=True)
+    return affine, bend, np.where(length > _LEAST_PARALLAX_PX, along / np.maximum(length, 1e-300), 0.0)
 
 
 def _inside(uv_px: FloatArray, camera: Camera) -> BoolArray:

@@ -30,7 +30,7 @@ from pancam_graph.images._match_pair import PairMatches, match_pair
 from pancam_graph.images._overlap import overlap_cells, overlapping_pairs
 from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._read import Pictures, image_name, read_pictures
-from pancam_graph.images._refine import refine_tracks
+from pancam_graph.images._refine import RefinedTracks, refine_tracks
 from pancam_graph.images._rover import find_rover, rover_partners
 from pancam_graph.images._splines import Splines
 from pancam_graph.images._terrain import terrain_arrays, terrain_from
@@ -249,8 +249,10 @@ class Steps:
     def _spline(self) -> Splines:
         return Splines(self.pictures.images)
 
-    def refined(self, image: IntArray, track: IntArray, uv_px: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Positions after least-squares matching, and which observations it moved; see `refine_tracks`.
+    def refined(
+        self, image: IntArray, track: IntArray, uv_px: FloatArray, as_found_px: FloatArray
+    ) -> RefinedTracks:
+        """Positions after least-squares matching and the noise of all observations; see `refine_tracks`.
 
         One part of the work are the tracks that begin in one image. An observation keeps its position if the
         patch around it, or around the first of its track, has pixels that are left out.
@@ -261,11 +263,10 @@ class Steps:
         spline, picture_keys = self._spline, self.picture_keys
 
         def refine(rows: IntArray) -> Arrays:
-            columns = image[rows], track[rows], uv_px[rows]
+            columns = image[rows], track[rows], uv_px[rows], as_found_px[rows]
 
             def make() -> Arrays:
-                moved, good = refine_tracks(self.traverse, spline, *columns, self.options)
-                return {"uv_px": moved, "refined": good}
+                return vars(refine_tracks(self.traverse, spline, *columns, self.options))
 
             pictures = [picture_keys[i] for i in np.unique(image[rows])]
             key = step_key("refined", pictures, columns)
@@ -273,13 +274,20 @@ class Steps:
 
         parts = in_order(refine, rows_of, lambda k, _: self.tell("refinement", k + 1, len(firsts)))
         fitted_px, refined = uv_px.copy(), np.zeros(len(image), dtype=bool)
+        covariance = np.zeros((len(image), 2, 2))
         for rows, part in zip(rows_of, parts, strict=True):
             fitted_px[rows], refined[rows] = part["uv_px"], part["refined"]
+            covariance[rows] = part["covariance_px2"]
         clear = self._clear(image, track, fitted_px) & self._clear(image, track, uv_px)
         moved = refined & clear & clear[first] & (first != np.arange(len(first)))
         good = moved.copy()
         good[first[moved]] = True  # the first of a track keeps its position, to which the others are fitted
-        return np.where(moved[:, None], fitted_px, uv_px), good
+        # What was refined but is not clear counts as found, like what could not be compared.
+        as_found = (refined & ~good) | (covariance[:, 0, 0] == 0)
+        covariance[as_found] = as_found_px[as_found, None, None] ** 2 * np.eye(2)
+        return RefinedTracks(
+            uv_px=np.where(moved[:, None], fitted_px, uv_px), refined=good, covariance_px2=covariance
+        )
 
     def tied(self, observations: Observations, feature: IntArray) -> tuple[Observations, list[StopMatching]]:
         """Observations within stops, with ties between stops added, and a report of each pair of stops.
@@ -302,7 +310,8 @@ class Steps:
             self.tell("terrain of the stops", 1, 1)
             return {**terrain_arrays(solution), "unit": np.array(unit)}
 
-        columns = observations.image, observations.track, observations.uv_px, observations.sigma_px, feature
+        noise = observations.covariance_px2
+        columns = observations.image, observations.track, observations.uv_px, noise, feature
         inputs = self.picture_keys, self.mask_keys, self.traverse.stops, columns
         key = step_key("terrain", *inputs)
         placed = self.cache.recall("terrain", key, place)
@@ -332,7 +341,8 @@ class Steps:
         directed = [d for a, b in self.stop_pairs for d in ((a, b), (b, a))]
         stop_ties = in_order(tie, directed, tell)
         ties = Ties.concatenate([each.ties for each in stop_ties])
-        return joined(observations, terrain, ties, unit * ties.sigma_px), [each.report for each in stop_ties]
+        ties = ties.scaled(np.full(len(ties), unit))
+        return joined(observations, terrain, ties), [each.report for each in stop_ties]
 
     def _clear(self, image: IntArray, track: IntArray, uv_px: FloatArray) -> BoolArray:
         """Which observations (n,) have no left-out pixel in the patch around them."""

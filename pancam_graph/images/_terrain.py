@@ -11,6 +11,7 @@ import scipy
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, pose_arrays
 from pancam_graph.cameras import Camera
 from pancam_graph.data import Observations, Solution, Traverse
+from pancam_graph.images._patches import HALF_WIDTH_PX, local_map
 
 __all__ = ["Sighting", "StopTerrain", "terrain_arrays", "terrain_from"]
 
@@ -21,6 +22,7 @@ _FITS = 3
 _CAUCHY_SIGMAS = 2.0
 _GRAZING = 0.03
 _SLOPE_SHARE = 0.5
+_MOST_CHANGE = 0.5  # of the inverse depth within a patch
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -167,16 +169,26 @@ class StopTerrain:
             valid=valid,
         )
 
-    def affine(self, rows: IntArray, image: int, world_T_mast: gtsam.Pose3) -> FloatArray:
-        """Derivative (n, 2, 2) of the pixel in `image` by the pixel of one other image, on the surface."""
+    def local_map(
+        self, rows: IntArray, image: int, world_T_mast: gtsam.Pose3
+    ) -> tuple[FloatArray, FloatArray]:
+        """How the pixel in `image` moves with that of one other image, on the surface; see `local_map`.
+
+        Second derivatives are 0 where the surface is so steep to the line of sight that its plane nearly reaches
+        the horizon within a patch.
+        """
         camera = self.camera(image)
         mast_R, mast_t = (x[image] for x in self._mast_T_cameras)
         R_m, t_m = world_T_mast.rotation().matrix(), world_T_mast.translation()
-        pixels = []
-        for shift in ((-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0)):
-            in_mast = (self.points_m(rows, shift) - t_m) @ R_m
-            pixels.append(camera.project((in_mast - mast_t) @ mast_R)[0])
-        return np.stack([pixels[1] - pixels[0], pixels[3] - pixels[2]], -1) / 2
+
+        def moved(du: float, dv: float) -> FloatArray:
+            in_mast = (self.points_m(rows, (du, dv)) - t_m) @ R_m
+            return camera.project((in_mast - mast_t) @ mast_R)[0]
+
+        affine, bend = local_map(moved)
+        change = HALF_WIDTH_PX * np.abs(self.slope[rows]).sum(axis=1)
+        flat = change < _MOST_CHANGE * np.maximum(self.inverse_depth[rows], _NEAREST_INVERSE_M)
+        return affine, np.where(flat[:, None, None], bend, 0.0)
 
     @cached_property
     def _mast_T_cameras(self) -> tuple[FloatArray, FloatArray]:
@@ -253,7 +265,7 @@ def terrain_from(
 def _sigma_inverse_m(
     solution: Solution, tracks: IntArray, to_point: FloatArray, image: IntArray
 ) -> FloatArray:
-    """Standard deviations (n,) of inverse depths, by the longest baseline across the line of sight.
+    """Standard deviations (n,) of inverse depths, by the observation whose baseline says most of them.
 
     Infinite without a baseline.
     """
@@ -264,12 +276,12 @@ def _sigma_inverse_m(
     direction = to_point / np.linalg.norm(to_point, axis=1, keepdims=True)
     centre = solution.final.world_t_camera
     across = np.cross(centre[obs.image[rows]] - centre[image[k]], direction[k])
-    baseline = np.zeros(len(tracks))
-    np.maximum.at(baseline, k, np.linalg.norm(across, axis=1))
-    focal = t.calibration[image, 0, 0]
-    noise = np.sqrt(2) * float(np.median(solution.sigma_px))
+    # Across its epipolar line an observation says nothing of the depth, and along it is the less sure one.
+    noise = np.sqrt(2) * solution.sigma_px[rows] / t.calibration[image[k], 0, 0]
+    best = np.zeros(len(tracks))
+    np.maximum.at(best, k, np.linalg.norm(across, axis=1) / noise)
     with np.errstate(divide="ignore"):
-        return np.asarray(noise / (focal * baseline))
+        return np.asarray(1 / best)
 
 
 def _forward(camera: Camera) -> FloatArray:

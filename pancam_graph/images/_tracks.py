@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 
-__all__ = ["Links", "join_tracks", "spread_tracks"]
+__all__ = ["Links", "apart_tracks", "join_tracks", "spread_tracks"]
 
 _CELLS = 16
 
@@ -73,6 +74,30 @@ def join_tracks(links: Links) -> tuple[IntArray, IntArray, IntArray]:
     rows = np.array([i for m in tracks for i in m], dtype=np.int64)
     number = np.repeat(np.arange(len(tracks), dtype=np.int64), [len(m) for m in tracks])
     return nodes[rows, 0], nodes[rows, 1], number
+
+
+def apart_tracks(image: IntArray, track: IntArray, uv_px: FloatArray, least_px: float) -> BoolArray:
+    """Which observations (n,) to keep, so that no image has two that are nearer to each other than `least_px`.
+
+    Columns as `join_tracks` returns them, with pixels (n, 2). Of tracks that come near each other in any image
+    the one with more observations stays, whole, then the one with the lower number.
+    """
+    near: list[IntArray] = [np.empty((0, 2), dtype=np.int64)]
+    for i in np.unique(image).tolist():
+        rows = np.flatnonzero(image == i)
+        close = scipy.spatial.cKDTree(uv_px[rows]).query_pairs(least_px, output_type="ndarray")
+        near.append(track[rows[close]].reshape(-1, 2))
+    length = np.bincount(track)
+    rank = np.empty(len(length), dtype=np.int64)
+    rank[np.lexsort((np.arange(len(length)), -length))] = np.arange(len(length))
+    pairs = np.concatenate(near)
+    better = np.where((rank[pairs[:, 0]] < rank[pairs[:, 1]])[:, None], pairs, pairs[:, ::-1])
+    stays = [True] * len(length)
+    # In the order of the better ones, each is decided before it decides about others.
+    for keep, gone in better[np.argsort(rank[better[:, 0]], kind="stable")].tolist():
+        if stays[keep]:
+            stays[gone] = False
+    return np.asarray(np.array(stays, dtype=bool)[track])
 
 
 def spread_tracks(
