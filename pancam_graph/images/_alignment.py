@@ -199,7 +199,9 @@ def _whitened(
 ) -> tuple[FloatArray, FloatArray, Sighting]:
     """Residuals (n, 2) in pixels, and the matrices (n, 2, 2) that take them to unit covariance."""
     seen = terrain.sighting(ties.row, ties.image, world_T_mast)
-    covariance = ties.covariance_px2 + seen.covariance_px2(np.zeros((6, 6)), terrain.sigma_inverse_m[ties.row])
+    covariance = ties.covariance_px2 + seen.covariance_px2(
+        np.zeros((6, 6)), terrain.sigma_inverse_m[ties.row]
+    )
     return ties.uv_px - seen.uv_px, np.linalg.inv(np.linalg.cholesky(covariance)), seen
 
 

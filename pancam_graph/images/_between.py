@@ -21,15 +21,10 @@ from pancam_graph.images._alignment import (
 )
 from pancam_graph.images._features import Features
 from pancam_graph.images._front_end_options import FrontEndOptions
+from pancam_graph.images._local_map import HALF_WIDTH_PX
 from pancam_graph.images._masks import pixels_at
 from pancam_graph.images._patch_noise import patch_covariance_px2
-from pancam_graph.images._patches import (
-    HALF_WIDTH_PX,
-    MAX_REACH_PX,
-    QUALITIES,
-    Coefficients,
-    align_patches,
-)
+from pancam_graph.images._patches import MAX_REACH_PX, QUALITIES, Coefficients, align_patches
 from pancam_graph.images._splines import Splines
 from pancam_graph.images._terrain import Sighting, StopTerrain
 
@@ -50,6 +45,7 @@ _FIT_SCALE = 4.0
 _FITS = 4
 _MAX_RETURN_PX = 0.3
 _LEAST_NOISE_PX = 0.05
+_COMMON = 2.5
 _GROUP, _MOST_GROUPS = 100, 6
 _COUNTS = ("a", "b", "sought", "unlike", "ambiguous", "unstable", "masked", "off_pose", "kept", "refusal")
 
@@ -148,6 +144,7 @@ class StopMatcher:
             kept=len(ties),
             noise_px=float(np.sqrt(np.mean(ties.sigma_px**2))) if len(ties) else 0.0,
         )
+        ties = _with_common_errors(ties)
         # Ties of one point in several images err alike, by the point's own patch: they count as one.
         _, of, times = np.unique(ties.row, return_inverse=True, return_counts=True)
         return StopTies(ties=ties.scaled(np.sqrt(times[of])), report=report)
@@ -223,6 +220,17 @@ def _measured(
     return ties.select(distance < options.epipolar_scales)
 
 
+def _with_common_errors(ties: Ties) -> Ties:
+    """The ties with what their scatter does not show: errors that all of two stops have in common.
+
+    From nearer, an image sees more of what lies behind each bump: patches sit off their points along the
+    lines of sight, all to one side. About a fortieth of the variance along the epipolar line is common to all
+    ties of two stops; no sigma of single ties says that, but with this factor the stops' sigmas hold.
+    """
+    spread = _LEAST_NOISE_PX**2 * np.eye(2)
+    return replace(ties, covariance_px2=_COMMON * ties.covariance_px2 + spread)
+
+
 def _found(
     terrain: StopTerrain,
     spline: Splines,
@@ -284,7 +292,7 @@ def _found(
         row=rows[k[good]],
         image=np.full(count[2], image, dtype=np.int64),
         uv_px=uv[good],
-        covariance_px2=patch_covariance_px2(fit[good, 4:], _lines(seen.select(k[good]))),
+        covariance_px2=patch_covariance_px2(fit[good, 4:], _lines(seen.select(k[good])), one_pointing=False),
     )
     return sought, ties
 

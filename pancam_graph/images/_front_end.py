@@ -94,10 +94,10 @@ def find_observations(
     image, feature, uv_px, size_px = image[kept], feature[kept], uv_px[kept], size_px[kept]
     track = np.unique(track[kept], return_inverse=True)[1]
     as_found_px = np.hypot(options.sigma_px, options.sigma_per_size * size_px)
-    refined = work.refined(image, track, uv_px, as_found_px)
+    uv_px, covariance = work.refined(image, track, uv_px, as_found_px)
     observations = Observations(
-        image=image, track=track, uv_px=refined.uv_px, sigma_px=as_found_px, origin="images"
-    ).with_covariance(refined.covariance_px2)
+        image=image, track=track, uv_px=uv_px, sigma_px=as_found_px, origin="images"
+    ).with_covariance(covariance)
     stops: list[StopMatching] = []
     if work.stop_pairs:
         observations, stops = work.tied(observations, feature)

@@ -29,8 +29,8 @@ class FrontEndOptions:
     """If an image shares more points with others, the points that most images see are kept, evenly over a
     grid of cells. A point is kept in all its images if one of them keeps it."""
     min_apart_px: float = 8.0
-    """Points of an image that are nearer to each other are not both kept: their patches overlap, and so do their
-    errors."""
+    """Of points of an image that are nearer to each other one is kept: their patches overlap, and so their
+    errors are alike."""
     min_depth_m: float = 0.5
     """Nothing nearer than this is matched."""
     min_overlap: float = 0.05

@@ -1,13 +1,12 @@
 """Least-squares matching of patches (Gruen 1985), after a search by correlation: the compiled loop.
 
-A patch of image a is compared with image b under a map from a to b, and any gain and offset. The map is affine,
-with second derivatives that are given and stay: what the perspective of two images does to a patch beyond an
-affine map moves all patches the same way, and would look like a turn of the camera. Images are given by their
-cubic spline coefficients.
+A patch of image a is compared with image b under a map from a to b, and any gain and offset. The map is
+affine, with second derivatives that are given and stay: what perspective does to a patch beyond an affine map
+moves all patches the same way, and would look like a turn of the camera. Images are given by their cubic
+spline coefficients.
 """
 
 import math
-from collections.abc import Callable
 from typing import TypeAlias
 
 import numpy as np
@@ -15,14 +14,13 @@ from numpy.typing import NDArray
 
 from pancam_graph.base.compiled import entry, inlined, part
 from pancam_graph.base.geometry import FloatArray, IntArray
+from pancam_graph.images._local_map import HALF_WIDTH_PX
 
-__all__ = ["HALF_WIDTH_PX", "MAX_REACH_PX", "QUALITIES", "Coefficients", "align_patches", "local_map"]
+__all__ = ["MAX_REACH_PX", "QUALITIES", "Coefficients", "align_patches"]
 
 Coefficients: TypeAlias = NDArray[np.float32]
 """Coefficients (height, width) of cubic splines."""
 
-HALF_WIDTH_PX = 6
-"""Half width of a patch in image a: it has 2 HALF_WIDTH_PX + 1 pixels to a side."""
 MAX_REACH_PX = 12
 """The furthest that a search goes along u or v of image a."""
 
@@ -35,23 +33,6 @@ _CONVERGED_PX = 0.01
 _MAX_STEP_PX = 1.0
 _MAX_AFFINE_STEP = 0.1
 _SAME_PEAK_PX = 2
-
-
-def local_map(moved: Callable[[float, float], FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """First (n, 2, 2) and second derivatives (n, 2, 3: uu, uv, vv) of a map of n patches, over their width.
-
-    `moved(du, dv)` is where the map takes the pixels (n, 2) that lie by that beside the patches' middles. Second
-    derivatives are 0 where the map is not defined over the whole patch.
-    """
-    h = float(HALF_WIDTH_PX)
-    middle, near = moved(0.0, 0.0), [moved(*d) for d in ((-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0))]
-    affine = np.stack([near[1] - near[0], near[3] - near[2]], axis=-1) / 2
-    left, right, up, down = (moved(*d) for d in ((-h, 0.0), (h, 0.0), (0.0, -h), (0.0, h)))
-    corners = moved(h, h) + moved(-h, -h) - moved(h, -h) - moved(-h, h)
-    second = [left + right - 2 * middle, corners / 4, up + down - 2 * middle]
-    bend = np.stack(second, axis=-1) / h**2
-    whole = np.isfinite(bend).all(axis=(1, 2))
-    return affine, np.where(whole[:, None, None], bend, 0.0)
 
 
 @part

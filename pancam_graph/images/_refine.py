@@ -10,14 +10,14 @@ from pancam_graph.base.threads import in_parallel
 from pancam_graph.cameras import Camera
 from pancam_graph.data import Traverse
 from pancam_graph.images._front_end_options import FrontEndOptions
+from pancam_graph.images._local_map import HALF_WIDTH_PX, local_map
 from pancam_graph.images._pairs import FAR_M, PairGeometry
 from pancam_graph.images._patch_noise import (
     patch_covariance_px2,
     pulled_back,
-    shared_by_tracks,
     unlike_covariance_px2,
 )
-from pancam_graph.images._patches import HALF_WIDTH_PX, QUALITIES, align_patches, local_map
+from pancam_graph.images._patches import QUALITIES, align_patches
 from pancam_graph.images._splines import Splines
 from pancam_graph.images._verify import epipolar_px
 
@@ -37,11 +37,14 @@ class RefinedTracks:
 
     uv_px: FloatArray
     """(n, 2) pixels."""
-    refined: BoolArray
-    """(n,) which observations were fitted to the first of their track, or are a first that others fit."""
+    moved: BoolArray
+    """(n,) which observations were fitted to the first of their track."""
+    unlike: BoolArray
+    """(n,) which were compared with the first of their track and look unlike."""
     covariance_px2: FloatArray
-    """(n, 2, 2) noise of those refined; of others that the first of their track was compared with and looks
-    unlike; 0 where the features' own places count."""
+    """(n, 2, 2) of these two: the noise against the first of the track; 0 of others."""
+    in_first_px2: FloatArray
+    """(n, 2, 2) the same of those moved, in the pixels of the first image."""
 
 
 def refine_tracks(
@@ -61,9 +64,13 @@ def refine_tracks(
     patches look unlike, where it would move by more than a pixel, near the image's edge, and between images
     whose scales differ by more than a factor of 2.
     """
-    refined = np.zeros(len(image), dtype=bool)
-    refined_px, covariance, in_first = uv_px.copy(), np.zeros((len(image), 2, 2)), np.zeros((len(image), 2, 2))
-    track = np.unique(track, return_inverse=True)[1]
+    out = RefinedTracks(
+        uv_px=uv_px.copy(),
+        moved=np.zeros(len(image), dtype=bool),
+        unlike=np.zeros(len(image), dtype=bool),
+        covariance_px2=np.zeros((len(image), 2, 2)),
+        in_first_px2=np.zeros((len(image), 2, 2)),
+    )
     first = np.searchsorted(track, track)
     other = np.flatnonzero(first != np.arange(len(track)))
     pairs = np.column_stack([image[first[other]], image[other]])
@@ -71,15 +78,16 @@ def refine_tracks(
         pair = PairGeometry(traverse, int(a), int(b), options.mount_sigma_rad)
         rows = other[(pairs[:, 0] == a) & (pairs[:, 1] == b)]
         fit = _refine_pair(pair, spline, uv_px[first[rows]], uv_px[rows], options)
-        good, unlike = rows[fit.good], rows[fit.compared & ~fit.good]
-        refined_px[good] = fit.uv_px[fit.good]
-        refined[good] = refined[first[good]] = True
-        covariance[good] = patch_covariance_px2(fit.fit_px2[fit.good], fit.along[fit.good])
-        in_first[good] = pulled_back(covariance[good], fit.affine[fit.good])
-        covariance[unlike] = unlike_covariance_px2(as_found_px[unlike], fit.along[fit.compared & ~fit.good])
-    frame = traverse.image_frame[image]
-    covariance = shared_by_tracks(covariance, in_first, refined, track, frame)
-    return RefinedTracks(uv_px=refined_px, refined=refined, covariance_px2=covariance)
+        missed = fit.compared & ~fit.good
+        good, unlike = rows[fit.good], rows[missed]
+        out.uv_px[good], out.moved[good], out.unlike[unlike] = fit.uv_px[fit.good], True, True
+        covariance = patch_covariance_px2(
+            fit.fit_px2[fit.good], fit.along[fit.good], one_pointing=pair.same_frame
+        )
+        out.covariance_px2[good] = covariance
+        out.in_first_px2[good] = pulled_back(covariance, fit.affine[fit.good])
+        out.covariance_px2[unlike] = unlike_covariance_px2(as_found_px[unlike], fit.along[missed])
+    return out
 
 
 class _PairFit(NamedTuple):
@@ -130,8 +138,8 @@ def _local_map(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """How the pixel in b moves with that in a: first derivatives (n, 2, 2) and second ones (n, 2, 3).
 
-    On a sphere around camera a through each point. The third are unit vectors (n, 2) along which the pixel in b
-    moves with the depth, 0 where it does not.
+    On a sphere around camera a through each point. The third are unit vectors (n, 2) along which the pixel in
+    b moves with the depth, 0 where it does not.
     """
     b_T_a = pair.b_T_a(pair.no_correction)
     _, inverse_depth = epipolar_px(pair, pair.no_correction, uv_a, uv_b, options)

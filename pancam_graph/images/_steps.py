@@ -29,6 +29,7 @@ from pancam_graph.images._masks import ImageMask, Reason, elevation_rad, mask_im
 from pancam_graph.images._match_pair import PairMatches, match_pair
 from pancam_graph.images._overlap import overlap_cells, overlapping_pairs
 from pancam_graph.images._pairs import PairGeometry
+from pancam_graph.images._patch_noise import shared_by_tracks
 from pancam_graph.images._read import Pictures, image_name, read_pictures
 from pancam_graph.images._refine import RefinedTracks, refine_tracks
 from pancam_graph.images._rover import find_rover, rover_partners
@@ -251,11 +252,12 @@ class Steps:
 
     def refined(
         self, image: IntArray, track: IntArray, uv_px: FloatArray, as_found_px: FloatArray
-    ) -> RefinedTracks:
-        """Positions after least-squares matching and the noise of all observations; see `refine_tracks`.
+    ) -> tuple[FloatArray, FloatArray]:
+        """Positions (n, 2) after least-squares matching, and covariances (n, 2, 2); see `refine_tracks`.
 
-        One part of the work are the tracks that begin in one image. An observation keeps its position if the
-        patch around it, or around the first of its track, has pixels that are left out.
+        One part of the work are the tracks that begin in one image. An observation keeps its position, to
+        `as_found_px` (n,), if the patch around it, or around the first of its track, has pixels that are left
+        out.
         """
         first = np.searchsorted(track, track)
         firsts = np.unique(image[first])
@@ -273,21 +275,16 @@ class Steps:
             return self.cache.recall("refined", key, make)
 
         parts = in_order(refine, rows_of, lambda k, _: self.tell("refinement", k + 1, len(firsts)))
-        fitted_px, refined = uv_px.copy(), np.zeros(len(image), dtype=bool)
-        covariance = np.zeros((len(image), 2, 2))
-        for rows, part in zip(rows_of, parts, strict=True):
-            fitted_px[rows], refined[rows] = part["uv_px"], part["refined"]
-            covariance[rows] = part["covariance_px2"]
-        clear = self._clear(image, track, fitted_px) & self._clear(image, track, uv_px)
-        moved = refined & clear & clear[first] & (first != np.arange(len(first)))
-        good = moved.copy()
-        good[first[moved]] = True  # the first of a track keeps its position, to which the others are fitted
-        # What was refined but is not clear counts as found, like what could not be compared.
-        as_found = (refined & ~good) | (covariance[:, 0, 0] == 0)
-        covariance[as_found] = as_found_px[as_found, None, None] ** 2 * np.eye(2)
-        return RefinedTracks(
-            uv_px=np.where(moved[:, None], fitted_px, uv_px), refined=good, covariance_px2=covariance
-        )
+        order = np.argsort(np.concatenate(rows_of))
+        fitted = RefinedTracks(**{n: np.concatenate([p[n] for p in parts])[order] for n in parts[0]})
+        clear = self._clear(image, track, fitted.uv_px) & self._clear(image, track, uv_px)
+        clear &= clear[first]
+        moved, unlike = fitted.moved & clear, fitted.unlike & clear
+        as_found = as_found_px[:, None, None] ** 2 * np.eye(2)
+        covariance = np.where((moved | unlike)[:, None, None], fitted.covariance_px2, as_found)
+        frame = self.traverse.image_frame[image]
+        covariance = shared_by_tracks(covariance, fitted.in_first_px2, moved, track, frame)
+        return np.where(moved[:, None], fitted.uv_px, uv_px), covariance
 
     def tied(self, observations: Observations, feature: IntArray) -> tuple[Observations, list[StopMatching]]:
         """Observations within stops, with ties between stops added, and a report of each pair of stops.

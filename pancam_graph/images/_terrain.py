@@ -11,7 +11,7 @@ import scipy
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, pose_arrays
 from pancam_graph.cameras import Camera
 from pancam_graph.data import Observations, Solution, Traverse
-from pancam_graph.images._patches import HALF_WIDTH_PX, local_map
+from pancam_graph.images._local_map import HALF_WIDTH_PX, local_map
 
 __all__ = ["Sighting", "StopTerrain", "terrain_arrays", "terrain_from"]
 
@@ -174,7 +174,7 @@ class StopTerrain:
     ) -> tuple[FloatArray, FloatArray]:
         """How the pixel in `image` moves with that of one other image, on the surface; see `local_map`.
 
-        Second derivatives are 0 where the surface is so steep to the line of sight that its plane nearly reaches
+        Second derivatives are 0 where the line of sight grazes the surface, so that its plane nearly reaches
         the horizon within a patch.
         """
         camera = self.camera(image)

@@ -77,10 +77,10 @@ def join_tracks(links: Links) -> tuple[IntArray, IntArray, IntArray]:
 
 
 def apart_tracks(image: IntArray, track: IntArray, uv_px: FloatArray, least_px: float) -> BoolArray:
-    """Which observations (n,) to keep, so that no image has two that are nearer to each other than `least_px`.
+    """Which observations (n,) to keep, so that no image has two that are nearer to each other than that.
 
-    Columns as `join_tracks` returns them, with pixels (n, 2). Of tracks that come near each other in any image
-    the one with more observations stays, whole, then the one with the lower number.
+    Columns as `join_tracks` returns them, with pixels (n, 2). Of tracks that come near each other in any
+    image the one with more observations stays, whole, then the one with the lower number.
     """
     near: list[IntArray] = [np.empty((0, 2), dtype=np.int64)]
     for i in np.unique(image).tolist():

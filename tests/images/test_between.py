@@ -31,8 +31,9 @@ from pancam_graph.data import StopMatching
 from pancam_graph.images import FrontEndOptions, _refine, _steps
 from pancam_graph.images._alignment import Ties, fit_pose, telemetry_alignment
 from pancam_graph.images._between import StopMatcher, StopTies
+from pancam_graph.images._local_map import local_map
 from pancam_graph.images._pairs import PairGeometry
-from pancam_graph.images._patches import align_patches
+from pancam_graph.images._patches import QUALITIES, align_patches
 from pancam_graph.images._splines import Splines
 from pancam_graph.images._terrain import StopTerrain, terrain_arrays, terrain_from
 from pancam_graph.rigs import Eye, Rig, rig_template
@@ -61,17 +62,43 @@ def test_patches_are_found_from_afar_and_through_an_unknown_affine_map() -> None
     uv_a = rng.uniform(70, 150, (300, 2))
     truth = (uv_a - middle) @ affine.T + middle + shift
     start = truth + rng.uniform(-4, 4, truth.shape)
-    found, fit = start.copy(), np.empty((300, 5))
+    found, fit = start.copy(), np.empty((300, QUALITIES))
     unknown = np.tile(np.eye(2), (300, 1, 1))
     reach = np.full((300, 2), 6, dtype=np.int64)
     pictures = coefficients(image_a), coefficients(image_b)
-    align_patches(0, 300, *pictures, uv_a, unknown, reach, 10, found, fit)
+    align_patches(0, 300, *pictures, uv_a, unknown, np.zeros((300, 2, 3)), reach, 10, found, fit)
     error = np.linalg.norm(found - truth, axis=1)
     assert np.quantile(error, 0.99) < 0.03
     assert fit[:, 1].min() > 0.99
     assert np.all(fit[:, 1] >= fit[:, 0])
     # Of a patch that has a likeness nowhere else, the second best is far behind.
     assert np.median(fit[:, 2]) < 0.8
+
+
+def test_a_bend_that_is_known_moves_no_patch() -> None:
+    """Images that differ by a quadratic map: patches that know it are placed right, others to one side."""
+    rng = np.random.default_rng(1)
+    image_b = 100 * ndimage.gaussian_filter(rng.standard_normal((220, 240)), 1.5)
+    middle, curve = np.array([120.0, 110.0]), 2e-3
+
+    def to_b(uv: FloatArray) -> FloatArray:
+        return uv + 0.5 * curve * np.column_stack([(uv[:, 0] - middle[0]) ** 2, np.zeros(len(uv))])
+
+    v, u = np.mgrid[:220, :240]
+    source = to_b(np.stack([u, v], -1).reshape(-1, 2).astype(float))
+    image_a = ndimage.map_coordinates(image_b, source.T[::-1], order=3, mode="mirror").reshape(220, 240)
+    uv_a = rng.uniform(80, 150, (400, 2))
+    affine, bend = local_map(lambda du, dv: to_b(uv_a + np.array([du, dv])))
+    assert np.allclose(bend, [[curve, 0, 0], [0, 0, 0]], atol=1e-9)
+    off = {}
+    for name, known in (("known", bend), ("unknown", np.zeros_like(bend))):
+        found, fit = to_b(uv_a), np.empty((400, QUALITIES))
+        pictures = coefficients(image_a), coefficients(image_b)
+        reach = np.zeros((400, 2), dtype=np.int64)
+        align_patches(0, 400, *pictures, uv_a, affine, known, reach, 10, found, fit)
+        off[name] = float(np.median((found - to_b(uv_a))[:, 0]))
+    assert abs(off["known"]) < 1e-3
+    assert off["unknown"] > 0.008
 
 
 # --- terrain and alignment, from simulated points ---
@@ -102,7 +129,12 @@ def seen_rows(terrain: StopTerrain, mast: gtsam.Pose3) -> Ties:
             on = seen.valid & terrain.camera(j).contains(seen.uv_px)
             count = int(on.sum())
             parts.append(
-                Ties(row=rows[on], image=np.full(count, j), uv_px=seen.uv_px[on], sigma_px=np.ones(count))
+                Ties(
+                    row=rows[on],
+                    image=np.full(count, j),
+                    uv_px=seen.uv_px[on],
+                    covariance_px2=np.tile(np.eye(2), (count, 1, 1)),
+                )
             )
     return Ties.concatenate(parts)
 
@@ -200,10 +232,10 @@ def small_run(small: tuple[Rendering, Traverse]) -> tuple[Traverse, Fitted, int]
 
     def recorded(
         pair: PairGeometry, spline: Splines, uv_a: FloatArray, uv_b: FloatArray, options: FrontEndOptions
-    ) -> tuple[FloatArray, np.ndarray]:
-        found, good = original(pair, spline, uv_a, uv_b, options)
-        fitted.append((pair, uv_a[good], uv_b[good], found[good]))
-        return found, good
+    ) -> _refine._PairFit:
+        found = original(pair, spline, uv_a, uv_b, options)
+        fitted.append((pair, uv_a[found.good], uv_b[found.good], found.uv_px[found.good]))
+        return found
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_refine, "_refine_pair", recorded)
@@ -234,6 +266,38 @@ def errors_px(rendering: Rendering, traverse: Traverse) -> tuple[FloatArray, np.
         )
     error[~hit[first] | (first == np.arange(len(obs)))] = np.nan
     return error, first
+
+
+def test_the_noise_that_patches_predict_is_that_of_their_errors(
+    small: tuple[Rendering, Traverse], small_found: Traverse
+) -> None:
+    """In stereo, along the epipolar line (a row here) and across it: robust sigmas, by stated noise."""
+    obs, truth = small_found.observations, small[0].truth
+    assert obs is not None
+    assert obs.covariance_px2 is not None
+    first = np.searchsorted(obs.track, obs.track)
+    stereo = small_found.image_frame[obs.image] == small_found.image_frame[obs.image[first]]
+    k = np.flatnonzero(stereo & (first != np.arange(len(obs))) & (obs.sigma_px < QUICK.sigma_px))
+    R, centre = small_found.camera_poses(truth.world_T_mast, truth.pan_tilt_rad)
+    error = np.full((len(obs), 2), np.nan)
+    for i in np.unique(obs.image[first[k]]).tolist():
+        rows = k[obs.image[first[k]] == i]
+        points, hit = small[0].points(i, obs.uv_px[first[rows]])
+        for j in np.unique(obs.image[rows]).tolist():
+            on = (obs.image[rows] == j) & hit
+            camera = small_found.rig.eyes[small_found.image_eye[j]].camera
+            seen, _ = camera.project((points[on] - centre[j]) @ R[j])
+            error[rows[on]] = obs.uv_px[rows[on]] - seen
+    k = k[np.isfinite(error[k]).all(axis=1)]
+    # The first of a track has a share of its own.
+    sigma = np.sqrt(np.diagonal(obs.covariance_px2[k] + obs.covariance_px2[first[k]], axis1=1, axis2=2))
+    ratio = np.abs(error[k]) / sigma
+    by_noise = np.argsort(sigma[:, 0])
+    for part in np.array_split(by_noise, 3):
+        along, across = np.median(ratio[part], axis=0) / 0.6745
+        assert 0.5 < along < 1.5
+        assert 0.5 < across < 1.5
+    assert np.quantile(sigma[:, 0], 0.9) > 2 * np.quantile(sigma[:, 0], 0.1)
 
 
 def linking(traverse: Traverse, first: np.ndarray) -> np.ndarray:
@@ -282,7 +346,7 @@ def test_the_same_on_any_number_of_threads_and_from_the_cache(
         again = find_observations(small[1], QUICK, cache=tmp_path)
         assert again.observations is not None
         assert again.warnings == small_found.warnings
-        for name in ("image", "track", "uv_px", "sigma_px"):
+        for name in ("image", "track", "uv_px", "covariance_px2"):
             assert getattr(again.observations, name).tobytes() == getattr(before, name).tobytes()
         for name in ("find_features", "match_pair", "refine_tracks", "terrain_arrays"):
             monkeypatch.setattr(_steps, name, not_again)
@@ -316,7 +380,7 @@ def test_ties_that_were_found_before_an_interrupt_are_kept(
     assert again.matching == small_found.matching
     assert again.observations is not None
     assert small_found.observations is not None
-    for name in ("image", "track", "uv_px", "sigma_px"):
+    for name in ("image", "track", "uv_px", "covariance_px2"):
         assert (
             getattr(again.observations, name).tobytes() == getattr(small_found.observations, name).tobytes()
         )

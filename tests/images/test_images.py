@@ -14,7 +14,8 @@ from pancam_graph.base.geometry import rz
 from pancam_graph.images import FrontEndOptions, find_observations, usable_mask
 from pancam_graph.images._features import find_features
 from pancam_graph.images._pairs import PairGeometry
-from pancam_graph.images._tracks import Links, join_tracks, spread_tracks
+from pancam_graph.images._patch_noise import patch_covariance_px2, shared_by_tracks
+from pancam_graph.images._tracks import Links, apart_tracks, join_tracks, spread_tracks
 from pancam_graph.images._verify import epipolar_px
 from pancam_graph.io import read_pds
 from support.image_scenes import (
@@ -279,9 +280,44 @@ def test_opportunity(opportunity_folder: Path) -> None:
     pairs = {tuple(obs.image[obs.track == t].tolist()) for t in np.unique(obs.track)}
     assert pairs == {(0, 1), (2, 3), (3, 4)}
     assert len(np.unique(obs.track)) > 3000
-    assert np.mean(obs.sigma_px == FrontEndOptions().refined_sigma_px) > 0.85
+    assert np.mean(obs.sigma_px < FrontEndOptions().sigma_px) > 0.85
     again = found_in(find_observations(disturbed(traverse, 0.5, seed=0)))
     assert len(again) == pytest.approx(len(obs), rel=0.02)
+
+
+def test_of_tracks_that_come_near_each_other_the_longest_stays() -> None:
+    image = np.array([0, 1, 0, 1, 2, 0, 1, 1, 2])
+    track = np.array([0, 0, 1, 1, 1, 2, 2, 3, 3])
+    uv = np.array([[10, 10], [50, 10], [14, 10], [80, 80], [5, 5], [10, 60], [56, 10], [83, 80], [90, 90]])
+    # 0 is near 1 in image 0 and near 2 in image 1; 3 is near 1 in image 1.
+    kept = apart_tracks(image, track, uv.astype(float), 8.0)
+    assert np.unique(track[kept]).tolist() == [1, 2]
+    assert kept.tolist() == np.isin(track, [1, 2]).tolist()
+    assert apart_tracks(image, track, uv.astype(float), 2.0).all()
+
+
+def test_noise_along_and_across_the_line_of_a_patch() -> None:
+    fit = np.array([[0.04, 0.01, 0.02]])
+    along = np.array([[0.6, 0.8]])
+    across = np.array([[-0.8, 0.6]])
+    none = np.zeros((1, 2))
+    plain, lined = (patch_covariance_px2(fit, a, one_pointing=True)[0] for a in (none, along))
+    assert along[0] @ (lined - 2 * plain) @ along[0] == pytest.approx(0, abs=1e-4)
+    assert across[0] @ (lined - plain) @ across[0] == pytest.approx(0, abs=1e-12)
+
+
+def test_noise_against_the_first_is_shared_out() -> None:
+    """Track 0: two images of one frame and two of another; track 1: one that was not fitted."""
+    track, frame = np.array([0, 0, 0, 0, 1, 1]), np.array([0, 0, 1, 1, 0, 1])
+    moved = np.array([False, True, True, True, False, False])
+    own = np.array([1.0, 2.0, 3.0, 4.0, 9.0, 9.0])[:, None, None] * np.eye(2)
+    out = shared_by_tracks(own, own, moved, track, frame)[:, 0, 0]
+    # The first of the track and its stereo partner have together the noise of the one against the other.
+    assert out[0] == pytest.approx(0.3 * np.mean([2, 3, 4]))
+    assert out[1] == pytest.approx(0.7 * 2)
+    # Two images that err alike, with a correlation of 0.6, tell as much as 1 / 0.8 of one.
+    assert out[2:4].tolist() == pytest.approx([0.7 * 3 * 1.6, 0.7 * 4 * 1.6])
+    assert out[4:].tolist() == [9.0, 9.0]
 
 
 def test_tracks_are_thinned_evenly_and_stay_whole() -> None:

@@ -173,4 +173,5 @@ def errors_px(truth: Traverse, scene: Scene, obs: Observations) -> FloatArray:
 
 
 def as_bytes(obs: Observations) -> bytes:
-    return b"".join(c.tobytes() for c in (obs.image, obs.track, obs.uv_px, obs.sigma_px))
+    assert obs.covariance_px2 is not None
+    return b"".join(c.tobytes() for c in (obs.image, obs.track, obs.uv_px, obs.covariance_px2))
