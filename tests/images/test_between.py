@@ -89,7 +89,7 @@ def test_a_bend_that_is_known_moves_no_patch() -> None:
     image_a = ndimage.map_coordinates(image_b, source.T[::-1], order=3, mode="mirror").reshape(220, 240)
     uv_a = rng.uniform(80, 150, (400, 2))
     affine, bend = local_map(lambda du, dv: to_b(uv_a + np.array([du, dv])))
-    assert np.allclose(bend, [[curve, 0, 0], [0, 0, 0]], atol=1e-9)
+    assert np.allclose(bend, np.array([[curve, 0.0, 0.0], [0.0, 0.0, 0.0]]), atol=1e-9)
     off = {}
     for name, known in (("known", bend), ("unknown", np.zeros_like(bend))):
         found, fit = to_b(uv_a), np.empty((400, QUALITIES))
