@@ -186,7 +186,7 @@ class _Place:
 def _same(a: Any, b: Any) -> bool:
     if isinstance(a, gtsam.Pose3):
         return bool(a.equals(b, 0.0))
-    return bool(np.array_equal(a, b))
+    return bool(a.tobytes() == b.tobytes() if isinstance(a, np.ndarray) else a == b)
 
 
 def _difference(a: Any, b: Any) -> FloatArray:

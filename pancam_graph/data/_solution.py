@@ -48,6 +48,16 @@ class RigCorrection:
             radius_m=np.zeros(n),
         )
 
+    def part(self, stops: slice, frames: IntArray, images: IntArray) -> "RigCorrection":
+        """The corrections at some stops, and of these frames and images (n,)."""
+        return RigCorrection(
+            calibration_px=self.calibration_px[images],
+            mount=self.mount[images],
+            pan_T_tilt=self.pan_T_tilt[stops],
+            radius_m=self.radius_m[images],
+            flex=None if self.flex is None else self.flex[frames],
+        )
+
     def calibration(self, traverse: Traverse) -> FloatArray:
         """K (images, 3, 3) of each image's camera, upper-triangular, without distortion."""
         out: FloatArray = traverse.calibration.copy()
@@ -96,6 +106,17 @@ class State:
     """(landmarks, 3) terrain points; a row of NaN where there is no usable point."""
     rig: RigCorrection | None = None
     """Corrections of the rig; None if the rig is the traverse's."""
+
+    def part(self, stops: slice, frames: IntArray, images: IntArray) -> "State":
+        """The state of some stops, and of these frames and images (n,); without landmarks."""
+        return State(
+            world_T_mast=self.world_T_mast[stops],
+            pan_tilt_rad=self.pan_tilt_rad[frames],
+            world_R_camera=self.world_R_camera[images],
+            world_t_camera=self.world_t_camera[images],
+            landmarks_m=np.zeros((0, 3)),
+            rig=None if self.rig is None else self.rig.part(stops, frames, images),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

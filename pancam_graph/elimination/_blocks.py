@@ -95,14 +95,15 @@ class Layout:
 
 def blocks_of(linkage: Linkage, m: Measurements) -> tuple[IntArray, dict[int, tuple[int, ...]]]:
     """Block of each landmark, named by the first group that sees it, and the groups each block touches."""
-    groups = [linkage.unit_groups[u] for u in linkage.image_unit]
+    groups = linkage.unit_groups
     # Landmarks of constant cameras form a block that depends on no group.
     nobody = linkage.n_groups
-    image_first = np.array([g[0] if g else nobody for g in groups])
-    first = np.minimum.reduceat(image_first[m.image], m.starts)
+    unit_first = np.array([g[0] if g else nobody for g in groups])
+    unit = linkage.image_unit[m.image]
+    first = np.minimum.reduceat(unit_first[unit], m.starts)
     seen = np.zeros((nobody + 1, len(groups)), dtype=bool)
-    seen[first[m.landmark], m.image] = True
+    seen[first[m.landmark], unit] = True
     return first, {
-        int(b): tuple(sorted(set().union(*(groups[i] for i in np.flatnonzero(seen[b])))))
+        int(b): tuple(sorted(set().union(*{groups[u] for u in np.flatnonzero(seen[b])})))
         for b in np.flatnonzero(seen.any(axis=1))
     }

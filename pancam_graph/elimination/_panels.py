@@ -282,6 +282,28 @@ class Root:
             )
         return x
 
+    def forward(self, right: FloatArray) -> FloatArray:
+        """The Y (columns, n) with R'Y = right (columns, n), by forward substitution; group by group.
+
+        Y'Y is right' S^-1 right. Raises FreeDirectionError where R leaves a direction free.
+        """
+        st = self.structure
+        begin = np.concatenate([[0], np.cumsum(st.dim)])
+        y = np.array(right, dtype=float)
+        for g in st.order:
+            n, rows = int(st.dim[g]), self.rows[g]
+            if len(rows) < n:
+                raise FreeDirectionError(g, _loosest(rows[:, :n]))
+            of_group = slice(begin[g], begin[g + 1])
+            touched = y[of_group].any(axis=0)
+            if touched.any():
+                some = slice(None) if touched.all() else np.flatnonzero(touched)
+                solved = np.linalg.solve(rows[:, :n].T, y[of_group][:, some])
+                y[of_group, some] = solved
+                for h, a, b in zip(st.after[g][1:], st.begin[g][1:-1], st.begin[g][2:], strict=True):
+                    y[begin[h] : begin[h + 1], some] -= rows[:, a:b].T @ solved
+        return y
+
     def inverse_columns(self, g: int, columns: slice) -> FloatArray:
         """Columns (all columns, n) of the inverse of R'R that belong to some columns of group g.
 
@@ -292,21 +314,26 @@ class Root:
         begin = np.concatenate([[0], np.cumsum(st.dim)])
         x = np.zeros((int(begin[-1]), columns.stop - columns.start))
         x[begin[g] + columns.start : begin[g] + columns.stop] = np.eye(x.shape[1])
-        for h in st.order:
-            n, rows = int(st.dim[h]), self.rows[h]
-            if len(rows) < n:
-                raise FreeDirectionError(h, _loosest(rows[:, :n]))
-            of_group = slice(begin[h], begin[h + 1])
-            if x[of_group].any():
-                x[of_group] = np.linalg.solve(rows[:, :n].T, x[of_group])
-                for k, a, b in zip(st.after[h][1:], st.begin[h][1:-1], st.begin[h][2:], strict=True):
-                    x[begin[k] : begin[k + 1]] -= rows[:, a:b].T @ x[of_group]
+        x = self.forward(x)
         for h in reversed(st.order):
             n, rows = int(st.dim[h]), self.rows[h]
             of_group = slice(begin[h], begin[h + 1])
             rest = np.concatenate([x[:0], *(x[begin[k] : begin[k + 1]] for k in st.after[h][1:])])
             x[of_group] = np.linalg.solve(rows[:, :n], x[of_group] - rows[:, n:-1] @ rest)
         return x
+
+    def marginal(self, g: int) -> tuple[FloatArray, FloatArray]:
+        """Covariance (n, n) of group g in the inverse of R'R, and its part (n,) of `step`.
+
+        Cheaper than `covariance` the later the group was eliminated. Raises FreeDirectionError where R leaves
+        a direction free.
+        """
+        st = self.structure
+        begin = np.concatenate([[0], np.cumsum(st.dim)])
+        unit = np.zeros((int(begin[-1]), int(st.dim[g])))
+        unit[begin[g] : begin[g + 1]] = np.eye(unit.shape[1])
+        half = self.forward(unit)
+        return half.T @ half, -half.T @ np.concatenate([rows[:, -1] for rows in self.rows])
 
     def covariance(self) -> "Covariance":
         """The blocks of the inverse of R'R where R is filled (Takahashi's recursion).

@@ -35,6 +35,11 @@ class Kind(Enum):
     """Calibration as GTSAM's projection factors want it (Cal3_S2)."""
 
 
+_KINDS = {ord(kind.value): kind for kind in Kind}
+_LETTER = 56
+"""Bits of a key below its letter, as gtsam::Symbol has them."""
+
+
 def key_of(kind: Kind, index: int) -> int:
     """Key of a variable, by its kind and its number among those of its kind."""
     return int(gtsam.symbol(kind.value, index))
@@ -42,7 +47,10 @@ def key_of(kind: Kind, index: int) -> int:
 
 def kind_of(key: int) -> Kind:
     """Kind of the variable that a key made here names. Raises ValueError for any other key."""
-    return Kind(chr(gtsam.symbolChr(key)))
+    kind = _KINDS.get(key >> _LETTER)
+    if kind is None:
+        raise ValueError(f"key {key}: expected one of a variable made here")
+    return kind
 
 
 def index_of(key: int) -> int:
@@ -53,7 +61,7 @@ def index_of(key: int) -> int:
 def read_variable(values: gtsam.Values, key: int) -> Any:
     """Value of a variable: gtsam.Pose3, vector or number; of a Cal3_S2 its five numbers (5,)."""
     kind = kind_of(key)
-    if kind in {Kind.MAST, Kind.CAMERA}:
+    if kind is Kind.MAST or kind is Kind.CAMERA:
         return values.atPose3(key)
     if kind is Kind.LANDMARK:
         return values.atPoint3(key)

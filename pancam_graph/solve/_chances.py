@@ -2,6 +2,9 @@
 
 import numpy as np
 import scipy
+from numpy.typing import ArrayLike
+
+from pancam_graph.base.geometry import FloatArray
 
 __all__ = ["CHANCE", "rms_limit", "two_sided_limit"]
 
@@ -14,6 +17,7 @@ def two_sided_limit(n: int, chance: float) -> float:
     return float(scipy.special.ndtri(1 - chance / (2 * max(n, 1))))
 
 
-def rms_limit(freedom: float, chance: float) -> float:
-    """RMS that the root of chi-square over its degrees of freedom exceeds with this chance."""
-    return float(np.sqrt(scipy.special.chdtri(max(freedom, 1e-3), chance) / max(freedom, 1e-3)))
+def rms_limit(freedom: ArrayLike, chance: float) -> FloatArray:
+    """RMS that the root of chi-square over its degrees of freedom (n,) exceeds with this chance (n,)."""
+    n = np.maximum(freedom, 1e-3)
+    return np.asarray(np.sqrt(scipy.special.chdtri(n, chance) / n), dtype=float)

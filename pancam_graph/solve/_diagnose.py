@@ -5,8 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 import scipy
 
-from pancam_graph.base.geometry import BoolArray, IntArray
+from pancam_graph.base.geometry import IntArray
 from pancam_graph.data import Traverse
+from pancam_graph.landmarks import kernel
 
 __all__ = ["components", "connection_warnings", "listed", "shared_landmarks"]
 
@@ -19,11 +20,10 @@ def components(n_members: int, member: IntArray, landmark: IntArray) -> tuple[in
     `member` and `landmark` (n,) are the rows of each observation. Returns the number of groups, and the group
     of each member (members,).
     """
-    n_landmarks = int(landmark.max()) + 1 if len(landmark) else 0
-    n = n_members + n_landmarks
-    links = scipy.sparse.coo_array((np.ones(len(member)), (member, n_members + landmark)), shape=(n, n))
-    _, label = scipy.sparse.csgraph.connected_components(links, directed=False)
-    names, group = np.unique(label[:n_members], return_inverse=True)
+    leader = np.arange(n_members)
+    first = np.full(int(landmark.max()) + 1 if len(landmark) else 0, -1)
+    kernel.connect(member, landmark, first, leader)
+    names, group = np.unique(leader, return_inverse=True)
     return len(names), group
 
 
@@ -39,12 +39,12 @@ def shared_landmarks(
     return scipy.sparse.csr_array(sees @ sees.T)
 
 
-def connection_warnings(traverse: Traverse, used: BoolArray) -> list[str]:
-    """Warnings of images without observations, separate groups of frames, and stops that nothing connects."""
-    obs = traverse.observations
-    assert obs is not None
+def connection_warnings(traverse: Traverse, image: IntArray, landmark: IntArray) -> list[str]:
+    """Warnings of images without observations, separate groups of frames, and stops that nothing connects.
+
+    `image` and `landmark` (n,) are the rows of each observation in use.
+    """
     warnings: list[str] = []
-    image, track = obs.image[used], np.unique(obs.track[used], return_inverse=True)[1]
     count = np.bincount(image, minlength=len(traverse.images))
     empty = [traverse.images[i].id for i in np.flatnonzero(count == 0)]
     if empty:
@@ -55,8 +55,8 @@ def connection_warnings(traverse: Traverse, used: BoolArray) -> list[str]:
 
     # The rig connects the eyes of a frame, so groups consist of frames.
     frame_of = traverse.image_frame
-    n, group = components(len(traverse.frames), frame_of[image], track)
-    seen = np.bincount(frame_of[image], minlength=len(traverse.frames)) > 0
+    n, group = components(len(traverse.frames), frame_of[image], landmark)
+    seen = np.bincount(frame_of, count, minlength=len(traverse.frames)) > 0
     groups = [np.flatnonzero((group == g) & seen) for g in range(n)]
     groups = sorted((g for g in groups if len(g)), key=lambda g: int(g[0]))
     if len(groups) > 1:
@@ -70,8 +70,8 @@ def connection_warnings(traverse: Traverse, used: BoolArray) -> list[str]:
             "between them only telemetry joins the panorama"
         )
     if len(traverse.stops) > 1:
-        stop_of = traverse.image_stop
-        _, stop_group = components(len(traverse.stops), stop_of[image], track)
+        # Frames of a group are connected, and a stop connects its own.
+        _, stop_group = components(len(traverse.stops), traverse.frame_stop[seen], group[seen])
         size = np.bincount(stop_group)
         alone = [traverse.stops[s].id for s in np.flatnonzero(size[stop_group] == 1)]
         if alone:

@@ -42,7 +42,7 @@ class EliminatedSolver(Solver):
         problem, outcome = self._fit(problem, rule, SQUARED, "solve", LEFT_SIGMAS)
         if self._last is None or not self._last.system.any_behind:
             return problem, outcome
-        _, in_front = problem.residuals()
+        _, in_front = problem.residuals
         problem, again = self._fit(
             replace(problem, accepted=problem.accepted & in_front), rule, SQUARED, "solve", LEFT_SIGMAS
         )

@@ -100,7 +100,7 @@ class ExplicitSolver(Solver):
         if not self._is_near:
             rule_afar = StopRule(max_iterations=20, relative_decrease=1e-4)
             problem, costs = self._approach(problem, rule_afar, SQUARED, "approach")
-            _, in_front = problem.residuals()
+            _, in_front = problem.residuals
             problem = replace(problem, accepted=problem.accepted & in_front)
             self._is_near = True
         for _ in range(_ROUNDS):
@@ -137,7 +137,7 @@ class ExplicitSolver(Solver):
         )
         points = np.where(present[:, None], explicit.points_m(outcome.values, present), points)
         adjusted = problem.at(explicit.only_cameras(outcome.values), problem.landmarks.moved_to(points))
-        if explicit.calibrations.any and not adjusted.residuals()[1][problem.kept].all():
+        if explicit.calibrations.any and not adjusted.residuals[1][problem.kept].all():
             raise SolveError(
                 "explicit landmarks: expected all in front of their cameras, found some behind, which "
                 "GTSAM's factor of a free calibration does not count; eliminated landmarks bear it"

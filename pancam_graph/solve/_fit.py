@@ -172,7 +172,7 @@ def refitted(fitted: Fitted, landmarks: BoolArray) -> tuple[Problem, Outcome]:
 def noise_factor(problem: Problem) -> float:
     """By how much residuals exceed the noise assumed: the square root of the variance factor."""
     rows = problem.kept
-    residual, _ = problem.residuals()
+    residual, _ = problem.residuals
     # Priors add as many equations as they have unknowns, but for what observations say on top of them.
     freedom = 2 * int(rows.sum()) - 3 * int(problem.present.sum())
     if freedom < 1:

@@ -50,8 +50,8 @@ def judge(fitted: Fitted) -> Judged:
     prepared, problem = fitted.screened.prepared, fitted.problem
     state = state_of(problem)
     covariances, regular, reduced, warnings = _uncertainty(fitted, state)
-    used = np.zeros(len(prepared.observations), dtype=bool)
-    used[problem.measurements.row[problem.kept]] = True
+    m, used = problem.measurements, np.zeros(len(prepared.observations), dtype=bool)
+    used[m.row[problem.kept]] = True
     first = _first(fitted)
     stated = covariances
     if prepared.options.rig == "considered" and reduced is not None:
@@ -82,7 +82,7 @@ def judge(fitted: Fitted) -> Judged:
             *(f"{sentence(part)}: let go" for part in let_go),
             *warnings,
             *_fit_warnings(fitted, used),
-            *connection_warnings(prepared.traverse, used),
+            *connection_warnings(prepared.traverse, m.image[problem.kept], m.landmark[problem.kept]),
         ),
     )
 
@@ -193,7 +193,7 @@ def _diverging(problem: Problem) -> BoolArray:
         weight = problem.accepted.astype(float)
         bound = replace(
             problem, landmarks=refine(problem.landmarks, m, problem.views, weight, only=rows)
-        ).residuals()[0]
-        excess = weight * np.sum(bound**2 - problem.residuals()[0] ** 2, axis=1)
+        ).residuals[0]
+        excess = weight * np.sum(bound**2 - problem.residuals[0] ** 2, axis=1)
         beyond &= np.bincount(m.landmark, excess, minlength=m.n_landmarks) > 9.0
     return beyond

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pancam_graph.base.geometry import FloatArray, IntArray
+from pancam_graph.landmarks import SQUARED
 from pancam_graph.solve._problem import Problem
 
 __all__ = ["Residuals"]
@@ -14,29 +15,34 @@ __all__ = ["Residuals"]
 class Residuals:
     """Sums of squared whitened residuals of the observations in use, and what noise alone would give."""
 
-    image: IntArray
-    """(n,) row of the image of each observation."""
+    n_observations: int
+    """Number of residuals."""
+    n_not_finite: int
+    """Number of residuals that are no numbers."""
     square: FloatArray
-    """(n,) squared length of each residual."""
+    """(images,) sum of squared lengths of the residuals of each image"""
     expected: FloatArray
-    """(n,) its expectation: 2 less an even share of the three numbers of its landmark."""
+    """(images,) its expectation: of each, 2 less an even share of the three numbers of its landmark"""
 
     @staticmethod
     def of(problem: Problem) -> "Residuals":
         """Residuals of a problem at its values."""
-        m, rows = problem.measurements, np.flatnonzero(problem.kept)
-        whitened, _ = problem.residuals()
-        views = np.bincount(m.landmark[rows], minlength=m.n_landmarks)
-        return Residuals(
-            image=m.image[rows],
-            square=np.sum(whitened[rows] ** 2, axis=1),
-            expected=2 - 3 / views[m.landmark[rows]],
+        m, n_images = problem.measurements, len(problem.template.traverse.images)
+        rows = np.flatnonzero(problem.kept)
+        image, landmark = m.image[rows], m.landmark[rows]
+        square = SQUARED.cost(problem.residuals[0])[rows] * 2
+        views = np.bincount(landmark, minlength=m.n_landmarks)
+        expected = (2 - 3 / views.clip(1))[landmark]
+        of_image, of_noise = (
+            np.asarray(np.bincount(image, each, minlength=n_images), dtype=float)
+            for each in (square, expected)
         )
-
-    @property
-    def n_not_finite(self) -> int:
-        """Number of residuals that are no numbers."""
-        return int(np.count_nonzero(~np.isfinite(self.square)))
+        return Residuals(
+            n_observations=len(rows),
+            n_not_finite=int(np.count_nonzero(~np.isfinite(square))),
+            square=of_image,
+            expected=of_noise,
+        )
 
     @property
     def ratio(self) -> float:
@@ -48,7 +54,6 @@ class Residuals:
 
         An owner without observations has the ratio 0.
         """
-        of = owner[self.image]
-        square = np.bincount(of, self.square, minlength=n)
-        freedom = np.asarray(np.bincount(of, self.expected, minlength=n), dtype=float)
+        square = np.bincount(owner, self.square, minlength=n)
+        freedom = np.asarray(np.bincount(owner, self.expected, minlength=n), dtype=float)
         return np.sqrt(square / freedom.clip(1e-300)), freedom

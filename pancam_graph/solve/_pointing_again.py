@@ -18,7 +18,7 @@ from pancam_graph.landmarks import Measurements, rays_of
 from pancam_graph.solve._chances import CHANCE, two_sided_limit
 from pancam_graph.solve._problem import Problem
 from pancam_graph.solve._rejection import Snooping, snoop
-from pancam_graph.solve._share_tests import in_use_by, links_of
+from pancam_graph.solve._share_tests import InUse
 
 __all__ = ["pointing_again"]
 
@@ -68,12 +68,12 @@ def _suspects(problem: Problem) -> IntArray:
     t = problem.template.traverse
     if len(t.frames) < 2:
         return np.zeros(0, dtype=np.int64)
-    owner, kept = links_of(problem, t.image_frame)
-    if len(owner) == 0 or kept.all():
+    links = InUse.links(problem, t.image_frame, len(t.frames))
+    n, used = links.n, links.used
+    if np.array_equal(n, used):
         return np.zeros(0, dtype=np.int64)
-    n, used, usual, chance = in_use_by(owner, kept, len(t.frames))
     is_free = np.array([(f.sigmas_rad > 0).all() for f in t.frames], dtype=bool)
-    lost = is_free & (n >= _LEAST) & (used < _LOST * usual * n) & (chance < _BY_CHANCE)
+    lost = is_free & (n >= _LEAST) & (used < _LOST * links.usual * n) & (links.chance < _BY_CHANCE)
     rows = np.flatnonzero(lost)
     return np.asarray(rows[np.argsort(used[rows] / n[rows], kind="stable")])
 

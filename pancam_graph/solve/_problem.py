@@ -43,13 +43,13 @@ class Problem:
         """Cameras at the values."""
         return self.template.views(self.values)
 
-    @property
+    @cached_property
     def present(self) -> BoolArray:
         """(landmarks,) whether two or more observations are accepted."""
         m = self.measurements
         return np.asarray(np.bincount(m.landmark, self.accepted, minlength=m.n_landmarks) >= 2)
 
-    @property
+    @cached_property
     def kept(self) -> BoolArray:
         """(n,) whether a measurement takes part."""
         return np.asarray(self.accepted & self.present[self.measurements.landmark])
@@ -65,9 +65,10 @@ class Problem:
 
     def cost(self, loss: Loss = SQUARED) -> float:
         """True cost: half the sum of squares of `factors`, and the loss of observations that take part."""
-        residual, _ = self.residuals()
+        residual, _ = self.residuals
         return float(self.factors.error(self.values) + loss.cost(residual)[self.kept].sum())
 
+    @cached_property
     def residuals(self) -> tuple[FloatArray, BoolArray]:
         """Whitened residuals (n, 2), and whether the landmark is in front of its camera (n,)."""
         return residuals(self.landmarks, self.measurements, self.views)
@@ -106,9 +107,10 @@ def reach_m(problem: Problem, of: BoolArray | None = None) -> FloatArray:
     landmark = m.landmark[rows]
     if len(landmark) == 0:
         return np.zeros(0)
-    arm = np.linalg.norm(views.world_t_camera[m.image[rows]] - problem.landmarks.origin_m[landmark], axis=1)
-    starts = np.flatnonzero(np.diff(landmark, prepend=-1))
-    baseline = (2 * np.maximum.reduceat(arm, starts)).clip(_LEAST_BASELINE_M)
+    arm = views.world_t_camera[m.image[rows]] - problem.landmarks.origin_m[landmark]
+    starts = m.starts if of is None else np.flatnonzero(np.diff(landmark, prepend=-1))
+    longest = np.sqrt(np.maximum.reduceat(np.einsum("ij,ij->i", arm, arm), starts))
+    baseline = (2 * longest).clip(_LEAST_BASELINE_M)
     return np.asarray(baseline * _resolution(problem))
 
 

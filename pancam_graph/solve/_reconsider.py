@@ -96,15 +96,14 @@ def _fitted_again(fitted: Fitted, let_go: LetGo) -> Fitted:
 
 def _largest(suspected: Suspected) -> Sequence[Correction]:
     """The error that the corrections speak for most strongly, and others that explain them as well."""
-    every = [*suspected.angles, *suspected.stops]
-    worst = max(every, key=lambda c: c.sigmas)
+    every = suspected.angles + suspected.stops
+    worst = every.largest
     response = _response(worst, suspected.telemetry, suspected.root)
     out = [worst]
-    for c in every:
-        if c is worst or c.sigmas**2 < worst.sigmas**2 - _AS_LIKELY:
-            continue
+    for i in np.flatnonzero(every.sigmas**2 >= worst.sigmas**2 - _AS_LIKELY):
+        c = every[int(i)]
         common = sum(float(a @ response[stop]) for stop, a in c.along.items())
-        if abs(common) >= _ALIKE * np.sqrt(c.shown * worst.shown):
+        if i != np.argmax(every.sigmas) and abs(common) >= _ALIKE * np.sqrt(c.shown * worst.shown):
             out.append(c)
     return out
 

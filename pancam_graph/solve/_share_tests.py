@@ -6,12 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.data import VerdictTest
+from pancam_graph.landmarks import kernel
 from pancam_graph.solve._chances import CHANCE
 from pancam_graph.solve._problem import Problem
 
-__all__ = ["in_use_by", "let_go_links", "links_of", "shares_in_use"]
+__all__ = ["InUse", "let_go_links", "shares_in_use"]
 
 _LEFT_OUT = 0.9
 """Largest share of the observations that may be left out as outliers."""
@@ -28,31 +29,81 @@ _LINKS = 4
 """... nor are frames and stops that share fewer points with others."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class InUse:
+    """How much of what each image, frame or stop (the *owners*) has is in use."""
+
+    n: IntArray
+    """(owners,) how many things each has"""
+    used: IntArray
+    """(owners,) how many of them are in use"""
+
+    @staticmethod
+    def observations(problem: Problem) -> "InUse":
+        """Observations of each image."""
+        image, n = problem.measurements.image, len(problem.template.traverse.images)
+        used = np.bincount(image[problem.kept], minlength=n)
+        return InUse(n=np.bincount(image, minlength=n), used=used)
+
+    @staticmethod
+    def links(problem: Problem, owner: IntArray, n_owners: int) -> "InUse":
+        """Landmarks that each owner shares with another; in use are those that still join it to another.
+
+        `owner` (images,) is the frame or the stop of each image.
+        """
+        m = problem.measurements
+        n, used = np.zeros(n_owners, dtype=np.int64), np.zeros(n_owners, dtype=np.int64)
+        kernel.count_links(m.begin, owner[m.image], problem.kept, n, used)
+        return InUse(n=n, used=used)
+
+    def by(self, owner: IntArray, n_owners: int) -> "InUse":
+        """The same of owners of these owners: `owner` (owners,) is that of each."""
+        n, used = (np.bincount(owner, of, minlength=n_owners) for of in (self.n, self.used))
+        return InUse(n=n.astype(np.int64), used=used.astype(np.int64))
+
+    @property
+    def usual(self) -> float:
+        """Share in use of all things; 1 where there are none."""
+        n = int(self.n.sum())
+        return float(self.used.sum() / n) if n else 1.0
+
+    @property
+    def chance(self) -> FloatArray:
+        """(owners,) Chance of no more in use, if an owner's things were as good as all others.
+
+        A few are out of use by chance too, where few are owned.
+        """
+        return np.asarray(scipy.special.bdtr(self.used.astype(float), self.n, self.usual), dtype=float)
+
+
 def shares_in_use(problem: Problem) -> Iterator[VerdictTest]:
     """Tests of how much is in use of what was measured, and of what joins frames and stops."""
     t = problem.template.traverse
-    image, kept = problem.measurements.image, problem.kept
-    share = float(np.mean(kept)) if len(kept) else 0.0
+    images = InUse.observations(problem)
+    n = int(images.n.sum())
+    share = images.usual if n else 0.0
     yield VerdictTest.of(
         "observations",
         1 - share,
         _LEFT_OUT,
-        f"{share:.0%} of {len(kept)} observations are in use",
-        f"only {share:.0%} of {len(kept)} observations are in use, too few to tell right ones from wrong "
+        f"{share:.0%} of {n} observations are in use",
+        f"only {share:.0%} of {n} observations are in use, too few to tell right ones from wrong "
         "ones; check matches and rig",
     )
-    images = ("image", np.arange(len(t.images)), [i.id for i in t.images])
-    frames = ("frame", t.image_frame, [f.id for f in t.frames])
-    stops = ("stop", t.image_stop, [s.id for s in t.stops])
-    for name, owner, ids in (images, frames, stops):
+    owners = (
+        ("image", np.arange(len(t.images)), [i.id for i in t.images]),
+        ("frame", t.image_frame, [f.id for f in t.frames]),
+        ("stop", t.image_stop, [s.id for s in t.stops]),
+    )
+    for name, owner, ids in owners:
         test = _Fairness(
             name=f"{name} share", owner=name, what="observations", least=_OBSERVATIONS, fair=_FAIR, ids=ids
         )
-        yield test.of(owner[image], kept)
-    for name, owner, ids in (frames, stops):
+        yield test.of(images.by(owner, len(ids)))
+    for name, owner, ids in owners[1:]:
         what = f"points shared with another {name}"
         test = _Fairness(name=f"{name} links", owner=name, what=what, least=_LINKS, fair=_FAIR_LINKS, ids=ids)
-        yield test.of(*links_of(problem, owner))
+        yield test.of(InUse.links(problem, owner, len(ids)))
 
 
 def let_go_links(problem: Problem) -> Iterator[VerdictTest]:
@@ -71,37 +122,7 @@ def let_go_links(problem: Problem) -> Iterator[VerdictTest]:
         fair=_FAIR_LET_GO,
         ids=[f.id for f in t.frames],
     )
-    yield test.of(*links_of(problem, t.image_frame), among=frames)
-
-
-def links_of(problem: Problem, owner: IntArray) -> tuple[IntArray, BoolArray]:
-    """Each owner of each landmark that two owners or more see (n,), and whether it still joins them (n,).
-
-    `owner` (images,) is the frame or the stop of each image.
-    """
-    m = problem.measurements
-    n_owners = int(owner.max()) + 1
-    pair, of = np.unique(m.landmark * n_owners + owner[m.image], return_inverse=True)
-    landmark, seen_by = pair // n_owners, pair % n_owners
-    in_use = np.bincount(of, problem.kept, minlength=len(pair)) > 0
-    joins = np.bincount(landmark, minlength=m.n_landmarks) >= 2
-    joined = np.bincount(landmark, in_use, minlength=m.n_landmarks) >= 2
-    rows = joins[landmark]
-    return seen_by[rows], (in_use & joined[landmark])[rows]
-
-
-def in_use_by(
-    owner: IntArray, kept: BoolArray, n_owners: int
-) -> tuple[IntArray, FloatArray, float, FloatArray]:
-    """How many each owner has (owners,), how many of them are in use (owners,), and the share of all.
-
-    The last value (owners,) is the chance of no more, if its own were as good as all others: few are in use
-    by chance too, where few are owned. `owner` (n,) is of each thing, and `kept` (n,) whether it is in use.
-    """
-    usual = float(np.mean(kept)) if len(kept) else 1.0
-    n = np.bincount(owner, minlength=n_owners)
-    used = np.asarray(np.bincount(owner, kept, minlength=n_owners), dtype=float)
-    return n, used, usual, np.asarray(scipy.special.bdtr(used, n, usual), dtype=float)
+    yield test.of(InUse.links(problem, t.image_frame, len(t.frames)), among=frames)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,17 +140,14 @@ class _Fairness:
     """Part of the usual share in use that each must have."""
     ids: Sequence[str]
 
-    def of(self, owner: IntArray, kept: BoolArray, among: IntArray | None = None) -> VerdictTest:
-        """The test, given the owner of each thing (n,) and whether it is in use (n,).
-
-        Only owners `among` some are tested; default: all.
-        """
+    def of(self, things: InUse, among: IntArray | None = None) -> VerdictTest:
+        """The test of what owners have; only of owners `among` some, default: all."""
         is_tested = np.ones(len(self.ids), dtype=bool)
         if among is not None:
             is_tested = np.isin(np.arange(len(self.ids)), among)
-        n, used, usual, chance = in_use_by(owner, kept, len(self.ids))
+        n, used, usual = things.n, things.used, things.usual
         share, limit = used / n.clip(1), 1 - self.fair * usual
-        is_sure = chance < CHANCE / len(self.ids)
+        is_sure = things.chance < CHANCE / len(self.ids)
         suspect = is_tested & (n >= self.least) & is_sure & (share < self.fair * usual)
         tested = np.flatnonzero(suspect if suspect.any() else is_tested & (n >= self.least))
         if not len(tested):

@@ -61,7 +61,7 @@ def _reasons(fitted: Fitted) -> tuple[str, ...]:
 def _raw_residuals(problem: Problem, present: BoolArray, n: int, noise: PixelNoise) -> FloatArray:
     """Projected minus measured (n, 2) in raw pixels; NaN where there is no landmark in front."""
     m = problem.measurements
-    whitened, in_front = problem.residuals()
+    whitened, in_front = problem.residuals
     residual_px = np.full((n, 2), np.nan)
     known = present[m.landmark] & in_front
     residual_px[m.row[known]] = noise.select(m.row[known]).to_pixels(whitened[known])

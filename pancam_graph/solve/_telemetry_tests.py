@@ -6,17 +6,16 @@ that of the solution. A suspected error along a (one entry, or one offset of man
 error itself is estimated as a'z / a'Ka.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import TypedDict
+from typing import Protocol, overload
 
 import gtsam
 import numpy as np
 import scipy
 
 from pancam_graph.base.geometry import FloatArray, IntArray, pose_arrays
-from pancam_graph.elimination import Covariance, JointCovariance, Root
+from pancam_graph.elimination import Covariance, Root
 from pancam_graph.graph import FactorTemplate, Kind, index_of, kind_of
 from pancam_graph.solve._covariance import Uncertainty
 from pancam_graph.solve._problem import Problem
@@ -24,10 +23,11 @@ from pancam_graph.solve._problem import Problem
 __all__ = [
     "MAST_ENTRIES",
     "Correction",
+    "Errors",
     "StopTelemetry",
     "Suspected",
-    "corrections",
-    "leg_corrections",
+    "entry_errors",
+    "leg_errors",
     "telemetry_of",
     "total",
 ]
@@ -70,7 +70,6 @@ class StopTelemetry:
             return np.asarray(self.correction / self.sigma)
         return np.asarray(self.whitening @ self.correction)
 
-    @cached_property
     def spread(self) -> FloatArray:
         """(n, n) covariance of `whitened` if all errors are as stated."""
         w, eye = self.whitening, np.eye(len(self.sigma))
@@ -78,15 +77,13 @@ class StopTelemetry:
             return np.asarray(eye - self.posterior / np.outer(self.sigma, self.sigma))
         return np.asarray(eye - w @ self.posterior @ w.T)
 
-    @cached_property
     def pull(self) -> FloatArray:
         """(n,) z = S^-1 e."""
         return self.back(self.whitened)
 
-    @cached_property
     def shown(self) -> FloatArray:
         """(n, n) K = S^-1 - S^-1 C S^-1, the covariance of `pull`."""
-        return self.back(self.back(self.spread).T)
+        return self.back(self.back(self.spread()).T)
 
     def back(self, m: FloatArray) -> FloatArray:
         """W' m, of W that whitens."""
@@ -95,9 +92,9 @@ class StopTelemetry:
         return np.asarray(self.whitening.T @ m)
 
     def told(self, along: FloatArray) -> FloatArray:
-        """S^-1 a of an error along a (n,)."""
+        """S^-1 a of an error along a (n,), or of several (n, k)."""
         if self.whitening is None:
-            return np.asarray(along / self.sigma**2)
+            return np.asarray((along.T / self.sigma**2).T)
         return np.asarray(self.whitening.T @ (self.whitening @ along))
 
 
@@ -125,14 +122,58 @@ class Correction:
     """By stop, the suspected error's share (n,) in each entry of its `StopTelemetry`."""
 
 
+class _Tested(Protocol):
+    """Errors of one stop, or of all legs, that telemetry is tested for."""
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """(n,) as in `Correction`."""
+
+    def correction(self, i: int) -> Correction:
+        """The i-th error."""
+
+
+class Errors(Sequence[Correction]):
+    """Errors that telemetry is tested for; a `Correction` is made when it is asked for."""
+
+    def __init__(self, parts: Sequence[_Tested]) -> None:
+        self._parts = parts
+        self._end = np.cumsum([len(part.sigmas) for part in parts])
+        self.sigmas = np.concatenate([np.zeros(0), *(part.sigmas for part in parts)])
+        """(n,) as in `Correction`."""
+
+    def __len__(self) -> int:
+        return len(self.sigmas)
+
+    @overload
+    def __getitem__(self, i: int) -> Correction: ...
+    @overload
+    def __getitem__(self, i: slice) -> Sequence[Correction]: ...
+    def __getitem__(self, i: int | slice) -> Correction | Sequence[Correction]:
+        if isinstance(i, slice):
+            return [self[k] for k in range(*i.indices(len(self)))]
+        if not 0 <= i < len(self):
+            raise IndexError(f"error {i} of {len(self)}")
+        part = int(np.searchsorted(self._end, i, side="right"))
+        return self._parts[part].correction(i - int(self._end[part]) + len(self._parts[part].sigmas))
+
+    def __add__(self, more: "Errors") -> "Errors":
+        return Errors([*self._parts, *more._parts])
+
+    @property
+    def largest(self) -> Correction:
+        """The one that the solution speaks for most strongly. Raises ValueError where there is none."""
+        return self[int(np.argmax(self.sigmas))]
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Suspected:
     """All errors of telemetry that a solution is tested for."""
 
     telemetry: list[StopTelemetry]
-    angles: list[Correction]
+    angles: Errors
     """Of pans and tilts, single and common to a stop."""
-    stops: list[Correction]
+    stops: Errors
     """Of stops, and of legs."""
     root: Root
     """Square root of the system that the covariances are of."""
@@ -142,13 +183,11 @@ class Suspected:
         """Those of a solution whose covariances are known; `is_far`: at expected ranges of far terrain."""
         assert u.variables is not None  # the caller has looked
         assert u.masts is not None
-        telemetry = telemetry_of(problem, u.variables)
+        telemetry, root = telemetry_of(problem, u.variables), u.masts.root
         least = _HARDLY_SHOWN if is_far else _BLIND
-        single = list(corrections(telemetry, least))
-        angles = [c for c in single if c.entry in {"pan", "tilt"}]
-        stops = [c for c in single if c.entry not in {"pan", "tilt"}]
-        stops += leg_corrections(problem, telemetry, u.masts, least)
-        return Suspected(telemetry=telemetry, angles=angles, stops=stops, root=u.masts.root)
+        angles, stops = entry_errors(telemetry, least)
+        stops += leg_errors(problem, telemetry, root, least)
+        return Suspected(telemetry=telemetry, angles=angles, stops=stops, root=root)
 
 
 def telemetry_of(problem: Problem, covariance: Covariance) -> list[StopTelemetry]:
@@ -232,50 +271,72 @@ def _entries(template: FactorTemplate, keys: Sequence[int]) -> tuple[int, tuple[
     return int(template.traverse.frame_stop[frames[0]]), ("pan", "tilt") * len(frames), np.repeat(frames, 2)
 
 
-def corrections(telemetry: Sequence[StopTelemetry], least: float = _BLIND) -> Iterator[Correction]:
+def entry_errors(telemetry: Sequence[StopTelemetry], least: float = _BLIND) -> tuple[Errors, Errors]:
     """Each entry by itself, and a common offset of the pans, and of the tilts, of each stop.
 
-    Left out are errors of which no more than the share `least` shows in the correction.
+    Those of pans and tilts, and those of stops. Left out are errors of which no more than the share `least`
+    shows in the correction.
     """
+    angles, stops = [], []
     for one in telemetry:
-        n, names = len(one.entry), np.array(one.entry)
-        for i in range(n):
-            frame = int(one.frame[i])
-            if found := _along(one, np.eye(n)[i], least):
-                yield Correction(
-                    entry=one.entry[i],
-                    stop=one.stop,
-                    frame=None if frame < 0 else frame,
-                    is_common=False,
-                    **found,
-                )
-        for name in ("pan", "tilt"):
-            shape = (names == name).astype(float)
-            if shape.sum() > 1 and (found := _along(one, shape, least)):
-                yield Correction(entry=name, stop=one.stop, frame=None, is_common=True, **found)
+        is_angle = np.isin(one.entry, ("pan", "tilt"))
+        single = np.eye(len(one.entry))
+        common = [(np.array(one.entry) == name).astype(float) for name in ("pan", "tilt")]
+        of_angles = np.vstack([single[is_angle], *(shape for shape in common if shape.sum() > 1)])
+        z, K = one.pull(), one.shown()
+        angles.append(_entry_errors(one, of_angles, z, K, least))
+        stops.append(_entry_errors(one, single[~is_angle], z, K, least))
+    return Errors(angles), Errors(stops)
 
 
-class _Found(TypedDict):
-    size: float
-    error: float
-    shown: float
-    sigmas: float
-    along: Mapping[int, FloatArray]
+def _entry_errors(
+    one: StopTelemetry, shapes: FloatArray, z: FloatArray, K: FloatArray, least: float
+) -> "_EntryErrors":
+    """Errors along shapes (k, n) of a stop's entries, as far as they show.
 
-
-def _along(one: StopTelemetry, shape: FloatArray, least: float) -> _Found | None:
-    """The test of an error along a shape (n,) of one stop's entries; None where too little of it shows."""
-    shown = float(shape @ one.shown @ shape)
-    if shown <= least * float(shape @ one.told(shape)):
-        return None
-    pull = float(shape @ one.pull)
-    return _Found(
-        size=float(shape @ one.correction / shape.sum()),
-        error=pull / shown,
-        shown=shown,
-        sigmas=abs(pull) / np.sqrt(shown),
-        along={one.stop: shape},
+    z (n,) and K (n, n) are the stop's `pull` and `shown`.
+    """
+    shown = np.einsum("ki,ki->k", shapes @ K, shapes)
+    told = np.einsum("ki,ki->k", shapes, one.told(shapes.T).T)
+    shows = shown > least * told
+    shapes, shown = shapes[shows], shown[shows]
+    return _EntryErrors(
+        of=one, shape=shapes, size=shapes @ one.correction / shapes.sum(axis=1), pull=shapes @ z, shown=shown
     )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _EntryErrors:
+    """Errors of entries of one stop's telemetry; fields as in `Correction`."""
+
+    of: StopTelemetry
+    shape: FloatArray
+    """(k, n) share in each entry"""
+    size: FloatArray
+    pull: FloatArray
+    """(k,) a'z"""
+    shown: FloatArray
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """(k,) as in `Correction`."""
+        return np.asarray(np.abs(self.pull) / np.sqrt(self.shown))
+
+    def correction(self, i: int) -> Correction:
+        """The i-th error."""
+        entries = np.flatnonzero(self.shape[i])
+        frame, is_common = int(self.of.frame[entries[0]]), len(entries) > 1
+        return Correction(
+            entry=self.of.entry[entries[0]],
+            stop=self.of.stop,
+            frame=None if is_common or frame < 0 else frame,
+            is_common=is_common,
+            size=float(self.size[i]),
+            error=float(self.pull[i] / self.shown[i]),
+            shown=float(self.shown[i]),
+            sigmas=float(self.sigmas[i]),
+            along={self.of.stop: self.shape[i]},
+        )
 
 
 def total(telemetry: Sequence[StopTelemetry]) -> tuple[float, float]:
@@ -285,85 +346,102 @@ def total(telemetry: Sequence[StopTelemetry]) -> tuple[float, float]:
     freedom (Satterthwaite's approximation; corrections of different stops count as independent). (0, 0)
     where images say nothing of telemetry.
     """
+    spreads = [one.spread() for one in telemetry]
     squares = sum(float(one.whitened @ one.whitened) for one in telemetry)
-    expected = sum(float(np.trace(one.spread)) for one in telemetry)
-    variance = sum(float(np.sum(one.spread**2)) for one in telemetry)
+    expected = sum(float(np.trace(spread)) for spread in spreads)
+    variance = sum(float(np.sum(spread**2)) for spread in spreads)
     if expected <= _BLIND or variance <= 0:
         return 0.0, 0.0
     return float(np.sqrt(squares / expected)), expected**2 / variance
 
 
-def leg_corrections(
-    problem: Problem, telemetry: Sequence[StopTelemetry], masts: JointCovariance, least: float = _BLIND
-) -> list[Correction]:
+def leg_errors(
+    problem: Problem, telemetry: Sequence[StopTelemetry], root: Root, least: float = _BLIND
+) -> Errors:
     """A shift of all stops after a leg against all before it, for each leg; the entries are `leg x` to `z`.
 
-    In the directions of the world's axes; `least` as for `corrections`. None in drives of fewer than two
-    stops, or of very many.
+    In the directions of the world's axes; `root` is that of the solution's system, and `least` as for
+    `entry_errors`. None in drives of fewer than two stops, or of very many.
     """
     stops = problem.template.traverse.stops
     n = len(stops)
     if not 2 <= n <= _MOST_STOPS:
-        return []
-    e, D, sigma = _positions(telemetry, masts, n)
+        return Errors([])
     world_R, _ = pose_arrays([stop.world_T_mast for stop in stops])
-    out = []
-    for after in range(1, n):
-        for axis, name in enumerate(("leg x", "leg y", "leg z")):
-            shift = np.where(sigma > 0, world_R[:, axis], 0.0)
-            shift[:after] = 0.0
-            h = np.divide(shift, sigma, out=np.zeros_like(shift), where=sigma > 0).ravel()
-            variance, along = float(h @ D @ h), dict[int, FloatArray]()
-            if variance <= least * float(h @ h):
-                continue
-            for one in telemetry:
-                if shift[one.stop].any():
-                    along[one.stop] = np.zeros(len(one.entry))
-                    along[one.stop][_position_rows(one)] = shift[one.stop]
-            out.append(
-                Correction(
-                    entry=name,
-                    stop=after,
-                    frame=None,
-                    is_common=False,
-                    size=float(h @ e / (h @ h)),
-                    error=float(h @ e / variance),
-                    shown=variance,
-                    sigmas=float(abs(h @ e) / np.sqrt(variance)),
-                    along=along,
-                )
+    # By leg and axis, in the order of the legs: whitened shifts of all positions, and of all columns.
+    begin = np.concatenate([[0], np.cumsum(root.structure.dim)])
+    shifts, columns = np.zeros((n - 1, 3, n, 3)), np.zeros((int(begin[-1]), n - 1, 3))
+    correction = np.zeros((n, 3))
+    for one in telemetry:
+        s, rows = one.stop, _position_rows(one)
+        if not rows.stop:
+            continue
+        sigma = one.sigma[rows]
+        correction[s] = one.correction[rows] / sigma
+        shifts[:s, :, s] = world_R[s] / sigma
+        columns[begin[s] + one.column[rows], :s] = (world_R[s] / sigma**2).T[:, None]
+    h = shifts.reshape(-1, 3 * n)
+    told = np.einsum("ki,ki->k", h, h)
+    # A position's errors depend on no others, so that D = I - C of whitened corrections.
+    half = root.forward(columns.reshape(len(columns), -1))
+    shown = told - np.einsum("ik,ik->k", half, half)
+    leg = np.flatnonzero(shown > least * told)
+    pull = (h @ correction.ravel())[leg]
+    return Errors(
+        [
+            _LegErrors(
+                telemetry=telemetry,
+                world_R=world_R,
+                leg=leg,
+                size=pull / told[leg],
+                pull=pull,
+                shown=shown[leg],
             )
-    return out
+        ]
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _LegErrors:
+    """Shifts of all stops after a leg; fields as in `Correction`."""
+
+    telemetry: Sequence[StopTelemetry]
+    world_R: FloatArray
+    """(stops, 3, 3) of the masts as telemetry has them"""
+    leg: IntArray
+    """(k,) three times the row of the stop before, and the axis"""
+    size: FloatArray
+    pull: FloatArray
+    shown: FloatArray
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """(k,) as in `Correction`."""
+        return np.asarray(np.abs(self.pull) / np.sqrt(self.shown))
+
+    def correction(self, i: int) -> Correction:
+        """The i-th error."""
+        before, axis = divmod(int(self.leg[i]), 3)
+        along = {}
+        for one in self.telemetry:
+            rows = _position_rows(one)
+            if one.stop > before and rows.stop:
+                along[one.stop] = np.zeros(len(one.entry))
+                along[one.stop][rows] = self.world_R[one.stop][axis]
+        return Correction(
+            entry=("leg x", "leg y", "leg z")[axis],
+            stop=before + 1,
+            frame=None,
+            is_common=False,
+            size=float(self.size[i]),
+            error=float(self.pull[i] / self.shown[i]),
+            shown=float(self.shown[i]),
+            sigmas=float(self.sigmas[i]),
+            along=along,
+        )
 
 
 def _position_rows(one: StopTelemetry) -> slice:
     """Rows of a stop's x, y and z; none where telemetry holds them."""
     begin = one.entry.index("x") if "x" in one.entry else 0
     return slice(begin, begin + 3 * ("x" in one.entry))
-
-
-def _positions(
-    telemetry: Sequence[StopTelemetry], masts: JointCovariance, n: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Corrections of positions (3 n,) over their sigmas, their covariance if all is as stated, the sigmas.
-
-    The sigma (n, 3) of a position that telemetry holds is 0. A position's errors depend on no others.
-    """
-    e, C, sigma = np.zeros((n, 3)), np.zeros((n, 3, n, 3)), np.zeros((n, 3))
-    begin = np.concatenate([[0], np.cumsum(masts.root.structure.dim)])
-    rows = {one.stop: _position_rows(one) for one in telemetry}
-    free = [one for one in telemetry if rows[one.stop].stop]
-    columns = {one.stop: one.column[rows[one.stop]] for one in free}
-    for one in free:
-        sigma[one.stop] = one.sigma[rows[one.stop]]
-        e[one.stop] = one.correction[rows[one.stop]] / sigma[one.stop]
-    for one in free:
-        i, of_one = one.stop, columns[one.stop]
-        inverse = masts.root.inverse_columns(i, slice(int(of_one[0]), int(of_one[-1]) + 1))
-        for other in free:
-            j = other.stop
-            C[j, :, i] = inverse[begin[j] + columns[j]] / np.outer(sigma[j], sigma[i])
-    D = -C
-    for one in free:
-        D[one.stop, :, one.stop] += np.eye(3)
-    return e.ravel(), D.reshape(3 * n, 3 * n), sigma

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pancam_graph.base.geometry import BoolArray, IntArray
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.data import Refined, Traverse, Verdict, VerdictTest
 from pancam_graph.solve._chances import CHANCE, rms_limit, two_sided_limit
 from pancam_graph.solve._covariance import Uncertainty
@@ -70,7 +70,7 @@ def verdict(at: Optimum) -> Verdict:
     """All tests of a fit."""
     residuals = Residuals.of(at.fitted.problem)
     tests = [_converged(at), _finite(residuals), _cost(at), _optimum(at), *shares_in_use(at.fitted.problem)]
-    if len(residuals.square):
+    if residuals.n_observations:
         tests += _noise(at, residuals)
     tests += [
         _sigmas(at),
@@ -98,10 +98,10 @@ def _finite(residuals: Residuals) -> VerdictTest:
     n = residuals.n_not_finite
     return VerdictTest.of(
         "finite",
-        float(n) if len(residuals.square) else np.inf,
+        float(n) if residuals.n_observations else np.inf,
         0.0,
-        f"residuals of all {len(residuals.square)} observations in use are finite",
-        f"{n} of {len(residuals.square)} observations in use have no finite residual: "
+        f"residuals of all {residuals.n_observations} observations in use are finite",
+        f"{n} of {residuals.n_observations} observations in use have no finite residual: "
         "cameras or points have left the domain of their model",
     )
 
@@ -175,9 +175,7 @@ def _noise_let_go(problem: Problem, residuals: Residuals) -> Iterator[VerdictTes
     t, frames = problem.template.traverse, np.flatnonzero(problem.template.let_go.angles_rad.any(axis=1))
     if not len(frames):
         return
-    ratio, freedom = residuals.by(t.image_frame, len(t.frames))
-    allowed = np.array([rms_limit(freedom[f], CHANCE / len(frames)) for f in frames])
-    sure = ratio[frames] / max(residuals.ratio, 1e-300) / allowed
+    sure = _over_all(residuals, t.image_frame, len(t.frames), of=len(frames))[1][frames]
     worst = int(np.argmax(sure))
     name = t.frames[frames[worst]].id
     yield VerdictTest.of(
@@ -190,12 +188,20 @@ def _noise_let_go(problem: Problem, residuals: Residuals) -> Iterator[VerdictTes
     )
 
 
+def _over_all(residuals: Residuals, owner: IntArray, n: int, *, of: int) -> tuple[FloatArray, FloatArray]:
+    """Residuals of each of n owners over those of all (n,), and that over what chance allows (n,).
+
+    `owner` is that of each image; chance is that of the worst of so many owners. The second is 0 for owners
+    with hardly any observations.
+    """
+    ratio, freedom = residuals.by(owner, n)
+    ratio = ratio / max(residuals.ratio, 1e-300)
+    return ratio, np.where(freedom >= 1, ratio / rms_limit(freedom, CHANCE / of), 0.0)
+
+
 def _uneven(name: str, residuals: Residuals, owner: IntArray, ids: Sequence[str]) -> VerdictTest:
     """The owner whose residuals exceed those of all by most, less what chance may add."""
-    ratio, freedom = residuals.by(owner, len(ids))
-    ratio = ratio / max(residuals.ratio, 1e-300)
-    allowed = np.array([rms_limit(f, CHANCE / len(ids)) for f in freedom])
-    sure = np.where(freedom >= 1, ratio / allowed, 0.0)
+    ratio, sure = _over_all(residuals, owner, len(ids), of=len(ids))
     worst = int(np.argmax(sure))
     says = f"residuals of {name} {ids[worst]} are {ratio[worst]:.3g} times those of all"
     return VerdictTest.of(
@@ -244,7 +250,7 @@ def _telemetry(at: Optimum) -> Iterator[VerdictTest]:
         yield VerdictTest.of(
             "telemetry",
             rms,
-            rms_limit(freedom, CHANCE),
+            float(rms_limit(freedom, CHANCE)),
             says,
             f"{says}: give telemetry larger sigmas, or look for a wrong rig or wrong matches",
         )
@@ -254,7 +260,7 @@ def _telemetry(at: Optimum) -> Iterator[VerdictTest]:
         ("stops", stops, "widen sigma_translation_m and sigma_rotation_rad there"),
     ):
         if some:
-            worst = max(some, key=lambda c: c.sigmas)
+            worst = some.largest
             says = _describe(worst, at.traverse)
             yield VerdictTest.of(
                 name,

@@ -486,6 +486,33 @@ def test_columns_of_the_inverse_are_those_of_a_dense_one(name: str) -> None:
         assert np.abs((found - expected) / scale).max() < 1e-9
 
 
+@pytest.mark.parametrize("name", GRAPHS)
+def test_the_marginal_of_a_group_is_that_of_a_dense_inverse(name: str) -> None:
+    """Covariance and step, whichever group was eliminated last."""
+    random = Random(name, scaled=True)
+    inverse = np.asarray(np.linalg.inv(random.S), dtype=float)
+    step, size = -inverse @ random.s, np.sqrt(np.diag(inverse))
+    root = random.panels.root()
+    for g in range(len(random.dim)):
+        covariance, change = root.marginal(g)
+        of_group = size[random.columns(g)]
+        expected = random.of(inverse, g, g)
+        assert np.abs((covariance - expected) / np.outer(of_group, of_group)).max() < 1e-9
+        assert np.abs((change - step[random.columns(g)]) / of_group).max() < 1e-9
+
+
+def test_forward_substitution_gives_the_variance_of_any_sum() -> None:
+    """Of many sums at once, of which some begin at late groups."""
+    random = Random("chain", scaled=True)
+    rng = np.random.default_rng(3)
+    sums = rng.normal(size=(len(random.S), 4)) * (
+        np.arange(len(random.S))[:, None] >= [0, 7, 20, len(random.S)]
+    )
+    sums /= np.sqrt(np.diag(np.linalg.inv(random.S)))[:, None]
+    half = random.panels.root().forward(sums)
+    np.testing.assert_allclose(half.T @ half, sums.T @ np.linalg.solve(random.S, sums), rtol=1e-7, atol=1e-9)
+
+
 def test_columns_of_the_inverse_need_all_directions() -> None:
     panels = Panels(pattern(np.array([3, 3]), [(0, 1)]))
     panels.add([0], np.diag([1.0, 1.0, 0.0]), np.zeros(3))

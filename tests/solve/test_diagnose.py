@@ -5,8 +5,10 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 import pytest
+import scipy
 
 from pancam_graph.data import Frame, Image, Observations, Stop, Traverse
+from pancam_graph.landmarks import kernel
 from pancam_graph.rigs import mer_navcam
 from pancam_graph.solve._diagnose import components, connection_warnings
 
@@ -52,7 +54,8 @@ def traverse(tracks: Sequence[Sequence[str]], *, stops: int = 1, frames: int = 4
 
 def warnings(t: Traverse, used: Sequence[bool] | None = None) -> list[str]:
     assert t.observations is not None
-    return connection_warnings(t, np.ones(len(t.observations), bool) if used is None else np.array(used))
+    rows = np.flatnonzero(np.ones(len(t.observations), bool) if used is None else np.array(used))
+    return connection_warnings(t, t.observations.image[rows], t.observations.track[rows])
 
 
 CHAIN = [["aL", "bL"], ["bR", "cL"], ["cR", "dR"], ["aR", "dL"]]
@@ -124,3 +127,36 @@ def test_components_number_images_that_share_landmarks() -> None:
     assert len({group[0], group[1], group[3]}) == 3
     empty = np.zeros(0, dtype=np.int64)
     assert components(3, empty, empty)[0] == 3
+
+
+def test_links_are_counted_once_for_each_landmark_and_owner() -> None:
+    """Against sets, for random observations of which some are out of use."""
+    rng = np.random.default_rng(4)
+    landmark = np.sort(rng.integers(0, 60, 200))
+    landmark = np.unique(landmark, return_inverse=True)[1]
+    owner, kept = rng.integers(0, 7, 200), rng.random(200) < 0.6
+    begin = np.searchsorted(landmark, np.arange(landmark[-1] + 2))
+    n, used = np.zeros(7, dtype=np.int64), np.zeros(7, dtype=np.int64)
+    kernel.count_links(begin, owner, kept, n, used)
+    expected_n, expected_used = np.zeros(7, dtype=np.int64), np.zeros(7, dtype=np.int64)
+    for j in range(landmark[-1] + 1):
+        seen, in_use = set(owner[landmark == j]), set(owner[(landmark == j) & kept])
+        if len(seen) >= 2:
+            expected_n[list(seen)] += 1
+            expected_used[list(in_use)] += len(in_use) >= 2
+    assert np.array_equal(n, expected_n)
+    assert np.array_equal(used, expected_used)
+    assert 0 < used.sum() < n.sum()
+
+
+def test_components_are_those_of_the_graph() -> None:
+    rng = np.random.default_rng(5)
+    for n_members, n_landmarks, n in ((40, 60, 70), (10, 3, 5), (25, 200, 260)):
+        member, landmark = rng.integers(0, n_members, n), rng.integers(0, n_landmarks, n)
+        ones = np.ones(n)
+        graph = scipy.sparse.coo_array(
+            (ones, (member, n_members + landmark)), shape=(n_members + n_landmarks,) * 2
+        )
+        _, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
+        expected, group = label[:n_members], components(n_members, member, landmark)[1]
+        assert np.array_equal(group[:, None] == group, expected[:, None] == expected)

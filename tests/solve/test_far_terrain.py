@@ -98,7 +98,7 @@ def test_variance_of_an_inverse_range_is_the_curvature_of_the_cost() -> None:
             (
                 problem.at(
                     problem.values, at_inverse_ranges(problem.landmarks, ranges, ranges.per_m + step * off)
-                ).residuals()[0]
+                ).residuals[0]
                 ** 2
             ).sum(axis=1),
         )

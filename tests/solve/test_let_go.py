@@ -168,7 +168,7 @@ def test_an_error_of_telemetry_is_estimated() -> None:
     simulation = drive()
     fit = fitted(off(simulation.traverse, [4], pan=2.0), SolveOptions())
     judged = judge(fit)
-    worst = max(Suspected.of(judged.regular, judged.uncertainty, is_far=False).angles, key=lambda c: c.sigmas)
+    worst = Suspected.of(judged.regular, judged.uncertainty, is_far=False).angles.largest
     wrong = fit.screened.prepared.traverse.frames[4].pan_rad
     assert (worst.entry, worst.frame) == ("pan", 4)
     assert worst.error == pytest.approx(simulation.truth.pan_tilt_rad[4, 0] - wrong, abs=2e-3)

@@ -10,9 +10,9 @@ from pancam_graph.data import Solution, VerdictTest
 from pancam_graph.rigs import TEMPLATES
 from pancam_graph.simulate import Simulation
 from pancam_graph.smoother._incremental import solve_incrementally
-from pancam_graph.solve import judge
+from pancam_graph.solve import _rig_score, judge
 from pancam_graph.solve._rig_score import held_entries
-from pancam_graph.solve._telemetry_tests import corrections, leg_corrections, telemetry_of, total
+from pancam_graph.solve._telemetry_tests import entry_errors, leg_errors, telemetry_of, total
 from support.solving import fitted
 
 SMALL = SimulationOptions(stops=2, pans=9, points_per_image=20)
@@ -110,9 +110,10 @@ def test_corrections_over_their_sigmas_are_standard_normal() -> None:
         assert uncertainty.variables is not None
         assert uncertainty.masts is not None
         telemetry = telemetry_of(fit.problem, uncertainty.variables)
-        for one in corrections(telemetry):
-            (common if one.is_common else single).append(one.sigmas)
-        legs += [c.sigmas for c in leg_corrections(fit.problem, telemetry, uncertainty.masts)]
+        for errors in entry_errors(telemetry):
+            for one in errors:
+                (common if one.is_common else single).append(one.sigmas)
+        legs += leg_errors(fit.problem, telemetry, uncertainty.masts.root).sigmas.tolist()
         rms, freedom = total(telemetry)
         sums.append((rms**2 - 1) * np.sqrt(freedom / 2))
     for sizes, slack in ((single, 0.08), (common, 0.3), (legs, 0.3)):
@@ -132,6 +133,21 @@ def test_the_score_of_a_held_number_is_what_freeing_it_gains() -> None:
     assert gain > 30
     assert one.gain <= 1.1 * gain  # both eyes are free there
     assert max(e.gain for e in held.values()) > 0.4 * gain
+
+
+def test_the_score_of_a_long_drive_comes_from_part_of_its_stops(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Within a factor of two of what all observations say, of the same number."""
+    problem = fitted(drive(focal_error=2e-3, stops=8, pans=6).traverse, SolveOptions(loss="none")).problem
+    monkeypatch.setattr(_rig_score, "_ENOUGH", 10**9)
+    whole = max(held_entries(problem), key=lambda e: e.gain)
+    monkeypatch.setattr(_rig_score, "_ENOUGH", 300)
+    part = max(held_entries(problem), key=lambda e: e.gain)
+    few = _rig_score._part(problem, problem.template.rig_variables.sharing)
+    assert len(few.template.traverse.stops) == 3
+    assert 250 < few.kept.sum() < 700
+    assert np.abs(few.residuals[0]).mean() < 2 * np.abs(problem.residuals[0]).mean()
+    assert (part.quantity, part.entry) == (whole.quantity, whole.entry)
+    assert 0.4 * whole.gain < part.gain < 2.5 * whole.gain
 
 
 def test_a_rig_that_is_wrong_is_advised_of() -> None:

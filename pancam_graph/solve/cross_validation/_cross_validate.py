@@ -347,8 +347,8 @@ def _score(whole: _Whole, splitting: Splitting, number: int, own: _Half, other: 
     scored, n, px = 0, 0, [np.nan] * 4
     if p is not None and q is not None:
         m = p.measurements
-        by_own, in_front = p.residuals()
-        by_other, also_in_front = p.at(q.values, p.landmarks).placed().residuals()
+        by_own, in_front = p.residuals
+        by_other, also_in_front = p.at(q.values, p.landmarks).placed().residuals
         behind = np.bincount(m.landmark, p.kept & ~(in_front & also_in_front), minlength=m.n_landmarks) > 0
         which = p.present & ~behind & other.frames.joins_landmarks(m, whole.traverse.image_frame)
         rows = p.kept & which[m.landmark]
