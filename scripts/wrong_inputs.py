@@ -13,14 +13,17 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pancam_graph import Solution, SolveOptions, Traverse, simulate, solve
+from pancam_graph import Freedom, Sharing, Solution, SolveOptions, Traverse, simulate, solve
 from pancam_graph.base.errors import InputError, PancamGraphError
 from pancam_graph.base.geometry import FloatArray
 from pancam_graph.cli import Progress, ScriptParser, run
+from pancam_graph.initialise import Start
 from pancam_graph.rigs import rig_template
 from pancam_graph.simulate import Simulation, SimulationOptions
 from pancam_graph.smoother._incremental import solve_incrementally
 
+_HEADING_RAD = 0.01
+"""Sigma of the rotation of a stop that was held; that of the others."""
 _SILENT = 6.0
 """Error in formal sigmas from which a solution that passed its tests is a silent failure."""
 
@@ -149,17 +152,102 @@ def _stated_noise(factor: float) -> Fault:
     return fault
 
 
+def _tiny_sigmas(share: float) -> Fault:
+    """A share of the observations states a sigma of 1e-6 pixels, though all are 0.3 pixels off."""
+
+    def fault(s: Simulation, rng: np.random.Generator) -> Traverse:
+        o = s.traverse.observations
+        assert o is not None  # simulated
+        tiny = rng.random(len(o)) < share
+        return s.traverse.with_observations(replace(o, sigma_px=np.where(tiny, 1e-6, o.sigma_px)))
+
+    return fault
+
+
+def _apart(s: Simulation, rng: np.random.Generator) -> Traverse:
+    """Half of the observations are a million times noisier than the other half, and say so."""
+    o = s.traverse.observations
+    assert o is not None  # simulated
+    good = rng.random(len(o)) < 0.5
+    t, truth = s.traverse, s.truth
+    R, centre = t.camera_poses(truth.world_T_mast, truth.pan_tilt_rad)
+    uv = o.uv_px.copy()
+    for i in np.unique(o.image[good]):
+        rows = np.flatnonzero(good & (o.image == i))
+        camera = truth.rig.eyes[int(t.image_eye[i])].camera
+        seen = camera.project((truth.landmarks_m[o.track[rows]] - centre[i]) @ R[i])[0]
+        uv[rows] = seen + 1e-6 * (o.uv_px[rows] - seen)
+    sigma = np.where(good, 1e-6 * o.sigma_px, o.sigma_px)
+    return t.with_observations(replace(o, uv_px=uv, sigma_px=sigma))
+
+
+def _shuffled(s: Simulation, rng: np.random.Generator) -> Traverse:
+    """Stops in another order than they were driven in."""
+    order = rng.permutation(len(s.traverse.stops))
+    return replace(s.traverse, stops=tuple(s.traverse.stops[i] for i in order))
+
+
+def _unseen_stop(s: Simulation, rng: np.random.Generator) -> Traverse:
+    """The frames of one stop have no observations."""
+    t = s.traverse
+    assert t.observations is not None  # simulated
+    blind = int(rng.integers(len(t.stops)))
+    return t.with_observations(t.observations.select(t.image_stop[t.observations.image] != blind))
+
+
+def _no_frames(s: Simulation, rng: np.random.Generator) -> Traverse:
+    """One more stop, at which no frame was taken."""
+    last = s.traverse.stops[-1]
+    return replace(s.traverse, stops=(*s.traverse.stops, replace(last, id="without-frames")))
+
+
+def _none_held(sigma_m: float) -> Fault:
+    """The position of no stop is held, and none is known to better than `sigma_m`."""
+
+    def fault(s: Simulation, rng: np.random.Generator) -> Traverse:
+        stops = [
+            replace(
+                stop,
+                sigma_translation_m=sigma_m,
+                sigma_rotation_rad=stop.sigma_rotation_rad or _HEADING_RAD,
+            )
+            for stop in s.traverse.stops
+        ]
+        return replace(s.traverse, stops=tuple(stops))
+
+    return fault
+
+
+def _one_eye_first(s: Simulation, rng: np.random.Generator) -> Traverse:
+    """The first stop has pictures of one eye alone."""
+    t = s.traverse
+    assert t.observations is not None  # simulated
+    keep = (t.image_stop > 0) | (t.image_eye == 0)
+    place = np.cumsum(keep) - 1
+    o = t.observations.select(keep[t.observations.image])
+    images = tuple(image for image, kept in zip(t.images, keep, strict=True) if kept)
+    return replace(t, images=images, observations=replace(o, image=place[o.image]))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """A fault, and the drives that get it."""
+    """A fault, the drives that get it, and how these are solved."""
 
     fault: Fault = _right
     drive: Mapping[str, object] = field(default_factory=dict)
     """Options of the simulation beside the usual ones."""
+    options: SolveOptions = field(default_factory=SolveOptions)
+    other_turns: bool = False
+    """Whether first pans are in 0 to 2 pi, and some so a turn from telemetry's."""
+    incremental: bool = False
+    """Whether it is solved stop by stop, whatever the command line says."""
 
 
 _FEW_LINKS = {"stops": 1, "pans": 7, "points_per_image": 15}
 """One panorama whose frames have few neighbours: many have one alone."""
+_DOWN = {"spacing_m": 0.5, "pans": 6, "tilts_rad": (-np.pi / 2,)}
+"""Heads that look straight down, at stops so close that they see the same ground."""
+_MOUNTS = SolveOptions(sharing=Sharing(mounts=Freedom(scope="eye")))
 CASES: dict[str, Case] = {
     "right": Case(),
     "3 % outliers": Case(drive={"outliers": 0.03}),
@@ -188,6 +276,29 @@ CASES: dict[str, Case] = {
     "a tenth of the tracks on a rock 0.1 m away": Case(fault=_neighbouring_rock(0.1, 0.1)),
     "focal length off by 0.2 %": Case(drive={"focal_error": 2e-3}),
     "mounts off by 0.5 mrad": Case(drive={"mount_error_rad": 5e-4}),
+    "all sigmas stated as 1e-6 px": Case(fault=_tiny_sigmas(1.0)),
+    "half of the sigmas stated as 1e-6 px": Case(fault=_tiny_sigmas(0.5)),
+    "half of the observations a million times better": Case(fault=_apart),
+    "error ellipses of 1e4 to 1": Case(drive={"noise_stretch": 1e4}),
+    "a start with pans in 0 to 2 pi": Case(other_turns=True),
+    **{
+        f"model {model} at tilt -90 degrees": Case(drive=_DOWN, options=SolveOptions(model=model))
+        for model in ("circle", "free")
+    },
+    "stops shuffled, stop by stop": Case(fault=_shuffled, drive={"stops": 4}, incremental=True),
+    "a stop without observations": Case(fault=_unseen_stop, drive={"stops": 3}),
+    "a stop without observations, stop by stop": Case(
+        fault=_unseen_stop, drive={"stops": 3}, incremental=True
+    ),
+    "a stop without frames": Case(fault=_no_frames),
+    "a stop without frames, stop by stop": Case(fault=_no_frames, incremental=True),
+    "all stops at sigma 1.5 m": Case(fault=_none_held(1.5)),
+    "all stops at sigma 1.5 m, stop by stop": Case(fault=_none_held(1.5), incremental=True),
+    "all stops at sigma 1000 m": Case(fault=_none_held(1000.0)),
+    "mounts free, first stop of one eye": Case(fault=_one_eye_first, drive={"stops": 3}, options=_MOUNTS),
+    "mounts free, first stop of one eye, stop by stop": Case(
+        fault=_one_eye_first, drive={"stops": 3}, options=_MOUNTS, incremental=True
+    ),
 }
 
 
@@ -210,7 +321,10 @@ def measure(case: Case, rig: str, seed: int, *, incremental: bool) -> Outcome:
     simulation = simulate(rig_template(rig), options, seed=seed)
     traverse = case.fault(simulation, np.random.default_rng(seed))
     try:
-        solution = (solve_incrementally if incremental else solve)(traverse, SolveOptions())
+        if incremental or case.incremental:
+            solution = solve_incrementally(traverse, case.options)
+        else:
+            solution = solve(traverse, case.options, start=_turned(traverse) if case.other_turns else None)
     except PancamGraphError as error:
         return Outcome(passed=False, errors=np.zeros(0), let_go=False, failed=(str(error)[:40],))
     verdict = solution.verdict
@@ -223,13 +337,22 @@ def measure(case: Case, rig: str, seed: int, *, incremental: bool) -> Outcome:
     )
 
 
+def _turned(traverse: Traverse) -> Start:
+    """Telemetry as first values, with pans in 0 to 2 pi."""
+    pan, tilt = traverse.pan_tilt_rad.T
+    masts = tuple(stop.world_T_mast for stop in traverse.stops)
+    return Start(world_T_mast=masts, pan_tilt_rad=np.column_stack([np.mod(pan, 2 * np.pi), tilt]))
+
+
 def errors_in_sigmas(solution: Solution, simulation: Simulation) -> FloatArray:
     """Absolute errors (n,) of all pans, tilts and components of stops' poses over their formal sigmas."""
     truth, final = simulation.truth, solution.final
     angles = (final.pan_tilt_rad - truth.pan_tilt_rad).ravel()
-    stops = [t.localCoordinates(f) for t, f in zip(truth.world_T_mast, final.world_T_mast, strict=True)]
+    at = {stop.id: pose for stop, pose in zip(simulation.traverse.stops, truth.world_T_mast, strict=True)}
+    known = [i for i, stop in enumerate(solution.traverse.stops) if stop.id in at]
+    stops = [at[solution.traverse.stops[i].id].localCoordinates(final.world_T_mast[i]) for i in known]
     error = np.concatenate([(angles + np.pi) % (2 * np.pi) - np.pi, *stops])
-    variance = [np.diag(c) for c in solution.stop_covariance]
+    variance = [np.diag(solution.stop_covariance[i]) for i in known]
     sigma = np.concatenate([solution.angle_sigma_rad.ravel(), *np.sqrt(variance)])
     return np.asarray(np.abs(error[sigma > 0]) / sigma[sigma > 0])
 

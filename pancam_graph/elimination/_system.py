@@ -44,6 +44,10 @@ _LOST = 0.5 * 5.0**2
 """Cost per observation after refinement, as of residuals of 5 sigma, beyond which a stray is triangulated."""
 _TOUCHED = 1e-2
 """Relative change of its cost by a step below which a landmark is no stray."""
+_HALFWAY = (1e-3, 0.1)
+"""Relative decreases of the cost by a step between which all landmarks are refined after it. After a longer
+step only strays are; after a shorter one, back substitution places landmarks well. Between, it leaves enough
+of second order to need one more step of the cameras."""
 _REFINED = 0.1
 """Refinement of a stray ends when its expected decrease is at most this share of its cost."""
 _STRAY_GRAIN = 256
@@ -384,14 +388,16 @@ class LandmarkSystem:
         """Place landmarks anew that a step left behind a camera or with a large cost.
 
         A stray is refined from its place after the step; if its cost remains large, it is triangulated from
-        its rays.
+        its rays. Halfway to the optimum all landmarks are refined.
         """
         counts, seen = np.diff(self._seen.begin), self._seen
         before, after = self.reduced.cost, self._moved_cost
         # A landmark whose cost hardly changes is placed as well as before, however large its cost.
         touched = np.abs(after - before) > _TOUCHED * before
         is_stray = (after > _LOST * counts) | touched & (after > _STRAY * counts)
-        strays = np.flatnonzero(is_stray | self._refined)
+        least, most = _HALFWAY
+        is_halfway = least * before.sum() < before.sum() - after.sum() < most * before.sum()
+        strays = np.flatnonzero(is_stray | self._refined | is_halfway)
         self.regained = 0.0
         if len(strays) == 0:
             return

@@ -10,6 +10,7 @@ import pytest
 
 from pancam_graph import SimulationOptions, Solution, SolveOptions, Traverse, simulate, solve
 from pancam_graph.base.geometry import HEAD_R_FORWARD_CAMERA, FloatArray
+from pancam_graph.elimination import _system
 from pancam_graph.graph import ExplicitLandmarks, Flex, SoftTemplate
 from pancam_graph.initialise import Start
 from pancam_graph.landmarks import LossName
@@ -403,3 +404,16 @@ def test_where_telemetry_holds_everything_landmarks_are_placed(loss: LossName) -
         "ni,ni->n", error, np.linalg.solve(solution.landmark_covariance_m2, error[:, :, None])[..., 0]
     )
     assert squared[close].mean() == pytest.approx(3, rel=0.3)
+
+
+def test_landmarks_are_refined_halfway_to_the_optimum(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the third step leaves to gain is theirs: of second order in the step."""
+    options = SimulationOptions(stops=6, pans=6, points_per_image=10)
+    prepared = prepare(simulate(mer_navcam(), options, seed=1).traverse, SolveOptions(loss="none"))
+    left = []
+    for band in ((1.0, 0.0), _system._HALFWAY):  # the first is empty
+        monkeypatch.setattr(_system, "_HALFWAY", band)
+        costs = fit(screen(prepared)).outcome.costs
+        left.append(costs[3] - costs[-1])
+    assert left[0] > 1e-5
+    assert 0 <= left[1] < 0.05 * left[0]
