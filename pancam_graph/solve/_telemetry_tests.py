@@ -383,7 +383,7 @@ def leg_errors(
     h = shifts.reshape(-1, 3 * n)
     told = np.einsum("ki,ki->k", h, h)
     # A position's errors depend on no others, so that D = I - C of whitened corrections.
-    half = root.forward(columns.reshape(len(columns), -1))
+    half = root.forward(columns.reshape(len(columns), len(h)))
     shown = told - np.einsum("ik,ik->k", half, half)
     leg = np.flatnonzero(shown > least * told)
     pull = (h @ correction.ravel())[leg]
