@@ -1,9 +1,9 @@
 """Custom GTSAM factors: pure residuals with analytic Jacobians, and thin makers.
 
 One module a factor: `mast` (pan-tilt chain, 6 rows), `mast_projection` (a point seen from a rigid mast, 2
-rows), `circle` (thesis eq. 4.8, 3 rows), `projective` (projection matrix, 12 rows), `joint_prior` (vectors
-with correlated errors). Factors that GTSAM has (priors of one variable, projections of a camera pose) are
-taken from GTSAM.
+rows), `camera_projection` (a point seen by a camera that is no pinhole, 2 rows), `circle` (thesis eq. 4.8, 3
+rows), `projective` (projection matrix, 12 rows), `joint_prior` (vectors with correlated errors). Factors that
+GTSAM has (priors of one variable, projections of a pinhole) are taken from GTSAM.
 """
 
 from pancam_graph.factors._slots import Corrected as Corrected
@@ -11,6 +11,8 @@ from pancam_graph.factors._slots import Fixed as Fixed
 from pancam_graph.factors._slots import Key as Key
 from pancam_graph.factors._slots import PoseSlot as PoseSlot
 from pancam_graph.factors._slots import Slot as Slot
+from pancam_graph.factors.camera_projection import camera_projection_factor as camera_projection_factor
+from pancam_graph.factors.camera_projection import camera_projection_residual as camera_projection_residual
 from pancam_graph.factors.circle import CircleOffset as CircleOffset
 from pancam_graph.factors.circle import circle_factor as circle_factor
 from pancam_graph.factors.circle import circle_residual as circle_residual

@@ -50,12 +50,13 @@ class Corrected:
 
 Slot = Key | Fixed
 PoseSlot = Key | Fixed | Corrected
-Kind = Literal["pose", "vector", "point", "number"]
-"""What a slot holds: a gtsam.Pose3, a vector, a Point3, a number."""
+Kind = Literal["pose", "vector", "point", "number", "calibration"]
+"""What a slot holds: a gtsam.Pose3, a vector, a Point3, a number, a Cal3_S2."""
 
 Residual = Callable[..., tuple[FloatArray, tuple[FloatArray, ...]]]
 """Takes the values of each slot at n sites (poses as rotations (n, 3, 3) and translations (n, 3), vectors
-(n, k), numbers (n,)); returns residuals (n, m) and one Jacobian (n, m, tangent) per slot."""
+(n, k), numbers (n,), calibrations as fx, fy, skew, cx, cy (n, 5)); returns residuals (n, m) and one Jacobian
+(n, m, tangent) per slot."""
 
 
 def custom_factor(
@@ -101,6 +102,11 @@ def custom_factor(
     return gtsam.CustomFactor(noise, list(places), evaluate)
 
 
+def _calibration(values: gtsam.Values, key: int) -> FloatArray:
+    """fx, fy, skew, cx and cy of a variable of GTSAM's type Cal3_S2."""
+    return np.asarray(values.atCal3_S2(key).vector())
+
+
 class _Reader:
     """Reads the values of one slot at all sites; a variable that several sites share is read once."""
 
@@ -122,6 +128,7 @@ class _Reader:
             "vector": gtsam.Values.atVector,
             "point": gtsam.Values.atPoint3,
             "number": gtsam.Values.atDouble,
+            "calibration": _calibration,
         }[kind]
         self._is_pose = kind == "pose"
         self._twist: dict[int, FloatArray] = {}

@@ -5,7 +5,8 @@ compiled functions call. Only entry points are kept on disk; each holds the code
 
 Numba notices when the file of a function on disk has changed, but not when the file of a part has. An entry
 point is therefore kept under a name that ends in a digest of all source files of its folder: after an edit of
-any of them it is looked for under another name, and compiled anew.
+any of them it is looked for under another name, and compiled anew. A folder whose entry points take parts
+from another one names that: `Compiling(parts_from=...)`.
 
 `uncounted` has the same three decorators for functions that make no arrays. Numba counts references to arrays
 wherever a function hands them on, which costs half the time of a loop that hands on thirty of them; without
@@ -49,12 +50,15 @@ class Compiling:
     reordered.
     """
 
-    counts_references: bool
+    counts_references: bool = True
     """Whether Numba counts references to arrays: needed where a function makes arrays."""
+    parts_from: tuple[Path, ...] = ()
+    """Other folders that have parts of the entry points: their sources are in the digest too."""
 
     def entry(self, function: _F) -> _F:
         """Compile a function that Python calls, and keep the machine code on disk."""
-        digest = folder_digest(Path(function.__code__.co_filename).parent)
+        folders = (Path(function.__code__.co_filename).parent, *self.parts_from)
+        digest = "-".join(folder_digest(folder) for folder in folders)
         function.__qualname__ = f"{function.__qualname__}-{digest}"  # Numba names files after it
         compiled: Any = self._compile(function)
         kept = kept_code(function) if hasattr(compiled, "stats") else None  # without: compilation is off
@@ -73,6 +77,14 @@ class Compiling:
         """
         return self._compile(function, inline="always")
 
+    def merged(self, function: _F) -> _F:
+        """Copy a function as `inlined` does, but not before LLVM: what is copied is not typed again.
+
+        For functions that other functions of this kind call, and that take many arrays: a call hands on each
+        array as a dozen numbers.
+        """
+        return self._compile(function, forceinline=True)
+
     def _compile(self, function: _F, **options: Any) -> _F:
         if not self.counts_references:
             options["_nrt"] = False
@@ -80,7 +92,7 @@ class Compiling:
         return cast(_F, compiling(function))
 
 
-_counted = Compiling(counts_references=True)
+_counted = Compiling()
 entry, part, inlined = _counted.entry, _counted.part, _counted.inlined
 uncounted = Compiling(counts_references=False)
 

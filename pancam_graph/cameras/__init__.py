@@ -7,11 +7,15 @@ from pancam_graph.cameras._cahvore import CAHVORE as CAHVORE
 from pancam_graph.cameras._camera import Camera as Camera
 from pancam_graph.cameras._camera import Pinhole as Pinhole
 from pancam_graph.cameras._camera import Rays as Rays
-from pancam_graph.cameras._carry import carry_to_pinhole as carry_to_pinhole
 from pancam_graph.cameras._conditioning import Conditioning as Conditioning
 from pancam_graph.cameras._lens import MOUNT as MOUNT
+from pancam_graph.cameras._lens import Distorted as Distorted
+from pancam_graph.cameras._lens import Distortion as Distortion
 from pancam_graph.cameras._lens import Lens as Lens
 from pancam_graph.cameras._lens import LensField as LensField
+from pancam_graph.cameras._lens_table import LENS_SOURCES as LENS_SOURCES
+from pancam_graph.cameras._lens_table import LensTable as LensTable
+from pancam_graph.cameras._lens_table import distort as distort
 from pancam_graph.cameras._lenses import LENSES as LENSES
 from pancam_graph.cameras._lenses import as_cahv as as_cahv
 from pancam_graph.cameras._lenses import cahv_of_vectors as cahv_of_vectors

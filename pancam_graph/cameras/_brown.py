@@ -1,18 +1,22 @@
 """Pinhole with Brown distortion."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
+from pancam_graph.base.compiled import uncounted
 from pancam_graph.base.errors import CameraError
 from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.cameras._camera import PINHOLE_FIELDS, Pinhole, require_finite
-from pancam_graph.cameras._lens import Lens, LensField, linear_vectors
+from pancam_graph.cameras._lens import Distorted, Distortion, Lens, LensField, linear_vectors
 
 __all__ = ["BROWN_LENS", "Brown"]
 
 _BROWN_STEPS = 50
 _BROWN_TOLERANCE = 1e-14
+_MIN_DEPTH = 1e-12
+"""Least depth of a ray (d, w) of about unit length that counts as in front."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +57,19 @@ class Brown(Pinhole):
         d[:, 1, 1] = radial + 2 * y * y * d_radial + 6 * p1 * y + 2 * p2 * x
         return out, d
 
+    @cached_property
+    def fold_r2(self) -> float:
+        """Squared normalised radius where the radial distortion folds back; infinite where it never does."""
+        k1, k2, _, _, k3 = self.distortion
+        slope = np.array([7 * k3, 5 * k2, 3 * k1, 1.0])  # of the distorted radius, a polynomial in r2
+        roots = np.roots(slope)
+        real = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0)]
+        return float(real.min(initial=np.inf))
+
+    def in_domain(self, xy: FloatArray, d_distort: FloatArray) -> BoolArray:
+        """Whether points are before the fold; see `Pinhole.in_domain`."""
+        return np.asarray((np.sum(xy**2, axis=1) < self.fold_r2) & (np.linalg.det(d_distort) > 0))
+
     def undistort(self, xy_distorted: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Inverse of `distort` by Newton's method, and where it converged to the undistorted side.
 
@@ -72,7 +89,7 @@ class Brown(Pinhole):
                 break
         value, d = self.distort(xy)
         error = np.linalg.norm(value - xy_distorted, axis=1)
-        return xy, (error < 1e-10) & (np.linalg.det(d) > 0)
+        return xy, (error < 1e-10) & self.in_domain(xy, d)
 
 
 def _cahv_vectors(camera: Brown) -> dict[str, FloatArray]:
@@ -93,9 +110,41 @@ def _cahv_vectors(camera: Brown) -> dict[str, FloatArray]:
     return linear | {"O": linear["A"], "R": np.array([0.0, k1, k2])}
 
 
+@uncounted.part
+def _distort(p: FloatArray, row: int, d0: float, d1: float, d2: float, w: float) -> Distorted:
+    """`Brown.distort` for compiled loops; see `Distortion`. Beyond the fold nothing is in the domain."""
+    ahead = d2 > _MIN_DEPTH
+    per_depth = 1.0 / (d2 if ahead else 1.0)
+    x, y = d0 * per_depth, d1 * per_depth
+    k1, k2, p1, p2, k3 = p[row, 0], p[row, 1], p[row, 2], p[row, 3], p[row, 4]
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    by_r2 = k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3)
+    xx = radial + 2.0 * x * x * by_r2 + 2.0 * p1 * y + 6.0 * p2 * x
+    xy = 2.0 * x * y * by_r2 + 2.0 * p1 * x + 2.0 * p2 * y
+    yy = radial + 2.0 * y * y * by_r2 + 6.0 * p1 * y + 2.0 * p2 * x
+    distorted = (
+        x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+        y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+        1.0,
+    )
+    by_ray = (
+        (xx * per_depth, xy * per_depth, -(xx * x + xy * y) * per_depth),
+        (xy * per_depth, yy * per_depth, -(xy * x + yy * y) * per_depth),
+        (0.0, 0.0, 0.0),
+    )
+    within = r2 < p[row, 5] and xx * yy - xy * xy > 0.0
+    return ahead and within, distorted, by_ray, (0.0, 0.0, 0.0)
+
+
+def _parameters(camera: Brown) -> FloatArray:
+    return np.array([*camera.distortion, camera.fold_r2])
+
+
 BROWN_LENS = Lens(
     name="brown",
     camera=Brown,
     fields=(*PINHOLE_FIELDS, LensField(key="distortion", attribute="distortion", kind="vector", length=5)),
     cahv_vectors=_cahv_vectors,
+    distortion=Distortion(length=6, parameters=_parameters, distort=_distort),
 )

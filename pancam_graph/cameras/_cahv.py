@@ -186,4 +186,4 @@ CAHV_FIELDS = (
     LensField(key="H_px", attribute="H", kind="vector", length=3),
     LensField(key="V_px", attribute="V", kind="vector", length=3),
 )
-CAHV_LENS = Lens(name="cahv", camera=CAHV, fields=CAHV_FIELDS, cahv_vectors=own_vectors)
+CAHV_LENS = Lens(name="cahv", camera=CAHV, fields=CAHV_FIELDS, cahv_vectors=own_vectors, distortion=None)

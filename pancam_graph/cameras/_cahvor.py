@@ -4,12 +4,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pancam_graph.base.compiled import uncounted
 from pancam_graph.base.errors import CameraError
 from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.cameras._cahv import CAHV, CAHV_FIELDS, MIN_DEPTH, NEWTON_STEPS, own_vectors
-from pancam_graph.cameras._lens import Lens, LensField
+from pancam_graph.cameras._lens import Distorted, Distortion, Lens, LensField
 
 __all__ = ["CAHVOR", "CAHVOR_FIELDS", "CAHVOR_LENS"]
+
+_MIN_ALONG = 1e-12
+"""Least component along O of a ray (d, w) of about unit length that counts as in front."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -79,4 +83,38 @@ CAHVOR_FIELDS = (
     LensField(key="O", attribute="O", kind="vector", length=3),
     LensField(key="R", attribute="R", kind="vector", length=3),
 )
-CAHVOR_LENS = Lens(name="cahvor", camera=CAHVOR, fields=CAHVOR_FIELDS, cahv_vectors=own_vectors)
+
+
+@uncounted.part
+def _distort(p: FloatArray, row: int, d0: float, d1: float, d2: float, w: float) -> Distorted:
+    """The distortion of CAHVOR for compiled loops; see `Distortion`. Its pupil does not move with w."""
+    o0, o1, o2, r0, r1, r2 = p[row, 0], p[row, 1], p[row, 2], p[row, 3], p[row, 4], p[row, 5]
+    along = d0 * o0 + d1 * o1 + d2 * o2
+    ahead = along > _MIN_ALONG
+    per_along = 1.0 / (along if ahead else 1.0)
+    l0, l1, l2 = d0 - along * o0, d1 - along * o1, d2 - along * o2
+    # The tangent of the angle to O, in front; l and O are orthogonal as far as O is a unit vector.
+    a0, a1, a2 = l0 * per_along, l1 * per_along, l2 * per_along
+    t = a0 * a0 + a1 * a1 + a2 * a2
+    t = t if ahead else 0.0
+    m = r0 + t * (r1 + t * r2)
+    by_t = r1 + 2.0 * t * r2
+    aslant = a0 * o0 + a1 * o1 + a2 * o2 + t
+    g = 2.0 * by_t * per_along
+    g0, g1, g2 = g * (a0 - aslant * o0), g * (a1 - aslant * o1), g * (a2 - aslant * o2)
+    by_ray = (
+        (1.0 + m - m * o0 * o0 + l0 * g0, l0 * g1 - m * o0 * o1, l0 * g2 - m * o0 * o2),
+        (l1 * g0 - m * o1 * o0, 1.0 + m - m * o1 * o1 + l1 * g1, l1 * g2 - m * o1 * o2),
+        (l2 * g0 - m * o2 * o0, l2 * g1 - m * o2 * o1, 1.0 + m - m * o2 * o2 + l2 * g2),
+    )
+    growing = 1.0 + m + 2.0 * t * by_t > 0.0
+    return ahead and growing, (d0 + m * l0, d1 + m * l1, d2 + m * l2), by_ray, (0.0, 0.0, 0.0)
+
+
+CAHVOR_LENS = Lens(
+    name="cahvor",
+    camera=CAHVOR,
+    fields=CAHVOR_FIELDS,
+    cahv_vectors=own_vectors,
+    distortion=Distortion(length=6, parameters=lambda camera: [*camera.O, *camera.R], distort=_distort),
+)

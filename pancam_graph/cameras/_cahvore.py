@@ -7,15 +7,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pancam_graph.base.compiled import uncounted
 from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.cameras._cahv import MIN_DEPTH, NEWTON_STEPS, own_vectors
 from pancam_graph.cameras._cahvor import CAHVOR, CAHVOR_FIELDS
 from pancam_graph.cameras._camera import Rays, require_finite
-from pancam_graph.cameras._lens import Lens, LensField
+from pancam_graph.cameras._lens import Distorted, Distortion, Lens, LensField
 
 __all__ = ["CAHVORE", "CAHVORE_LENS"]
 
 _MIN_RANGE_M = 1e-6
+_STEPS = 20
+"""Most steps of Newton's method to the field angle of a ray in compiled loops; most need two."""
+_NEXT_IS_EXACT = 1e-8
+"""Step of Newton's method, radians, after which what is left is the square of it: below rounding."""
+_LEAST_L = 1e-12
+"""Linearity below which, by its size, it counts as 0."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -180,6 +187,96 @@ class CAHVORE(CAHVOR):
         raise AssertionError("CAHVORE is not central")
 
 
+@uncounted.part
+def _pupil(p: FloatArray, row: int, angle: float, sin: float, cos: float) -> tuple[float, float]:
+    """`CAHVORE._pupil` for compiled loops: the pupil's shift, metres, and its derivative by the angle."""
+    square = angle * angle
+    if abs(angle) < 1e-3:
+        ratio, by_angle = square * (1 / 6 + 7 / 360 * square), angle * (1 / 3 + 7 / 90 * square)
+    else:
+        per_sin = 1.0 / sin
+        ratio, by_angle = angle * per_sin - 1.0, (sin - angle * cos) * per_sin * per_sin
+    e0, e1, e2 = p[row, 6], p[row, 7], p[row, 8]
+    e = e0 + square * (e1 + square * e2)
+    return ratio * e, by_angle * e + ratio * angle * (2.0 * e1 + 4.0 * e2 * square)
+
+
+@uncounted.part
+def _radius(linearity: float, angle: float) -> tuple[bool, float, float]:
+    """Whether the linearised radius of a field angle exists; the radius, and its derivative by the angle."""
+    y = linearity * angle
+    inside = abs(y) < np.pi / 2 - 1e-9
+    if abs(linearity) < _LEAST_L:
+        return inside, angle, 1.0
+    y = y if inside else 0.0
+    sin, cos = np.sin(y), np.cos(y)
+    if linearity > 0.0:
+        return inside, sin / (cos * linearity), 1.0 / (cos * cos)
+    return inside, sin / linearity, cos
+
+
+@uncounted.part
+def _distort(p: FloatArray, row: int, d0: float, d1: float, d2: float, w: float) -> Distorted:
+    """The distortion of CAHVORE for compiled loops; see `Distortion`.
+
+    The point d / w is seen at the field angle th with cos(th) |l| = sin(th) (z - w s(th)), for d = l + z O.
+    The distorted ray is O + k(th) l / |l|; the derivatives of th follow from the equation's.
+    """
+    o0, o1, o2 = p[row, 0], p[row, 1], p[row, 2]
+    z = d0 * o0 + d1 * o1 + d2 * o2
+    l0, l1, l2 = d0 - z * o0, d1 - z * o1, d2 - z * o2
+    length = np.sqrt(l0 * l0 + l1 * l1 + l2 * l2)
+    distance = np.sqrt(length * length + z * z)
+    angle = np.arctan2(length, z)
+    found = distance > 0.0
+    for _ in range(_STEPS):
+        sin, cos = np.sin(angle), np.cos(angle)
+        s, by_angle = _pupil(p, row, angle, sin, cos)
+        slope = w * sin * by_angle - sin * length - cos * (z - w * s)
+        found = found and slope < 0.0
+        if not found:
+            break
+        step = (cos * length - sin * (z - w * s)) / slope
+        angle -= min(max(step, -0.3), 0.3)
+        if abs(step) < _NEXT_IS_EXACT:
+            break
+    sin, cos = np.sin(angle), np.cos(angle)
+    s, by_angle = _pupil(p, row, angle, sin, cos)
+    slope = w * sin * by_angle - sin * length - cos * (z - w * s)
+    found = found and slope < 0.0 and abs(cos * length - sin * (z - w * s)) < 1e-12 * distance
+    # The shift of the pupil grows without bound with the angle: no point nearer than it is in the domain.
+    reach = sin * length + cos * z
+    found = found and -1e-12 <= angle < np.pi and reach > abs(w) * (abs(s) + _MIN_RANGE_M)
+    inside, x, by_x = _radius(p[row, 9], angle)
+    if not (found and inside):
+        return False, (o0, o1, o2), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.0)
+    r0, r1, r2, xx = p[row, 3], p[row, 4], p[row, 5], x * x
+    k = x * (1.0 + r0 + xx * (r1 + xx * r2))
+    by_k = (1.0 + r0 + xx * (3.0 * r1 + xx * 5.0 * r2)) * by_x
+    per_slope = 1.0 / slope
+    # On the axis l / |l| has no direction, but k / |l| has a limit.
+    on_axis = length < 1e-12 * distance
+    per_length = 0.0 if on_axis else 1.0 / length
+    u0, u1, u2 = l0 * per_length, l1 * per_length, l2 * per_length
+    gain = -by_k * cos * per_slope if on_axis else k * per_length
+    along, across = -by_k * cos * per_slope, by_k * sin * per_slope
+    # By the ray: gain (I - O O' - u u') + u (along u' + across O').
+    g = along - gain
+    h0, h1, h2 = g * u0 + across * o0, g * u1 + across * o1, g * u2 + across * o2
+    by_ray = (
+        (gain - gain * o0 * o0 + u0 * h0, u0 * h1 - gain * o0 * o1, u0 * h2 - gain * o0 * o2),
+        (u1 * h0 - gain * o1 * o0, gain - gain * o1 * o1 + u1 * h1, u1 * h2 - gain * o1 * o2),
+        (u2 * h0 - gain * o2 * o0, u2 * h1 - gain * o2 * o1, gain - gain * o2 * o2 + u2 * h2),
+    )
+    by_w = -across * s
+    distorted = (o0 + k * u0, o1 + k * u1, o2 + k * u2)
+    return by_k > 0.0, distorted, by_ray, (u0 * by_w, u1 * by_w, u2 * by_w)
+
+
+def _parameters(camera: CAHVORE) -> FloatArray:
+    return np.array([*camera._unit_axis, *camera.R, *camera.E, camera.linearity])
+
+
 CAHVORE_LENS = Lens(
     name="cahvore",
     camera=CAHVORE,
@@ -189,4 +286,5 @@ CAHVORE_LENS = Lens(
         LensField(key="linearity", attribute="linearity"),
     ),
     cahv_vectors=lambda camera: own_vectors(camera) | {"linearity": camera.linearity},
+    distortion=Distortion(length=10, parameters=_parameters, distort=_distort),
 )

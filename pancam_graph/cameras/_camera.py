@@ -70,6 +70,10 @@ class Camera(ABC):
         Raises CameraError for focal lengths that are not above 0.
         """
 
+    def with_unit_calibration(self) -> "Camera":
+        """The same camera with a K of 1: its pixels are normalised coordinates after the distortion."""
+        return self.with_calibration(np.eye(3))
+
     @property
     def pupil_moves(self) -> bool:
         """Whether rays of different pixels start at different points, so that near and far points differ."""
@@ -151,6 +155,13 @@ class Pinhole(Camera):
         """Distorted normalised coordinates (n, 2) and their derivative (n, 2, 2): here, none."""
         return xy, np.broadcast_to(np.eye(2), (len(xy), 2, 2))
 
+    def in_domain(self, xy: FloatArray, d_distort: FloatArray) -> BoolArray:
+        """Whether `distort` describes the lens at normalised coordinates (n, 2): here, everywhere.
+
+        `d_distort` (n, 2, 2) is its derivative there.
+        """
+        return np.ones(len(xy), dtype=bool)
+
     def undistort(self, xy_distorted: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Inverse of `distort`, and where it exists: here, everywhere."""
         return xy_distorted, np.ones(len(xy_distorted), dtype=bool)
@@ -164,6 +175,7 @@ class Pinhole(Camera):
         xy = points_m[:, :2] / z[:, None]
         xy_distorted, d_distort = self.distort(xy)
         k = self.calibration_matrix
+        valid &= self.in_domain(xy, d_distort)
         return xy_distorted @ k[:2, :2].T + k[:2, 2], xy, z, d_distort, valid
 
     def project(self, points_m: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -231,6 +243,7 @@ PINHOLE_LENS = Lens(
     camera=Pinhole,
     fields=PINHOLE_FIELDS,
     cahv_vectors=lambda camera: linear_vectors(camera.calibration_matrix),
+    distortion=None,
 )
 
 

@@ -2,15 +2,21 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pancam_graph.base.geometry import FloatArray
 
-__all__ = ["MOUNT", "Lens", "LensField", "linear_vectors"]
+__all__ = ["MOUNT", "Distorted", "Distortion", "Lens", "LensField", "linear_vectors"]
 
 CameraT = TypeVar("CameraT")
+
+_Vector: TypeAlias = tuple[float, float, float]
+Distorted: TypeAlias = tuple[bool, _Vector, tuple[_Vector, _Vector, _Vector], _Vector]
+"""What a compiled distortion returns: whether the ray is in the model's domain; the distorted ray; its
+derivative by the ray, by rows; and its derivative by w."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +45,24 @@ MOUNT = LensField(key="head_T_camera", kind="mount")
 
 
 @dataclass(frozen=True, kw_only=True)
+class Distortion(Generic[CameraT]):
+    """The projection of a camera model in compiled loops: what it does to rays before K takes them to pixels.
+
+    A ray (d, w) is a homogeneous point in the camera's own frame: the point d / w, and a direction where w is
+    0. A factor above 0 on both changes no pixel. K times the distorted ray is the homogeneous pixel.
+    """
+
+    length: int
+    """How many parameters there are."""
+    parameters: Callable[[CameraT], ArrayLike]
+    """(length,) parameters of a camera; its K is not among them."""
+    distort: Callable[[FloatArray, int, float, float, float, float], Distorted]
+    """Compiled (`base.compiled.uncounted.part`): takes a table (lenses, length or more), its row, the ray's d
+    and w. Outside the model's domain all that it returns is finite and means nothing. The distorted ray may
+    have any length that does not vanish; derivatives are those of what is returned."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Lens(Generic[CameraT]):
     """A camera model as files and conversions know it."""
 
@@ -52,6 +76,8 @@ class Lens(Generic[CameraT]):
     cahv_vectors: Callable[[CameraT], Mapping[str, Any]]
     """The same camera as arguments of the CAHV family, in the camera's own frame: the vectors C, A, H, V, for
     CAHVOR also O and R, for CAHVORE also E and `linearity`. Raises CameraError saying why there are none."""
+    distortion: Distortion[CameraT] | None
+    """The projection in compiled loops; None for a model that K alone describes."""
 
     @property
     def in_head_frame(self) -> bool:

@@ -8,7 +8,6 @@ import scipy
 from pancam_graph.base.errors import CameraError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.cameras._camera import Camera, Pinhole
-from pancam_graph.cameras._carry import carry_to_pinhole
 
 __all__ = ["straight_pixels", "straightened", "straightening_map"]
 
@@ -57,15 +56,45 @@ def straightened(camera: Camera, range_m: float) -> Pinhole:
 def straight_pixels(
     camera: Camera, straight: Pinhole, uv_px: FloatArray, range_m: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Pixels (n, 2) of a camera as its straightened pinhole has them, at the ranges (n,).
+    """Pixels (n, 2) of a camera as its straightened pinhole would have measured them.
+
+    The camera is in its own frame. `range_m` (n,) is the distance from its centre to what each pixel sees; it
+    matters only where the entrance pupil moves (CAHVORE); a rough value is enough there unless the point is
+    near.
 
     Returns the pixels, matrices (n, 2, 2) that take small residuals of the camera's image to the straightened
-    image, and validity (n,), as `carry_to_pinhole`.
+    image, and validity (n,): False outside either model's domain.
     """
-    carried, back, valid = carry_to_pinhole(camera, uv_px, range_m)
+    carried, forward, valid = _at_pinhole(camera, uv_px, range_m)
     # From the camera's pinhole, with its skew and its place of the first pixel, to the other: a shear.
     shear = straight.calibration_matrix @ np.linalg.inv(camera.pinhole.calibration_matrix)
-    return carried @ shear[:2, :2].T + shear[:2, 2], shear[:2, :2] @ np.linalg.inv(back), valid
+    return carried @ shear[:2, :2].T + shear[:2, 2], shear[:2, :2] @ forward, valid
+
+
+def _at_pinhole(
+    camera: Camera, uv_px: FloatArray, range_m: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """`straight_pixels` for the pinhole of the camera itself, with its skew and principal point."""
+    pinhole = camera.pinhole
+    if camera == pinhole:
+        n = len(uv_px)
+        return uv_px, np.broadcast_to(np.eye(2), (n, 2, 2)).copy(), np.ones(n, dtype=bool)
+    rays = camera.unproject(uv_px)
+    # The range counts from the centre; the ray starts at the pupil.
+    along = np.einsum("ni,ni->n", rays.origin_m, rays.direction)
+    apart = np.einsum("ni,ni->n", rays.origin_m, rays.origin_m)
+    reach = np.sqrt(np.maximum(range_m**2 + along**2 - apart, 1e-12)) - along
+    points = rays.origin_m + reach[:, None] * rays.direction
+    carried, d_pinhole, in_front = pinhole.project_with_jacobian(points)
+    _, d_camera, seen = camera.project_with_jacobian(points)
+    # Both derivatives vanish along the line of sight, so any right inverse of one serves the other.
+    gram = d_camera @ d_camera.transpose(0, 2, 1)
+    valid = rays.valid & in_front & seen & (np.abs(np.linalg.det(gram)) > 0)
+    gram = np.where(valid[:, None, None], gram, np.eye(2))
+    forward = d_pinhole @ d_camera.transpose(0, 2, 1) @ np.linalg.inv(gram)
+    valid &= np.linalg.det(forward) > 1e-9
+    forward = np.where(valid[:, None, None], forward, np.eye(2))
+    return np.where(valid[:, None], carried, uv_px), forward, valid
 
 
 def straightening_map(camera: Camera, straight: Pinhole, range_m: float) -> FloatArray | None:

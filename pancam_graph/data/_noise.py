@@ -50,6 +50,11 @@ class PixelNoise:
         added = np.square(sigma_px)[:, None, None] * np.eye(2)
         return PixelNoise(sigma_px=sigma, covariance_px2=self.covariance_px2 + added)
 
+    @property
+    def whitening(self) -> FloatArray:
+        """L^-1 (n, 2, 2): takes residuals in pixels to unit covariance."""
+        return self.whiten(np.broadcast_to(np.eye(2), (len(self.sigma_px), 2, 2)))
+
     def whiten(self, pixels: FloatArray) -> FloatArray:
         """L^-1 times vectors (n, 2) or matrices (n, 2, k) in pixels: of unit covariance."""
         if self.covariance_px2 is None:

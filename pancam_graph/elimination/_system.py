@@ -214,11 +214,8 @@ class LandmarkSystem:
 
     def bearings(self, posture: Posture) -> kernel.Bearings:
         """A posture as the kernel reads it."""
-        views = posture.views
         return kernel.Bearings(
-            to_pixel=np.ascontiguousarray(views.to_pixel),
-            centre_m=np.ascontiguousarray(views.world_t_camera),
-            calibration=np.ascontiguousarray(views.calibration),
+            cameras=posture.views.in_kernel,
             unit_R=np.ascontiguousarray(posture.unit_R),
             unit_t=np.ascontiguousarray(posture.unit_t),
             segment_begin=self.linkage.segment_begin,
@@ -390,7 +387,8 @@ class LandmarkSystem:
         A stray is refined from its place after the step; if its cost remains large, it is triangulated from
         its rays. Halfway to the optimum all landmarks are refined.
         """
-        counts, seen = np.diff(self._seen.begin), self._seen
+        seen = self._seen_by(bearings.cameras)
+        counts = np.diff(seen.begin)
         before, after = self.reduced.cost, self._moved_cost
         # A landmark whose cost hardly changes is placed as well as before, however large its cost.
         touched = np.abs(after - before) > _TOUCHED * before
@@ -401,7 +399,6 @@ class LandmarkSystem:
         self.regained = 0.0
         if len(strays) == 0:
             return
-        seen = seen._replace(to_pixel=bearings.to_pixel, centre_m=bearings.centre_m)
         weight, loss, refined = np.ones(len(seen.image)), self.loss, self._moved.copy()
         over_landmarks(
             kernel.refine,
@@ -430,18 +427,21 @@ class LandmarkSystem:
         placed = refine(placed, part, views, weight, self.loss, beyond_infinity=True)
         self._take_if_better(strays, placed.vector[rows], bearings)
 
-    @cached_property
-    def _seen(self) -> kernel.Seen:
-        """Observations for loops over landmarks, in the order of elimination; cameras are filled in later."""
+    def _seen_by(self, cameras: kernel.Cameras) -> kernel.Seen:
+        """Observations for loops over landmarks, in the order of elimination."""
         sights = self.sights
         return kernel.Seen(
-            begin=sights.occurrence_begin[sights.landmark_begin],
+            begin=self._begin,
             image=sights.image,
             uv_px=sights.uv_px,
             whitening=sights.whitening,
-            to_pixel=np.zeros((0, 3, 3)),
-            centre_m=np.zeros((0, 3)),
+            cameras=cameras,
         )
+
+    @cached_property
+    def _begin(self) -> IntArray:
+        """(landmarks + 1,) first observation of each landmark in the order of elimination, and n."""
+        return self.sights.occurrence_begin[self.sights.landmark_begin]
 
     def _take_if_better(self, strays: IntArray, vector: FloatArray, bearings: kernel.Bearings) -> None:
         cost, loss = np.empty(len(strays)), self.loss

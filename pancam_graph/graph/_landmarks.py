@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 
 from pancam_graph.base.geometry import BoolArray, FloatArray
+from pancam_graph.factors import Fixed, Key, camera_projection_factor
 from pancam_graph.graph._given import GivenFactor, seated
 from pancam_graph.graph._keys import Kind, key_of, read_variable
 from pancam_graph.graph._native_calibrations import NativeCalibrations
@@ -19,22 +20,22 @@ __all__ = ["ExplicitLandmarks"]
 
 
 class ExplicitLandmarks:
-    """One Point3 variable `L` per landmark, one native factor per observation.
+    """One Point3 variable `L` per landmark, one factor per observation: native ones of pinholes.
 
-    GTSAM's projections have no distortion: measurements are in pixels of the pinhole of the same camera, and
-    the noise model takes residuals back to raw pixels. A landmark behind a camera has a large constant cost,
-    so the optimiser rejects the step. GTSAM's factor of a free calibration lacks this, and the caller must
-    check for such landmarks.
+    GTSAM's projections have no distortion: observations of other cameras are factors of this package. A
+    landmark behind a camera has a large constant cost, so the optimiser rejects the step. GTSAM's factor of a
+    free calibration lacks this, and the caller must check for such landmarks.
     """
 
     def __init__(self, template: SoftTemplate, measurements: Measurements) -> None:
         self.template = template
         self.measurements = measurements
         self.calibrations = NativeCalibrations(template.rig_variables)
+        rig = template.traverse.rig
         self._calibration = [
-            gtsam.Cal3_S2(p.fx_px, p.fy_px, p.skew_px, p.cx_px, p.cy_px)
-            for p in template.traverse.rig.pinholes
+            gtsam.Cal3_S2(p.fx_px, p.fy_px, p.skew_px, p.cx_px, p.cy_px) for p in rig.pinholes
         ]
+        self._lens = [eye.camera.with_unit_calibration() for eye in rig.eyes]
 
     @staticmethod
     def key(landmark: int) -> int:
@@ -53,7 +54,7 @@ class ExplicitLandmarks:
         return graph
 
     def factors(self, accepted: BoolArray, loss: Loss = SQUARED) -> gtsam.NonlinearFactorGraph:
-        """A native factor for each accepted observation."""
+        """A factor for each accepted observation."""
         graph = gtsam.NonlinearFactorGraph()
         m, eye = self.measurements, self.template.traverse.image_eye
         isotropic: dict[float, gtsam.noiseModel.Base] = {}  # one model serves all pinholes of one sigma
@@ -69,23 +70,36 @@ class ExplicitLandmarks:
                 noise = loss.noise_model(gtsam.noiseModel.Gaussian.SqrtInformation(w, False))
             image = int(m.image[i])
             camera, landmark = self.template.camera_key(image), self.key(int(m.landmark[i]))
-            if self.calibrations.any:
+            if self.template.lenses.row[image] >= 0:
+                graph.push_back(
+                    camera_projection_factor(
+                        noise,
+                        Key(landmark),
+                        Key(camera),
+                        Key(self.calibrations.key(image))
+                        if self.calibrations.any
+                        else Fixed(self._calibration[eye[image]].vector()),
+                        lens=self._lens[eye[image]],
+                        uv_px=m.uv_px[i],
+                    )
+                )
+            elif self.calibrations.any:
                 calibration = self.calibrations.key(image)
                 graph.push_back(
                     gtsam.GeneralSFMFactor2Cal3_S2(m.uv_px[i], noise, camera, landmark, calibration)
                 )
-                continue
-            graph.push_back(
-                gtsam.GenericProjectionFactorCal3_S2(
-                    m.uv_px[i],
-                    noise,
-                    camera,
-                    landmark,
-                    self._calibration[eye[image]],
-                    False,
-                    False,
+            else:
+                graph.push_back(
+                    gtsam.GenericProjectionFactorCal3_S2(
+                        m.uv_px[i],
+                        noise,
+                        camera,
+                        landmark,
+                        self._calibration[eye[image]],
+                        False,
+                        False,
+                    )
                 )
-            )
         return graph
 
     def proximal_factors(

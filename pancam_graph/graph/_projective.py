@@ -70,6 +70,7 @@ class ProjectiveTemplate(SoftTemplate):
             world_R_camera=np.ascontiguousarray(camera_R_world.transpose(0, 2, 1)),
             world_t_camera=centre_m + self.conditioning.origin_m,
             calibration=K,
+            lenses=self.lenses,
         )
 
     def posture(self, values: gtsam.Values) -> Posture:

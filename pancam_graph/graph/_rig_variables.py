@@ -12,14 +12,13 @@ import gtsam
 import numpy as np
 
 from pancam_graph.base.geometry import (
-    BoolArray,
     FloatArray,
     IntArray,
     corrected_poses,
     correction_twists,
     pose_arrays,
 )
-from pancam_graph.cameras import CALIBRATION_ENTRIES, Camera
+from pancam_graph.cameras import CALIBRATION_ENTRIES
 from pancam_graph.data import (
     ASPECT,
     ENTRIES,
@@ -273,32 +272,6 @@ class RigVariables:
         row, column = CALIBRATION_ENTRIES
         out[:, row, column] += self._read("calibration", values)
         return out
-
-    def cameras(self, values: gtsam.Values) -> list[tuple[Camera, BoolArray]]:
-        """The rig's cameras, distortion included, each with the mask (images,) of the images that it took."""
-        t, out = self.traverse, []
-        K, calibration_of = (
-            self.calibration(values),
-            self._place.get("calibration", np.zeros(len(t.images), dtype=int)),
-        )
-        for i, eye in enumerate(t.rig.eyes):
-            for place in np.unique(calibration_of[t.image_eye == i]):
-                images = (t.image_eye == i) & (calibration_of == place)
-                free = bool(self.of["calibration"])
-                camera = eye.camera.with_calibration(K[np.argmax(images)]) if free else eye.camera
-                out.append((camera, images))
-        return out
-
-    @property
-    def pupil_moves(self) -> bool:
-        """Whether the pinhole equivalent of a camera's pixels depends on the range of the point."""
-        return any(eye.camera.pupil_moves for eye in self.traverse.rig.eyes)
-
-    @property
-    def distortion_moves(self) -> bool:
-        """Whether a distorted camera has a free calibration: its pinhole pixels then change with it."""
-        distorted = (eye.camera != eye.camera.pinhole for eye in self.traverse.rig.eyes)
-        return bool(self.of["calibration"]) and any(distorted)
 
     def mounts(self, values: gtsam.Values) -> tuple[FloatArray, FloatArray]:
         """`head_T_camera` (images, 3, 3), (images, 3)."""

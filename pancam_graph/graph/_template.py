@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 
 from pancam_graph.base.geometry import FloatArray, IntArray
+from pancam_graph.cameras import LensTable
 from pancam_graph.data import Refined, RigCorrection, Sharing, State, Traverse
 from pancam_graph.elimination import Covariance, JointCovariance, Linkage, PosePlace, Posture, Root
 from pancam_graph.factors import Fixed, Key, Slot
@@ -247,10 +248,18 @@ class FactorTemplate(ABC):
         self, world_R_camera: FloatArray, world_t_camera: FloatArray, values: gtsam.Values
     ) -> CameraViews:
         """Cameras of all images from their poses (images, 3, 3), (images, 3) and the values' calibrations."""
-        calibration = self.rig_variables.calibration(values)
         return CameraViews(
-            world_R_camera=world_R_camera, world_t_camera=world_t_camera, calibration=calibration
+            world_R_camera=world_R_camera,
+            world_t_camera=world_t_camera,
+            calibration=self.rig_variables.calibration(values),
+            lenses=self.lenses,
         )
+
+    @cached_property
+    def lenses(self) -> LensTable:
+        """The distortions of all images' cameras."""
+        t = self.traverse
+        return LensTable.of([eye.camera for eye in t.rig.eyes], t.image_eye)
 
 
 def _sigmas(

@@ -64,7 +64,7 @@ def _rigid_graph(
     """
     factors = template.factors()
     graph, m, t, rig = graph_of(factors.priors), measurements, template.traverse, template.rig_variables
-    free = bool(rig.of["calibration"])
+    free, lenses = bool(rig.of["calibration"]), [e.camera.with_unit_calibration() for e in t.rig.eyes]
     for i in np.flatnonzero(accepted).tolist():
         image = int(m.image[i])
         calibration: Slot = Fixed(np.zeros(0))
@@ -84,6 +84,7 @@ def _rigid_graph(
                 calibration,
                 nominal=t.calibration[image : image + 1],
                 basis=basis,
+                lens=lenses[int(t.image_eye[image])],
                 uv_px=m.uv_px[i : i + 1],
             )
         )

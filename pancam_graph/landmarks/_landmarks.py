@@ -6,7 +6,7 @@ functions of (X, w), so a ridge on the horizon (w near 0) is an ordinary landmar
 beyond infinity (w below 0) can come back.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.base.threads import in_parallel
+from pancam_graph.cameras import Camera, LensTable
 from pancam_graph.landmarks import kernel
 from pancam_graph.landmarks._losses import SQUARED, Loss
 
@@ -30,6 +31,7 @@ __all__ = [
     "Measurements",
     "evaluate",
     "free_derivatives",
+    "lines_of_sight",
     "point_sigma_m",
     "rays_of",
     "refine",
@@ -41,7 +43,7 @@ __all__ = [
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraViews:
-    """Pinhole cameras of all images."""
+    """Cameras of all images."""
 
     world_R_camera: FloatArray
     """(images, 3, 3) orientation of each camera"""
@@ -49,16 +51,60 @@ class CameraViews:
     """(images, 3) centre of each camera in the world, metres"""
     calibration: FloatArray
     """(images, 3, 3) calibration matrix K, upper triangular"""
+    lenses: LensTable | None = None
+    """What their lenses do to rays before K; None: nothing, they are pinholes"""
 
     @cached_property
-    def to_pixel(self) -> FloatArray:
-        """(images, 3, 3) K camera_R_world: takes world directions to homogeneous pixels."""
-        return np.asarray(self.calibration @ self.world_R_camera.transpose(0, 2, 1))
+    def in_kernel(self) -> kernel.Cameras:
+        """The cameras as the compiled loops read them."""
+        n = len(self.world_t_camera)
+        lenses = self.lenses or LensTable.without(n)
+        calibration = as_floats(self.calibration, (n, 3, 3))
+        world_R_camera = as_floats(self.world_R_camera, (n, 3, 3))
+        return kernel.Cameras(
+            to_pixel=np.ascontiguousarray(self.calibration @ self.world_R_camera.transpose(0, 2, 1)),
+            centre_m=as_floats(self.world_t_camera, (n, 3)),
+            calibration=calibration,
+            world_R_camera=world_R_camera,
+            lens=lenses.row,
+            lens_kind=lenses.kind,
+            lens_parameters=lenses.parameters,
+        )
+
+    def after(self, rotation: FloatArray, shift_m: FloatArray) -> "CameraViews":
+        """The cameras after a rigid motion of the world: x becomes rotation (3, 3) x + shift (3,)."""
+        return replace(
+            self,
+            world_R_camera=rotation @ self.world_R_camera,
+            world_t_camera=self.world_t_camera @ rotation.T + shift_m,
+        )
+
+    @staticmethod
+    def of(cameras: Sequence[Camera]) -> "CameraViews":
+        """One image of each camera, in the camera's own frame as the world."""
+        n = len(cameras)
+        return CameraViews(
+            world_R_camera=np.tile(np.eye(3), (n, 1, 1)),
+            world_t_camera=np.zeros((n, 3)),
+            calibration=np.array([c.pinhole.calibration_matrix for c in cameras]).reshape(n, 3, 3),
+            lenses=LensTable.of(cameras, np.arange(n)),
+        )
+
+    @staticmethod
+    def joined(parts: "Sequence[CameraViews]") -> "CameraViews":
+        """The cameras of several sets of images, one after the other."""
+        lenses = [v.lenses or LensTable.without(len(v.world_t_camera)) for v in parts]
+        return CameraViews(
+            world_R_camera=np.concatenate([v.world_R_camera for v in parts]),
+            world_t_camera=np.concatenate([v.world_t_camera for v in parts]),
+            calibration=np.concatenate([v.calibration for v in parts]),
+            lenses=LensTable.joined(lenses),
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Measurements:
-    """Observations as pinhole pixels, sorted by landmark; n rows."""
+    """Observations sorted by landmark; n rows."""
 
     row: IntArray
     """(n,) row in the traverse's observations"""
@@ -67,9 +113,9 @@ class Measurements:
     landmark: IntArray
     """(n,) landmark row, ascending, without gaps"""
     uv_px: FloatArray
-    """(n, 2) pixels of the pinhole of the same camera"""
+    """(n, 2) pixels as measured"""
     whitening: FloatArray
-    """(n, 2, 2) takes a residual of the pinhole to raw pixels, and these to unit covariance"""
+    """(n, 2, 2) takes a residual in pixels to unit covariance"""
 
     @property
     def n_landmarks(self) -> int:
@@ -174,18 +220,30 @@ def triangulate(
 
 def rays_of(measurements: Measurements, views: CameraViews) -> tuple[FloatArray, FloatArray]:
     """Centres (n, 3) and unit directions (n, 3) of the measurements' lines of sight, in the world."""
-    seen = seen_by(measurements, views)
-    n_images, direction = len(views.calibration), np.empty((len(seen.image), 3))
-    calibration = as_floats(views.calibration, (n_images, 3, 3))
-    rotation = as_floats(views.world_R_camera, (n_images, 3, 3))
+    centre_m, direction, _ = lines_of_sight(measurements.image, measurements.uv_px, views)
+    return centre_m, direction
+
+
+def lines_of_sight(
+    image: IntArray, uv_px: FloatArray, views: CameraViews
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Points (n, 3), metres, and unit directions (n, 3) in the world of the lines of sight of pixels (n, 2).
+
+    The point is the camera's centre, or one near it where the camera's pupil moves. Returns also whether each
+    pixel has a line of sight (n,): a pixel outside the domain of its lens has none, and gets that of the
+    pinhole instead. Raises IndexError for an image (n,) without a camera.
+    """
+    n = len(image)
+    images, pixels, cameras = _images(image, views), as_floats(uv_px, (n, 2)), views.in_kernel
+    centre, direction, seen = np.empty((n, 3)), np.empty((n, 3)), np.empty(n, dtype=bool)
     in_parallel(
-        lambda first, last: kernel.ray_directions(
-            seen.image, seen.uv_px, calibration, rotation, first, last, direction
+        lambda first, last: kernel.lines_of_sight(
+            images, pixels, cameras, first, last, centre, direction, seen
         ),
-        len(direction),
+        n,
         grain=_RAY_GRAIN,
     )
-    return views.world_t_camera[seen.image], direction
+    return centre, direction, seen
 
 
 def evaluate(
@@ -305,18 +363,23 @@ def as_floats(array: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
 
 def seen_by(measurements: Measurements, views: CameraViews) -> kernel.Seen:
     """Measurements with the cameras that made them. Raises IndexError for an image without a camera."""
-    n, n_images = len(measurements.image), len(views.world_t_camera)
-    image = np.require(measurements.image, np.int64, ["C", "W"])
-    if n and not 0 <= image.min() <= image.max() < n_images:
-        raise IndexError(f"image: expected 0 to {n_images - 1}, found {image.min()} to {image.max()}")
+    n = len(measurements.image)
     return kernel.Seen(
         begin=measurements.begin,
-        image=image,
+        image=_images(measurements.image, views),
         uv_px=as_floats(measurements.uv_px, (n, 2)),
         whitening=as_floats(measurements.whitening, (n, 2, 2)),
-        to_pixel=as_floats(views.to_pixel, (n_images, 3, 3)),
-        centre_m=as_floats(views.world_t_camera, (n_images, 3)),
+        cameras=views.in_kernel,
     )
+
+
+def _images(image: IntArray, views: CameraViews) -> IntArray:
+    """Images (n,) as contiguous int64. Raises IndexError for one without a camera."""
+    n_images = len(views.world_t_camera)
+    images: IntArray = np.require(image, np.int64, ["C", "W"])
+    if len(images) and not 0 <= images.min() <= images.max() < n_images:
+        raise IndexError(f"image: expected 0 to {n_images - 1}, found {images.min()} to {images.max()}")
+    return images
 
 
 def _arrays(landmarks: Landmarks, measurements: Measurements) -> tuple[FloatArray, FloatArray]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from pancam_graph.base.geometry import FloatArray
 from pancam_graph.elimination import Posture
-from pancam_graph.landmarks import CameraViews, Landmarks
+from pancam_graph.landmarks import Landmarks
 
 __all__ = ["CommonMotion", "carried", "orthonormal", "posture_in"]
 
@@ -50,13 +50,9 @@ def carried(landmarks: Landmarks, by: gtsam.Pose3) -> Landmarks:
 
 def posture_in(posture: Posture, by: gtsam.Pose3) -> Posture:
     """Cameras after a rigid motion of the world; the chain rule in body-frame tangents stays the same."""
-    rotation, shift, views = by.rotation().matrix(), by.translation(), posture.views
+    rotation, shift = by.rotation().matrix(), by.translation()
     return Posture(
-        views=CameraViews(
-            world_R_camera=rotation @ views.world_R_camera,
-            world_t_camera=views.world_t_camera @ rotation.T + shift,
-            calibration=views.calibration,
-        ),
+        views=posture.views.after(rotation, shift),
         unit_R=rotation @ posture.unit_R,
         unit_t=posture.unit_t @ rotation.T + shift,
         chain=posture.chain,

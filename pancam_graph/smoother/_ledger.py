@@ -40,7 +40,6 @@ _COLUMNS: dict[str, tuple[tuple[int, ...], type]] = {
     "uv_px": ((2,), np.float64),
     "sigma_px": ((), np.float64),
     "covariance_px2": ((2, 2), np.float64),
-    "carried_px": ((2,), np.float64),
     "whitening": ((2, 2), np.float64),
     "fate": ((), np.int8),
 }
@@ -65,14 +64,12 @@ class Ledger:
         self,
         image: IntArray,
         observations: Observations,
-        carried_px: FloatArray,
-        whitening: FloatArray,
         valid: BoolArray,
     ) -> IntArray:
         """Append observations of images (n,), rows of the drive's images; return their rows (n,).
 
-        `carried_px` (n, 2) are their pixels in the pinhole of the same camera; `valid` (n,) whether these
-        exist. One that was removed takes its old row: an image sees a track once.
+        `valid` (n,) says whether they are in the domain of their camera. One that was removed takes its old
+        row: an image sees a track once.
         """
         rows = self._find_among(self.all_with(Fate.REMOVED), image, observations.track)
         is_new = rows < 0
@@ -94,7 +91,7 @@ class Ledger:
         of = observations
         for name, part in zip(
             _COLUMNS,
-            (image, of.track, of.uv_px, of.sigma_px, covariance, carried_px, whitening, fate),
+            (image, of.track, of.uv_px, of.sigma_px, covariance, of.noise.whitening, fate),
             strict=True,
         ):
             self._column[name][rows] = part
@@ -114,13 +111,13 @@ class Ledger:
         return self._all("track")
 
     @property
-    def carried_px(self) -> FloatArray:
-        """(n, 2) pixels of the pinhole of the same camera."""
-        return self._all("carried_px")
+    def uv_px(self) -> FloatArray:
+        """(n, 2) pixels as measured."""
+        return self._all("uv_px")
 
     @property
     def whitening(self) -> FloatArray:
-        """(n, 2, 2) takes a residual in pixels of the pinhole to one of unit covariance."""
+        """(n, 2, 2) takes a residual in pixels to one of unit covariance."""
         return self._all("whitening")
 
     @property
@@ -135,7 +132,7 @@ class Ledger:
         return Observations(
             image=self.image.copy(),
             track=self.track.copy(),
-            uv_px=self._all("uv_px").copy(),
+            uv_px=self.uv_px.copy(),
             sigma_px=self._all("sigma_px").copy(),
             covariance_px2=covariance,
             origin=self._origin,

@@ -99,7 +99,7 @@ def _measurements(
         row=row,
         image=image[order],
         landmark=landmark[order],
-        uv_px=ledger.carried_px.take(row, axis=0),
+        uv_px=ledger.uv_px.take(row, axis=0),
         whitening=ledger.whitening.take(row, axis=0),
     )
 

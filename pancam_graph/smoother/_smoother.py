@@ -9,11 +9,10 @@ import numpy as np
 from pancam_graph.base.errors import InputError, SolveError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.base.threads import blas_on_one_thread
-from pancam_graph.cameras import carry_to_pinhole
 from pancam_graph.data import DrivePart, Frame, Image, Observations, Stop, Traverse
 from pancam_graph.graph import GraphKeys, HardTemplate, UserFactors, read_variable
 from pancam_graph.io import prefixed
-from pancam_graph.landmarks import Landmarks
+from pancam_graph.landmarks import CameraViews, Landmarks, lines_of_sight
 from pancam_graph.rigs import Rig
 from pancam_graph.smoother._batch import whole_template, whole_traverse
 from pancam_graph.smoother._covariances import joint_covariance, relative_covariance
@@ -32,8 +31,6 @@ from pancam_graph.smoother._station import Postures, Station, copied
 from pancam_graph.smoother._update_run import UpdateRun
 
 __all__ = ["TraverseSmoother"]
-
-_TYPICAL_RANGE_M = 10.0
 
 
 class TraverseSmoother:
@@ -188,16 +185,9 @@ class TraverseSmoother:
 
     def _append(self, observations: Observations, image: IntArray) -> IntArray:
         eye = np.concatenate([s.traverse.image_eye for s in self._drive.stations])[image]
-        carried, turn = np.empty((len(image), 2)), np.empty((len(image), 2, 2))
-        valid = np.empty(len(image), dtype=bool)
-        for i, one in enumerate(self.rig.eyes):
-            of_eye = eye == i
-            range_m = np.full(int(of_eye.sum()), _TYPICAL_RANGE_M)
-            carried[of_eye], turn[of_eye], valid[of_eye] = carry_to_pinhole(
-                one.camera, observations.uv_px[of_eye], range_m
-            )
-        whitening = observations.noise.whiten(turn)
-        return self._drive.ledger.append(image, observations, carried, whitening, valid)
+        cameras = CameraViews.of([one.camera for one in self.rig.eyes])
+        *_, valid = lines_of_sight(eye, observations.uv_px, cameras)
+        return self._drive.ledger.append(image, observations, valid)
 
     def _place(self, station: Station, previous: Station | None, run: UpdateRun) -> None:
         """Localise a new station, and add its observations."""

@@ -242,14 +242,9 @@ class Patch:
     def posture(self, postures: Postures) -> Posture:
         """Cameras of all images of the patch, and the chain rule from variables to them."""
         of = postures.of_all(self.stations)
-        views = [p.views for p in of]
         chains = [p.chain[taken] for p, taken in zip(of, self._segments, strict=True)]
         return Posture(
-            views=CameraViews(
-                world_R_camera=np.concatenate([v.world_R_camera for v in views]),
-                world_t_camera=np.concatenate([v.world_t_camera for v in views]),
-                calibration=np.concatenate([v.calibration for v in views]),
-            ),
+            views=CameraViews.joined([p.views for p in of]),
             unit_R=np.concatenate([p.unit_R for p in of]),
             unit_t=np.concatenate([p.unit_t for p in of]),
             chain=np.concatenate(chains),

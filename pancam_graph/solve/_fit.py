@@ -9,7 +9,6 @@ from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.data import PixelNoise
 from pancam_graph.graph import HardTemplate
 from pancam_graph.landmarks import Landmarks
-from pancam_graph.solve._carrying import carried_again, is_carried_anew
 from pancam_graph.solve._eliminated import EliminatedSolver, Ended
 from pancam_graph.solve._far_terrain import FarTerrain, far_terrain
 from pancam_graph.solve._optimise import Outcome
@@ -44,7 +43,7 @@ class Fitted:
 
 
 def fit(screened: Screened) -> Fitted:
-    """Least squares over what is accepted, until neither noise scale nor carried pixels move any more.
+    """Least squares over what is accepted, until the noise scale does not move any more.
 
     Raises SolveError where the system has a direction that nothing holds however much it is damped.
     """
@@ -57,16 +56,12 @@ def fit(screened: Screened) -> Fitted:
         problem, outcome = solver.adjust(problem, prepared.options)
         behind[problem.measurements.row[before & ~problem.accepted]] = True
         costs += outcome.costs[1:] if costs else outcome.costs
-        ended = problem
-        if is_carried_anew(problem):
-            problem = carried_again(problem, prepared.observations, noise)
-        moved = problem is not ended
-        if prepared.rescales_noise:
-            factor = noise_factor(problem)
-            noise = noise.scaled(factor)
-            problem = replace(problem, measurements=problem.measurements.scaled(factor))
-            moved |= abs(factor - 1) > 1e-3
-        if not (moved and outcome.converged):
+        if not prepared.rescales_noise:
+            break
+        factor = noise_factor(problem)
+        noise = noise.scaled(factor)
+        problem = replace(problem, measurements=problem.measurements.scaled(factor))
+        if not (abs(factor - 1) > 1e-3 and outcome.converged):
             break
     return _without_range_bias(
         Fitted(
@@ -85,14 +80,12 @@ def fitted_elsewhere(
 ) -> Fitted:
     """A problem that was fitted elsewhere, over what it accepts: `costs` on the way, and why that ended.
 
-    Where it is not the optimum of what it accepts, residuals decide how large the noise is, or pixels depend
-    on the range, the rounds of `fit` follow.
+    Where it is not the optimum of what it accepts, or residuals decide how large the noise is, the rounds of
+    `fit` follow.
     """
     prepared, problem = screened.prepared, screened.problem
-    if not is_optimum or prepared.rescales_noise or problem.template.rig_variables.pupil_moves:
-        if is_carried_anew(problem):
-            problem = carried_again(problem, prepared.observations, prepared.noise)
-        fitted = fit(replace(screened, problem=problem))
+    if not is_optimum or prepared.rescales_noise:
+        fitted = fit(screened)
         outcome = fitted.outcome
         return replace(
             fitted,
@@ -155,7 +148,7 @@ def refitted(fitted: Fitted, landmarks: BoolArray) -> tuple[Problem, Outcome]:
     """Least squares over some landmarks (landmarks,), from where a fit ended.
 
     From there, so that of several optima it is the one near by; anew from afar where that does not converge,
-    since steps with a firm tie are short. Pixels of moving pupils stay carried as they are.
+    since steps with a firm tie are short.
     """
     prepared, whole = fitted.screened.prepared, fitted.problem
     part = replace(whole, accepted=whole.accepted & landmarks[whole.measurements.landmark])

@@ -37,11 +37,10 @@ def build_graph(
     """All factors of a traverse and values to start from, for GTSAM's own optimisers.
 
     Terrain points are variables `L` (Point3), numbered as the tracks in `Solution.landmark_track`. Where
-    cameras are variables (`X`, Pose3, numbered as images), observations are GTSAM's projection factors; on a
-    rigid mast they are factors on mast, angles and point (`mast_projection_factor`). All other variables have
-    the keys of `graph_keys`. A quantity that telemetry holds is a variable with a constraint. Pixels are
-    those of pinholes, carried there once: where lenses are distorted and calibrations free, or pupils move,
-    `solve` carries them again and the graph does not.
+    cameras are variables (`X`, Pose3, numbered as images), observations are GTSAM's projection factors, or
+    `camera_projection_factor` for a camera that is no pinhole; on a rigid mast they are factors on mast,
+    angles and point (`mast_projection_factor`). All other variables have the keys of `graph_keys`. A quantity
+    that telemetry holds is a variable with a constraint. The cost of the graph is that of `solve`.
 
     `used` (observations,) is the mask of the observations to take, by least squares, as in `Solution.used`.
     Default: all observations of tracks with two or more, unscreened and therefore under the robust loss of

@@ -8,7 +8,6 @@ from pancam_graph.base.errors import SolveError
 from pancam_graph.base.geometry import BoolArray
 from pancam_graph.data import State, Verdict
 from pancam_graph.landmarks import refine
-from pancam_graph.solve._carrying import carried_again
 from pancam_graph.solve._considered import considered
 from pancam_graph.solve._covariance import Uncertainty, uncertainty
 from pancam_graph.solve._diagnose import connection_warnings, listed
@@ -146,10 +145,7 @@ def _first(fitted: Fitted) -> Problem:
         first = replace(first, template=problem.template, factors=problem.factors)
     if m is first.measurements and problem.accepted.all():
         return first
-    first = triangulated(replace(first, measurements=m, accepted=problem.accepted)).placed()
-    if problem.template.rig_variables.distortion_moves:
-        first = carried_again(first, prepared.observations, fitted.noise).placed()
-    return first
+    return triangulated(replace(first, measurements=m, accepted=problem.accepted)).placed()
 
 
 def _unknown(fitted: Fitted) -> Uncertainty:

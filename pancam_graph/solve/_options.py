@@ -18,8 +18,7 @@ Method = Literal["joint", "alternation"]
 class SolveOptions(StopRule):
     """Options of a solve, with the criteria that end its final least squares (StopRule).
 
-    If noise is rescaled or pixels are carried anew, several least-squares fits follow each other, and each
-    may take `max_iterations`.
+    If noise is rescaled, several least-squares fits follow each other, and each may take `max_iterations`.
     """
 
     model: Model = "mast"

@@ -31,9 +31,15 @@ from pancam_graph.graph import (
     given_factors,
 )
 from pancam_graph.initialise import FreeCameras, Start, in_turns_of_telemetry, start_from_telemetry
-from pancam_graph.landmarks import Landmarks, Measurements, rays_of, residuals, triangulate
+from pancam_graph.landmarks import (
+    Landmarks,
+    Measurements,
+    lines_of_sight,
+    rays_of,
+    residuals,
+    triangulate,
+)
 from pancam_graph.solve._alternation import AlternatingSolver
-from pancam_graph.solve._carrying import carry, first_ranges_m
 from pancam_graph.solve._eliminated import EliminatedSolver
 from pancam_graph.solve._explicit import ExplicitSolver
 from pancam_graph.solve._optimise import Iteration
@@ -239,11 +245,11 @@ def _factors(template: FactorTemplate, values: gtsam.Values, factors: UserFactor
 def _measure(
     observations: Observations, template: FactorTemplate, values: gtsam.Values
 ) -> tuple[Measurements, IntArray, Reasons]:
-    """Observations of tracks seen twice or more as pinhole pixels, the track of each landmark, and reasons.
+    """Observations of tracks seen twice or more, the track of each landmark, and reasons.
 
     Raises SolveError where no track is seen twice.
     """
-    uv_px, turn, valid = carry(observations, first_ranges_m(observations), template.rig_variables, values)
+    *_, valid = lines_of_sight(observations.image, observations.uv_px, template.views(values))
     _, track = np.unique(observations.track, return_inverse=True)
     single = valid & (np.bincount(track, valid)[track] < 2)
     reason = np.full(len(observations), "", dtype=object)
@@ -257,8 +263,8 @@ def _measure(
         row=rows,
         image=observations.image[rows],
         landmark=landmark.astype(np.int64),
-        uv_px=uv_px[rows],
-        whitening=observations.noise.select(rows).whiten(turn[rows]),
+        uv_px=observations.uv_px[rows],
+        whitening=observations.noise.select(rows).whitening,
     )
     return measurements, landmark_track, reason
 

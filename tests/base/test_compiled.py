@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from pancam_graph.base.compiled import folder_digest
+from pancam_graph.cameras import LENS_SOURCES
 from pancam_graph.landmarks import kernel
 
 CALLEE = """
@@ -69,3 +70,13 @@ def test_a_digest_sees_the_names_and_contents_of_all_source_files_of_a_folder(tm
 def test_nothing_must_be_compiled_where_compilation_is_off(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kernel._eliminate, "eliminate_poses", lambda: None)
     assert not kernel.must_compile()
+
+
+@pytest.mark.skipif(bool(os.environ.get("NUMBA_DISABLE_JIT")), reason="nothing is compiled")
+def test_loops_on_disk_are_named_after_the_sources_of_lenses_too() -> None:
+    """An edit of a lens, whose distortion they call, makes them stale."""
+    entries = [f for f in vars(kernel).values() if hasattr(f, "py_func")]
+    assert len(entries) > 10
+    digest = folder_digest(LENS_SOURCES)
+    assert (LENS_SOURCES / "_cahvore.py").exists()
+    assert all(digest in entry.py_func.__qualname__ for entry in entries)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from pancam_graph.base.geometry import FloatArray
+from pancam_graph.cameras import Pinhole
 from pancam_graph.factors import Corrected, Fixed, Key, mast_projection_factor
 
 L, M, A, E, T, K = (gtsam.symbol(c, 0) for c in "LMAETK")
@@ -12,6 +13,7 @@ NOMINAL = np.array([[1100.0, 0.3, 512.0], [0.0, 1090.0, 500.0], [0.0, 0.0, 1.0]]
 CAMERA_R = gtsam.Rot3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
 MOUNT = gtsam.Pose3(CAMERA_R * gtsam.Rot3.Rodrigues(0.02, 0.01, -0.03), np.array([0.1, 0.2, 0.05]))
 AXIS = gtsam.Pose3(gtsam.Rot3.Rodrigues(0.02, -0.01, 0.03), np.array([0.03, -0.02, 0.05]))
+LENS = Pinhole(width_px=1, height_px=1, fx_px=1.0, fy_px=1.0, cx_px=0.0, cy_px=0.0)
 ENTRIES = (0, 3)
 """Free entries of K: fx and cx."""
 
@@ -50,6 +52,7 @@ def made(uv_px: FloatArray) -> gtsam.CustomFactor:
         Key(K),
         nominal=NOMINAL[None],
         basis=basis,
+        lens=LENS,
         uv_px=uv_px[None],
     )
 
@@ -108,6 +111,7 @@ def test_what_is_fixed_is_no_variable() -> None:
         Fixed(np.zeros(0)),
         nominal=NOMINAL[None],
         basis=np.zeros((1, 5, 0)),
+        lens=LENS,
         uv_px=np.zeros((1, 2)),
     )
     assert list(factor.keys()) == [L]

@@ -24,7 +24,7 @@ from pancam_graph import (
 )
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray, rotation_from_wxyz
-from pancam_graph.cameras import Camera, carry_to_pinhole
+from pancam_graph.cameras import Camera, straight_pixels
 from pancam_graph.data._sharing import parse_sharing
 from pancam_graph.io import read_traverse
 from pancam_graph.results import check_out, write_results
@@ -88,9 +88,10 @@ def expected_length(solution: Solution) -> tuple[FloatArray, FloatArray]:
     for i, camera in enumerate(solution.image_cameras):
         own = np.flatnonzero(solution.used & (t.observations.image == i))
         range_m = np.linalg.norm(final.landmarks_m[row[own]] - final.world_t_camera[i], axis=1)
-        _, back, _ = carry_to_pinhole(camera, t.observations.uv_px[own], range_m)
-        out[own] = np.linalg.solve(back, solution.residual_final_px[own][..., None])[..., 0]
-        out[own, 0] -= camera.pinhole.skew_px / camera.pinhole.fy_px * out[own, 1]  # COLMAP has none
+        plain = replace(camera.pinhole, skew_px=0.0)  # COLMAP has none
+        seen, _, _ = straight_pixels(camera, plain, t.observations.uv_px[own], range_m)
+        points = (final.landmarks_m[row[own]] - final.world_t_camera[i]) @ final.world_R_camera[i]
+        out[own] = plain.project(points)[0] - seen
     return np.linalg.norm(out, axis=1), out
 
 

@@ -203,7 +203,7 @@ def distorted() -> Rig:
 
 
 @pytest.mark.parametrize("scope", ["eye", "stop"])
-def test_a_distorted_camera_is_carried_anew_as_its_calibration_moves(scope: Scope) -> None:
+def test_a_distorted_camera_keeps_its_distortion_as_its_calibration_moves(scope: Scope) -> None:
     options = replace(TWO_TILTS, noise_px=0.0, prior="truth", focal_error=3e-3)
     simulation = simulate(distorted(), options, seed=1)
     sharing = Sharing(calibration=loose("calibration", scope, "fx_px", "fy_px", "cx_px", "cy_px"))

@@ -193,7 +193,7 @@ def test_held_stops_and_angles_stay_bit_for_bit() -> None:
 
 
 def test_a_moving_entrance_pupil_is_taken_as_it_is() -> None:
-    """CAHVORE: the ray's origin depends on the pixel, and the carried pixel on the range."""
+    """CAHVORE: the ray's origin depends on the pixel, and the pixel on the range."""
     base = mer_navcam()
     eyes = []
     for eye in base.eyes:

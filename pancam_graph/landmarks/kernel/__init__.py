@@ -15,10 +15,11 @@ from pancam_graph.landmarks.kernel._loss import HUBER as HUBER
 from pancam_graph.landmarks.kernel._loss import NONE as NONE
 from pancam_graph.landmarks.kernel._loss import loss_costs as loss_costs
 from pancam_graph.landmarks.kernel._loss import loss_weights as loss_weights
+from pancam_graph.landmarks.kernel._observe import Cameras as Cameras
 from pancam_graph.landmarks.kernel._observe import Seen as Seen
 from pancam_graph.landmarks.kernel._observe import evaluate as evaluate
 from pancam_graph.landmarks.kernel._observe import free_derivatives as free_derivatives
-from pancam_graph.landmarks.kernel._observe import ray_directions as ray_directions
+from pancam_graph.landmarks.kernel._observe import lines_of_sight as lines_of_sight
 from pancam_graph.landmarks.kernel._observe import residuals as residuals
 from pancam_graph.landmarks.kernel._order import Bearings as Bearings
 from pancam_graph.landmarks.kernel._order import Reduced as Reduced

@@ -12,10 +12,11 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from pancam_graph.base.compiled import entry, inlined, is_on_disk, part
+from pancam_graph.base.compiled import inlined, is_on_disk, part
 from pancam_graph.base.geometry import FloatArray, IntArray
+from pancam_graph.landmarks.kernel._compiling import entry
 from pancam_graph.landmarks.kernel._loss import BEHIND_COST, NONE, loss_cost, loss_weight
-from pancam_graph.landmarks.kernel._observe import observe_ray, residual_by_ray
+from pancam_graph.landmarks.kernel._observe import Three, observe_ray, residual_by_ray
 from pancam_graph.landmarks.kernel._order import Bearings, Reduced, Sights
 from pancam_graph.landmarks.kernel._sphere import by_tangents, tangents
 from pancam_graph.landmarks.kernel._symmetric import UNDETERMINED
@@ -109,15 +110,12 @@ def _add_six(
     to[at + 3], to[at + 4], to[at + 5] = b3 + a3, b4 + a4, b5 + a5
 
 
-_Three: TypeAlias = tuple[float, float, float]
 _Symmetric: TypeAlias = tuple[float, float, float, float, float, float]
 """A symmetric matrix (3, 3): its entries 00, 01, 02, 11, 12, 22."""
-_Matrix: TypeAlias = tuple[_Three, _Three, _Three]
-"""A matrix (3, 3) by rows."""
 
 
 @inlined
-def _plus_gram(total: _Symmetric, a: _Three, b: _Three) -> _Symmetric:
+def _plus_gram(total: _Symmetric, a: Three, b: Three) -> _Symmetric:
     """A symmetric matrix plus J'J, J having the rows a and b."""
     return (
         total[0] + (a[0] * a[0] + b[0] * b[0]),
@@ -130,7 +128,7 @@ def _plus_gram(total: _Symmetric, a: _Three, b: _Three) -> _Symmetric:
 
 
 @inlined
-def _plus_product(total: _Three, a: _Three, b: _Three, r0: float, r1: float) -> _Three:
+def _plus_product(total: Three, a: Three, b: Three, r0: float, r1: float) -> Three:
     """A vector plus J'r, J having the rows a and b."""
     return (
         total[0] + (a[0] * r0 + b[0] * r1),
@@ -140,7 +138,7 @@ def _plus_product(total: _Three, a: _Three, b: _Three, r0: float, r1: float) -> 
 
 
 @inlined
-def _plus_outer(row: _Three, p: float, a: _Three, q: float, b: _Three) -> _Three:
+def _plus_outer(row: Three, p: float, a: Three, q: float, b: Three) -> Three:
     """A vector plus p a + q b."""
     return (
         row[0] + p * a[0] + q * b[0],
@@ -150,7 +148,7 @@ def _plus_outer(row: _Three, p: float, a: _Three, q: float, b: _Three) -> _Three
 
 
 @inlined
-def _in_base(unit_R: FloatArray, unit: int, d: _Three) -> _Three:
+def _in_base(unit_R: FloatArray, unit: int, d: Three) -> Three:
     """A direction (3,) in the world, or a derivative by one, taken to the frame of a unit's base."""
     return (
         d[0] * unit_R[unit, 0, 0] + d[1] * unit_R[unit, 1, 0] + d[2] * unit_R[unit, 2, 0],
@@ -160,7 +158,7 @@ def _in_base(unit_R: FloatArray, unit: int, d: _Three) -> _Three:
 
 
 @inlined
-def _cross(a: _Three, x: _Three) -> _Three:
+def _cross(a: Three, x: Three) -> Three:
     """Cross product of a and x."""
     return a[1] * x[2] - a[2] * x[1], a[2] * x[0] - a[0] * x[2], a[0] * x[1] - a[1] * x[0]
 
@@ -184,7 +182,7 @@ def _add_calibration(
     u: float,
     v: float,
     root: float,
-    derivatives: tuple[_Three, _Three, _Three, _Three],
+    derivatives: tuple[Three, Three, Three, Three],
     r0: float,
     r1: float,
     row: int,
@@ -198,7 +196,7 @@ def _add_calibration(
     """
     b0, b1, e0, e1 = derivatives
     jac, by_landmark, by_base = sums.jacobian, sums.by_landmark, sums.by_base
-    _by_calibration(bearings.calibration, sights.image[i], u, v, sights.whitening, i, root, jac)
+    _by_calibration(bearings.cameras.calibration, sights.image[i], u, v, sights.whitening, i, root, jac)
     for p in range(5):
         ja, jb = jac[0, p], jac[1, p]
         by_landmark[p, 0] += ja * b0[0] + jb * b1[0]
@@ -214,7 +212,7 @@ def _add_calibration(
 
 @inlined
 def _add_twist(
-    unit_H: FloatArray, unit_s: FloatArray, row: int, w: float, x: _Three, m: _Symmetric, k: _Three
+    unit_H: FloatArray, unit_s: FloatArray, row: int, w: float, x: Three, m: _Symmetric, k: Three
 ) -> None:
     """Add what one occurrence tells about the twist of its base to the information about that base.
 
@@ -249,7 +247,7 @@ def _add_twist(
 
 
 @inlined
-def _add_twist_by_calibration(unit_H: FloatArray, row: int, w: float, x: _Three, by_base: FloatArray) -> None:
+def _add_twist_by_calibration(unit_H: FloatArray, row: int, w: float, x: Three, by_base: FloatArray) -> None:
     """Add the products of twist and calibration of one occurrence to the information about its base."""
     for p in range(5):
         f = by_base[0, p], by_base[1, p], by_base[2, p]
@@ -266,7 +264,7 @@ def _add_to_arms(
     o: int,
     unit: int,
     first_pair: int,
-    twist_by_landmark: tuple[_Three, _Three, _Three, _Three, _Three, _Three],
+    twist_by_landmark: tuple[Three, Three, Three, Three, Three, Three],
     more: int,
     by_landmark: FloatArray,
     arms: FloatArray,
@@ -325,7 +323,7 @@ def _cholesky(v: _Symmetric) -> tuple[_Symmetric, bool]:
 
 @inlined
 def _eliminate(
-    sights: Sights, reduced: Reduced, j: int, v: _Symmetric, g: _Three, tiles: FloatArray, s: FloatArray
+    sights: Sights, reduced: Reduced, j: int, v: _Symmetric, g: Three, tiles: FloatArray, s: FloatArray
 ) -> None:
     """Eliminate landmark j, whose information is V and whose gradient is g.
 
@@ -377,7 +375,8 @@ def _eliminating(rows: int) -> Callable[..., None]:
     ) -> None:
         unit_H, unit_s = np.zeros((n_units, rows, rows)), np.zeros((n_units, rows))
         unit_of = np.full(n_units, -1)
-        to_pixel, centre_m, arms = bearings.to_pixel, bearings.centre_m, reduced.arms
+        cameras, arms = bearings.cameras, reduced.arms
+        centre_m = cameras.centre_m
         sums = _Calibrations(np.empty((2, more)), np.empty((more, 3)), np.empty((3, more)))
         for j in range(begin, end):
             X0, X1, X2, w = vector[j, 0], vector[j, 1], vector[j, 2], vector[j, 3]
@@ -402,7 +401,7 @@ def _eliminating(rows: int) -> Callable[..., None]:
                     c0, c1, c2 = centre_m[image, 0] - O0, centre_m[image, 1] - O1, centre_m[image, 2] - O2
                     y0, y1, y2 = X0 - w * c0, X1 - w * c1, X2 - w * c2
                     in_front, r0, r1, u_px, v_px, per_depth = observe_ray(
-                        to_pixel, image, y0, y1, y2, sights.uv_px, sights.whitening, i
+                        cameras, image, y0, y1, y2, w, sights.uv_px, sights.whitening, i
                     )
                     if not in_front:
                         cost += BEHIND_COST
@@ -411,11 +410,12 @@ def _eliminating(rows: int) -> Callable[..., None]:
                     cost += loss_cost(kind, width, squared)
                     root = 1.0 if kind == NONE else np.sqrt(loss_weight(kind, width, squared))
                     r0, r1 = root * r0, root * r1
-                    d00, d01, d02, d10, d11, d12 = residual_by_ray(
-                        to_pixel, image, u_px, v_px, root * per_depth, sights.whitening, i
+                    scale = root * per_depth
+                    d00, d01, d02, d10, d11, d12, w0, w1 = residual_by_ray(
+                        cameras, image, y0, y1, y2, w, u_px, v_px, scale, sights.whitening, i
                     )
-                    b0 = by_tangents(t, d00, d01, d02, -(d00 * c0 + d01 * c1 + d02 * c2))
-                    b1 = by_tangents(t, d10, d11, d12, -(d10 * c0 + d11 * c1 + d12 * c2))
+                    b0 = by_tangents(t, d00, d01, d02, w0 - (d00 * c0 + d01 * c1 + d02 * c2))
+                    b1 = by_tangents(t, d10, d11, d12, w1 - (d10 * c0 + d11 * c1 + d12 * c2))
                     e0 = _in_base(bearings.unit_R, unit, (d00, d01, d02))
                     e1 = _in_base(bearings.unit_R, unit, (d10, d11, d12))
                     v, g = _plus_gram(v, b0, b1), _plus_product(g, b0, b1, r0, r1)

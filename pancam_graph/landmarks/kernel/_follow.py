@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from pancam_graph.base.compiled import entry, part
+from pancam_graph.base.compiled import part
 from pancam_graph.base.geometry import FloatArray, IntArray
+from pancam_graph.landmarks.kernel._compiling import entry
 from pancam_graph.landmarks.kernel._loss import BEHIND_COST, loss_cost
 from pancam_graph.landmarks.kernel._observe import observe_ray
 from pancam_graph.landmarks.kernel._order import Bearings, Reduced, Sights
@@ -77,7 +78,7 @@ def _cost_at(
     j: int,
 ) -> float:
     """True cost of landmark j if it were at (x, w)."""
-    to_pixel, centre_m = bearings.to_pixel, bearings.centre_m
+    cameras, centre_m = bearings.cameras, bearings.cameras.centre_m
     O0, O1, O2 = origin_m[j, 0], origin_m[j, 1], origin_m[j, 2]
     cost = 0.0
     first, last = sights.landmark_begin[j], sights.landmark_begin[j + 1]
@@ -87,7 +88,7 @@ def _cost_at(
         y1 = x1 - w * (centre_m[image, 1] - O1)
         y2 = x2 - w * (centre_m[image, 2] - O2)
         in_front, r0, r1, _, _, _ = observe_ray(
-            to_pixel, image, y0, y1, y2, sights.uv_px, sights.whitening, i
+            cameras, image, y0, y1, y2, w, sights.uv_px, sights.whitening, i
         )
         cost += loss_cost(kind, width, r0 * r0 + r1 * r1) if in_front else BEHIND_COST
     return cost

@@ -2,8 +2,9 @@
 
 import math
 
-from pancam_graph.base.compiled import entry, part
+from pancam_graph.base.compiled import part
 from pancam_graph.base.geometry import FloatArray
+from pancam_graph.landmarks.kernel._compiling import entry
 
 __all__ = ["BEHIND_COST", "CAUCHY", "HUBER", "NONE", "loss_cost", "loss_costs", "loss_weight", "loss_weights"]
 

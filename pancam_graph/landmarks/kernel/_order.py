@@ -4,8 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pancam_graph.base.compiled import entry
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.landmarks.kernel._compiling import entry
+from pancam_graph.landmarks.kernel._observe import Cameras
 
 __all__ = ["Bearings", "Reduced", "Sights", "arrange"]
 
@@ -23,7 +24,7 @@ class Sights(NamedTuple):
     image: IntArray
     """(n,) image of each observation"""
     uv_px: FloatArray
-    """(n, 2) pixels of the pinhole"""
+    """(n, 2)"""
     whitening: FloatArray
     """(n, 2, 2) takes residuals in pixels to unit covariance"""
     occurrence_begin: IntArray
@@ -47,12 +48,7 @@ class Sights(NamedTuple):
 class Bearings(NamedTuple):
     """Cameras at a point of linearisation, and how the variables move them."""
 
-    to_pixel: FloatArray
-    """(images, 3, 3) world directions to homogeneous pixels"""
-    centre_m: FloatArray
-    """(images, 3) in the world"""
-    calibration: FloatArray
-    """(images, 3, 3) K"""
+    cameras: Cameras
     unit_R: FloatArray
     """(units, 3, 3) world_R_base; a unit's base is the body whose twist moves its images"""
     unit_t: FloatArray

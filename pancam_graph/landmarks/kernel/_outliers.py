@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from pancam_graph.base.compiled import entry
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.landmarks.kernel._compiling import entry
 from pancam_graph.landmarks.kernel._observe import Seen, observe_ray, residual_by_ray
 from pancam_graph.landmarks.kernel._symmetric import add_row, diagonalise
 
@@ -47,20 +47,21 @@ def smallest_information(
     which: IntArray, seen: Seen, points_m: FloatArray, weight: FloatArray, out: FloatArray
 ) -> None:
     """Smallest eigenvalue of the information about world points (landmarks, 3), in 1 / m^2, to `out`."""
+    cameras = seen.cameras
     v, turn = np.empty((3, 3)), np.empty((3, 3))
     for j in which:
         v[:] = 0.0
         for i in range(seen.begin[j], seen.begin[j + 1]):
             if weight[i] > 0:
                 image = seen.image[i]
-                y0 = points_m[j, 0] - seen.centre_m[image, 0]
-                y1 = points_m[j, 1] - seen.centre_m[image, 1]
-                y2 = points_m[j, 2] - seen.centre_m[image, 2]
+                y0 = points_m[j, 0] - cameras.centre_m[image, 0]
+                y1 = points_m[j, 1] - cameras.centre_m[image, 1]
+                y2 = points_m[j, 2] - cameras.centre_m[image, 2]
                 _, _, _, u, v_px, per_depth = observe_ray(
-                    seen.to_pixel, image, y0, y1, y2, seen.uv_px, seen.whitening, i
+                    cameras, image, y0, y1, y2, 1.0, seen.uv_px, seen.whitening, i
                 )
-                d00, d01, d02, d10, d11, d12 = residual_by_ray(
-                    seen.to_pixel, image, u, v_px, per_depth, seen.whitening, i
+                d00, d01, d02, d10, d11, d12, _, _ = residual_by_ray(
+                    cameras, image, y0, y1, y2, 1.0, u, v_px, per_depth, seen.whitening, i
                 )
                 add_row(v, weight[i], d00, d01, d02)
                 add_row(v, weight[i], d10, d11, d12)

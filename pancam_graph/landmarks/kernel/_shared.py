@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from pancam_graph.base.compiled import entry
 from pancam_graph.base.geometry import BoolArray, IntArray
+from pancam_graph.landmarks.kernel._compiling import entry
 
 __all__ = ["connect", "count_links"]
 

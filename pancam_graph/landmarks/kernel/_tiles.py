@@ -15,8 +15,9 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic, overload
 
-from pancam_graph.base.compiled import entry, part
+from pancam_graph.base.compiled import part
 from pancam_graph.base.geometry import FloatArray, IntArray
+from pancam_graph.landmarks.kernel._compiling import entry
 
 __all__ = ["add_to_panel", "row_subtraction", "subtract_row", "subtract_row_in_vectors", "tile_entry"]
 

@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from pancam_graph.base.compiled import entry, part
+from pancam_graph.base.compiled import part
 from pancam_graph.base.geometry import FloatArray, IntArray
+from pancam_graph.landmarks.kernel._compiling import entry
 from pancam_graph.landmarks.kernel._symmetric import diagonalise
 
 __all__ = ["triangulate"]

@@ -1,13 +1,21 @@
-"""Carrying measured pixels to the pinhole of the same camera, and its residuals back."""
+"""Measured pixels as the pinhole of the same camera has them, and its residuals turned back."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from pancam_graph.base.geometry import FloatArray
-from pancam_graph.cameras import Camera, carry_to_pinhole
+from pancam_graph.base.geometry import BoolArray, FloatArray
+from pancam_graph.cameras import Camera, straight_pixels
 from support.lenses import ALL, BROWN, CAHVORE_CAMERA, CENTRAL, FAR, PINHOLE, pixels
+
+
+def carried_to_pinhole(
+    camera: Camera, uv_px: FloatArray, range_m: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Pixels of the camera's own pinhole, matrices that turn its residuals back, and validity."""
+    carried, forward, valid = straight_pixels(camera, camera.pinhole, uv_px, range_m)
+    return carried, np.asarray(np.linalg.inv(forward)), valid
 
 
 @pytest.mark.parametrize("camera", ALL.values(), ids=ALL)
@@ -17,7 +25,7 @@ def test_a_carried_pixel_is_where_the_pinhole_sees_the_same_point(camera: Camera
     uv = pixels()
     rays = camera.unproject(uv)
     points = rays.origin_m + range_m * rays.direction
-    carried, _, valid = carry_to_pinhole(camera, uv, np.linalg.norm(points, axis=1))
+    carried, _, valid = carried_to_pinhole(camera, uv, np.linalg.norm(points, axis=1))
     assert valid.all()
     again = camera.pinhole.project(points)[0]
     assert carried == pytest.approx(again, abs=1e-9)
@@ -28,8 +36,8 @@ def test_a_carried_pixel_is_where_the_pinhole_sees_the_same_point(camera: Camera
 def test_a_carried_pixel_lies_on_the_same_line_of_sight(camera: Camera) -> None:
     """At any range: a central camera's carried pixels do not depend on it."""
     uv = pixels()
-    near, _, _ = carry_to_pinhole(camera, uv, np.full(len(uv), 1.0))
-    far, _, _ = carry_to_pinhole(camera, uv, np.full(len(uv), FAR))
+    near, _, _ = carried_to_pinhole(camera, uv, np.full(len(uv), 1.0))
+    far, _, _ = carried_to_pinhole(camera, uv, np.full(len(uv), FAR))
     assert near == pytest.approx(far, abs=1e-8)
     direction = camera.pinhole.unproject(near).direction
     assert direction == pytest.approx(camera.unproject(uv).direction, abs=1e-12)
@@ -42,7 +50,7 @@ def displaced(camera: Camera, range_m: float, step_m: float) -> tuple[FloatArray
     rays = camera.unproject(uv)
     points = rays.origin_m + range_m * rays.direction
     moved = points + step_m * rng.normal(size=points.shape)
-    carried, back, valid = carry_to_pinhole(camera, uv, np.linalg.norm(points, axis=1))
+    carried, back, valid = carried_to_pinhole(camera, uv, np.linalg.norm(points, axis=1))
     assert valid.all()
     of_pinhole = camera.pinhole.project(moved)[0] - carried
     return np.einsum("nij,nj->ni", back, of_pinhole), camera.project(moved)[0] - uv
@@ -62,7 +70,7 @@ def test_residuals_turn_back_to_raw_pixels_to_first_order(camera: Camera) -> Non
 
 def test_distortion_makes_turning_back_matter() -> None:
     """Without the matrices the residuals would be wrong by a tenth."""
-    _, back, _ = carry_to_pinhole(BROWN, pixels(), np.full(40, 10.0))
+    _, back, _ = carried_to_pinhole(BROWN, pixels(), np.full(40, 10.0))
     assert np.abs(np.linalg.det(back) - 1).max() > 0.1
 
 
@@ -78,7 +86,7 @@ def test_residuals_of_a_moving_pupil_turn_back_but_for_its_shift_by_the_range(
 def test_cahvore_depends_on_the_range_and_settles_far_off() -> None:
     uv = pixels()
     carried = [
-        carry_to_pinhole(CAHVORE_CAMERA, uv, np.full(len(uv), range_m))[0]
+        carried_to_pinhole(CAHVORE_CAMERA, uv, np.full(len(uv), range_m))[0]
         for range_m in (1.0, 10.0, 1000.0, FAR)
     ]
     shift = [np.linalg.norm(c - carried[-1], axis=1).max() for c in carried[:-1]]
@@ -88,16 +96,16 @@ def test_cahvore_depends_on_the_range_and_settles_far_off() -> None:
 
 def test_ranges_belong_to_their_own_pixels() -> None:
     uv = np.repeat(pixels(1), 2, axis=0)
-    mixed, back, _ = carry_to_pinhole(CAHVORE_CAMERA, uv, np.array([1.0, FAR]))
+    mixed, back, _ = carried_to_pinhole(CAHVORE_CAMERA, uv, np.array([1.0, FAR]))
     for i, range_m in enumerate((1.0, FAR)):
-        alone = carry_to_pinhole(CAHVORE_CAMERA, uv[:1], np.array([range_m]))
+        alone = carried_to_pinhole(CAHVORE_CAMERA, uv[:1], np.array([range_m]))
         assert mixed[i] == pytest.approx(alone[0][0], abs=1e-12)
         assert back[i] == pytest.approx(alone[1][0], abs=1e-12)
 
 
 def test_a_pinhole_is_carried_nowhere() -> None:
     uv = pixels()
-    carried, back, valid = carry_to_pinhole(PINHOLE, uv, np.full(len(uv), 10.0))
+    carried, back, valid = carried_to_pinhole(PINHOLE, uv, np.full(len(uv), 10.0))
     assert carried.tolist() == uv.tolist()
     assert back.tolist() == [np.eye(2).tolist()] * len(uv)
     assert valid.all()
@@ -108,7 +116,7 @@ def test_pixels_outside_the_model_are_invalid_and_stay_finite() -> None:
     """A barrel distortion that folds back has no line of sight for pixels past the fold."""
     folding = replace(BROWN, distortion=(-0.5, 0.0, 0.0, 0.0, 0.0))
     uv = np.array([[321.0, 237.0], [321.0 + 500, 237.0], [-2000.0, 237.0]])
-    carried, back, valid = carry_to_pinhole(folding, uv, np.full(3, 10.0))
+    carried, back, valid = carried_to_pinhole(folding, uv, np.full(3, 10.0))
     assert valid.tolist() == [True, False, False]
     assert np.isfinite(carried).all()
     assert np.isfinite(back).all()
