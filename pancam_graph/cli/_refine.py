@@ -87,9 +87,9 @@ def _add_options(parser: CommandParser) -> None:
     add(
         "--rig",
         choices=("estimated", "held", "considered"),
-        default="held",
+        default="estimated",
         help="estimated: what images say of cameras, mounts and tilt axis is estimated, within the rig's "
-        "uncertainty; held: the rig counts as exact (default); considered: it is not moved, but its "
+        "uncertainty (default); held: the rig counts as exact; considered: it is not moved, but its "
         "uncertainty is in every sigma",
     )
     add("--sharing", action=Several, type=Assignment(), default=(), metavar="WORD", help=_SHARING_HELP)

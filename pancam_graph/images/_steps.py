@@ -35,7 +35,7 @@ from pancam_graph.images._refine import RefinedTracks, refine_tracks
 from pancam_graph.images._rover import find_rover, rover_partners
 from pancam_graph.images._splines import Splines
 from pancam_graph.images._terrain import terrain_arrays, terrain_from
-from pancam_graph.solve import solve
+from pancam_graph.solve import SolveOptions, solve
 
 __all__ = ["Progress", "Steps", "step_key"]
 
@@ -301,7 +301,8 @@ class Steps:
 
         def place() -> Arrays:
             self.tell("terrain of the stops", 0, 1)
-            solution = solve(traverse)
+            # Terrain is to be found again within pixels: what of the rig is wrong changes that little.
+            solution = solve(traverse, SolveOptions(rig="held"))
             # A solve scales all noise by one factor, and the ties' noise must be in the same unit.
             unit = np.median(observations.sigma_px / solution.sigma_px)
             self.tell("terrain of the stops", 1, 1)

@@ -22,7 +22,7 @@ class SmootherOptions:
     """Meaning of the stops' poses and sigmas: "absolute": each is a prior on its mast pose, as in `solve`;
     "odometry": after the first stop a pose counts only by the motion from the stop before, and the sigmas are
     those of that motion, in the body frame of the later stop."""
-    rig: Literal["estimated", "held"] = "held"
+    rig: Literal["estimated", "held"] = "estimated"
     """What becomes of the rig's uncertainty, as for `solve`, which alone has "considered" too."""
     sharing: Sharing | None = None
     """Free entries of the rig and who shares them, as for `solve` with the model `mast`, in place of those

@@ -45,7 +45,7 @@ def build_graph(
     `used` (observations,) is the mask of the observations to take, by least squares, as in `Solution.used`.
     Default: all observations of tracks with two or more, unscreened and therefore under the robust loss of
     the options; the loss "none" gives least squares. `start` has initial mast poses and angles; default:
-    telemetry's.
+    telemetry's. Heads of frames do not flex, as where landmarks are explicit.
 
     Raises InputError for the model `projective`, for which GTSAM has no projection factor, and as `solve`.
     """

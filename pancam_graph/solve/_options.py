@@ -37,7 +37,7 @@ class SolveOptions(StopRule):
     variables that a sigma holds near there. Default: hard for "mast", soft for the others."""
     flex: Flex | None = None
     """Sigma of a soft tie; default: the model's own (graph.DEFAULT_FLEX)."""
-    rig: RigTreatment = "held"
+    rig: RigTreatment = "estimated"
     """What becomes of the rig's uncertainty (`Rig.uncertainty`): "estimated": what images say of the rig's
     numbers is estimated, with these sigmas as priors; "held": the rig counts as exact; "considered": it is
     not moved, but its uncertainty is in every sigma of the solution (model "mast" only)."""

@@ -209,8 +209,8 @@ def _uneven(name: str, residuals: Residuals, owner: IntArray, ids: Sequence[str]
         float(sure[worst]),
         _UNEVEN,
         says,
-        f"{says}: its calibration, its mount or its pixels are probably wrong; try it free (--sharing "
-        f"mounts=eye calibration=eye), or leave it out",
+        f"{says}: its calibration, its mount or its pixels are probably wrong; free it further (a larger "
+        f"uncertainty of the rig, or --sharing mounts=eye calibration=eye), or leave it out",
     )
 
 
@@ -354,7 +354,9 @@ def _held(at: Optimum) -> Iterator[VerdictTest]:
     if held:
         cost = at.fitted.problem.cost()
         best = max(held, key=lambda e: e.gain)
-        yield VerdictTest.note(
+        # A considered rig may be off: its sigmas say so.
+        is_considered = at.fitted.screened.prepared.options.rig == "considered"
+        yield (VerdictTest.note if is_considered else VerdictTest.of)(
             "held rig",
             best.gain,
             max(_HELD_GAIN, _HELD_SHARE * cost),
@@ -369,5 +371,6 @@ def _advice(entry: HeldEntry, cost: float) -> str:
     return (
         f"freeing {entry.entry} of {entry.quantity}{whose} would lower the cost from {cost:.4g} to about "
         f"{left:.4g} ({entry.change:+.3g}): the rig is wrong by more than pixels tell, and formal sigmas are "
-        f"too small; try --sharing {entry.quantity}={entry.scope}:{entry.entry}"
+        f"too small; estimate it (--rig estimated), or try --sharing "
+        f"{entry.quantity}={entry.scope}:{entry.entry}"
     )

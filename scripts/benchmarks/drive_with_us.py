@@ -12,7 +12,7 @@ import numpy as np
 from pancam_graph import SolveOptions, read_traverse, solve
 from pancam_graph.cli import run
 from pancam_graph.data import Traverse
-from pancam_graph.smoother import TraverseSmoother, Update
+from pancam_graph.smoother import SmootherOptions, TraverseSmoother, Update
 from pancam_graph.smoother._incremental import stops_of
 
 
@@ -33,7 +33,7 @@ def main() -> int:
                 "seconds": [max(each) for each in seconds[1:]],
                 "best_per_stop_s": np.min(seconds[1:], axis=0).tolist(),
                 "fell_back": sum(u.fell_back for u in updates),
-                **_against_batch(smoother, solve(traverse).cost_final),
+                **_against_batch(smoother, solve(traverse, SolveOptions(rig="held")).cost_final),
             }
         )
     )
@@ -41,7 +41,7 @@ def main() -> int:
 
 
 def _drive(traverse: Traverse) -> tuple[TraverseSmoother, list[Update]]:
-    smoother = TraverseSmoother(traverse.rig)
+    smoother = TraverseSmoother(traverse.rig, SmootherOptions(rig="held"))
     return smoother, [smoother.add_stop(*part) for part in stops_of(traverse)]
 
 
@@ -49,7 +49,9 @@ def _against_batch(smoother: TraverseSmoother, batch_cost: float) -> dict[str, f
     """Cost against the batch's; poses and sigmas against a batch of the same observations."""
     t, estimate = smoother.traverse, smoother.estimate()
     assert t.observations is not None  # simulated traverses have them
-    same = solve(t.with_observations(t.observations.select(smoother.used)), SolveOptions(loss="none"))
+    same = solve(
+        t.with_observations(t.observations.select(smoother.used)), SolveOptions(rig="held", loss="none")
+    )
     off, sigma_off = [0.0], [0.0]
     for i, stop in enumerate(t.stops):
         batch = np.sqrt(np.diag(same.stop_covariance[i]))

@@ -20,7 +20,8 @@ def main() -> int:
     begin = time.perf_counter()
     traverse = read_traverse(arguments.traverse)
     read_s = time.perf_counter() - begin
-    options = SolveOptions(landmarks=arguments.landmarks, loss="none")
+    # The other programs hold the rig too.
+    options = SolveOptions(rig="held", landmarks=arguments.landmarks, loss="none")
     begin = time.perf_counter()
     solution = solve(traverse, options)
     first_s = time.perf_counter() - begin

@@ -38,6 +38,7 @@ def variant(model: Model, sharing: str) -> Variant:
     """The variant of a model with a way of sharing: "fixed", "shared" or "unshared"."""
     options = SolveOptions(
         model=model,
+        rig="held",
         loss="none",
         flex=None if model in {"mast", "circle"} else FREE_FLEX,
         sharing=_sharing(model, sharing),

@@ -47,7 +47,7 @@ class OpportunityTask:
         traverse = find_observations(read_input(self.folder))
         samples = []
         for model in self.models:
-            options = SolveOptions(model=model)
+            options = SolveOptions(model=model, rig="held")
             metrics, failure = attempt(lambda o=options: _measured(traverse, o))  # type: ignore[misc]  # bound now
             samples.append(
                 Sample(

@@ -108,7 +108,7 @@ def compare(noise_px: float, seed: int) -> dict[str, float]:
     """Differences of the two optima, in cost and in the adjusted numbers."""
     simulation = simulate(navcam("both eyes"), replace(_TINY, noise_px=noise_px), seed=seed)
     t = simulation.traverse
-    ours = solve(t, SolveOptions(loss="none", relative_decrease=1e-14))
+    ours = solve(t, SolveOptions(rig="held", loss="none", relative_decrease=1e-14))
     dense = _Dense(t)
     theirs: Any = least_squares(
         dense.residuals,

@@ -182,7 +182,7 @@ ENTRIES: dict[str, tuple[Change, str, str]] = {
     ),
     "unknown entry": (
         put("sharing", to={"calibration": {"scope": "eye", "free": ["k1"]}}),
-        "sharing: calibration: free: expected entries of focal, fx_px, fy_px",
+        "sharing: calibration: free: expected entries of focal, aspect, fx_px, fy_px",
         "'k1'",
     ),
     "sigma as text": (

@@ -112,7 +112,7 @@ def test_a_method_other_than_joint_is_taken_and_named(
     solution = read_solution_json(tmp_path / "out" / "solution.json")
     assert solution.method == "alternation"
     assert solution.stop_reason == "iteration limit of 3"
-    done = run("optimize_traverse.py", "traverse", "--out", "other", *turns)
+    done = run("optimize_traverse.py", "traverse", "--out", "other", "--rig", "held", *turns)
     assert done.returncode == 2
     assert done.stderr == (
         "method: expected joint with the model mast as it is, found alternation: "

@@ -16,6 +16,7 @@ from pancam_graph import (
     RenderOptions,
     SimulationOptions,
     Solution,
+    SolveOptions,
     Traverse,
     find_observations,
     read_traverse,
@@ -409,7 +410,7 @@ def test_all_that_was_looked_at_is_accounted_for(
 def test_small_panoramas_place_the_second_stop(
     small: tuple[Rendering, Traverse], small_found: Traverse
 ) -> None:
-    solution = solve(small_found)
+    solution = solve(small_found, SolveOptions(rig="held"))
     assert solution.converged
     assert place_error(small[0], solution) < 0.01
     assert relative_rms_rad(small[0], solution).max() < 0.15e-3

@@ -53,7 +53,9 @@ def solved() -> Callable[..., Solution]:
     def of(rig: str, **options: Any) -> Solution:
         key = f"{rig} {options}"
         if key not in made:
-            made[key] = solve(simulate(small_rig(rig), SMALL, seed=0).traverse, SolveOptions(**options))
+            made[key] = solve(
+                simulate(small_rig(rig), SMALL, seed=0).traverse, SolveOptions(**{"rig": "held"} | options)
+            )
         return made[key]
 
     return of

@@ -290,7 +290,8 @@ def test_it_goes_on_after_a_restart(small: Simulation, batch: Solution, tmp_path
     again = TraverseSmoother.load(path)
     assert again.stops == smoother.stops
     assert again.images == smoother.images
-    assert again.cost == pytest.approx(smoother.cost, rel=1e-6)
+    # Of blocks that hardly moved the cost is that of their linear model; read anew, they are linearised.
+    assert again.cost == pytest.approx(smoother.cost, rel=1e-4)
     for part in parts[2:]:
         again.add_stop(*part)
     require_batch(again, batch)
@@ -388,7 +389,7 @@ def closing(loop: Simulation) -> tuple[TraverseSmoother, list[Parts], list[IntAr
     parts = list(stops_of(loop.traverse))
     held_back = []
     early = set(np.concatenate([p[3].track for p in parts[:3]]).tolist())
-    smoother = TraverseSmoother(loop.traverse.rig, SmootherOptions(telemetry="odometry"))
+    smoother = TraverseSmoother(loop.traverse.rig, SmootherOptions(rig="held", telemetry="odometry"))
     for i, part in enumerate(parts):
         rows = np.flatnonzero(np.isin(part[3].track, list(early))) if i >= 6 else np.zeros(0, dtype=np.int64)
         held_back.append(rows)

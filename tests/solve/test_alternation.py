@@ -45,7 +45,7 @@ def firm(quantity: Quantity, scope: Scope, sigma: float, *entries: str) -> Freed
 
 
 SHARED = {
-    "radius": SolveOptions(model="circle", flex=LOOSE),
+    "radius": SolveOptions(model="circle", rig="held", flex=LOOSE),
     "radius of all": SolveOptions(
         model="circle", flex=LOOSE, sharing=Sharing(radius=Freedom(scope="all", sigma={"radius_m": 1e-2}))
     ),

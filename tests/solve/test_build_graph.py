@@ -141,7 +141,7 @@ def test_what_a_solution_used_is_taken_by_least_squares() -> None:
 
 def test_bad_input_is_told() -> None:
     with pytest.raises(InputError, match="expected the model mast, circle or free, found projective"):
-        build_graph(near(), SolveOptions(model="projective"))
+        build_graph(near(), SolveOptions(rig="held", model="projective"))
     with pytest.raises(InputError, match=r"used: expected one entry for each of .* observations, found 3"):
         build_graph(near(), used=np.ones(3, dtype=bool))
     with pytest.raises(InputError, match=r"stop: expected one of stop0000, .*; found 'stop9'"):

@@ -30,8 +30,8 @@ from pancam_graph.rigs import mer_navcam
 from pancam_graph.solve.cross_validation._halves import Groups, random_half, upper_half
 
 SMALL = SimulationOptions(stops=2, pans=3, sweep_rad=1.5, points_per_image=15)
-PLAIN = SolveOptions(loss="none")
-EXACT = SolveOptions(loss="none", relative_decrease=1e-11)
+PLAIN = SolveOptions(rig="held", loss="none")
+EXACT = SolveOptions(rig="held", loss="none", relative_decrease=1e-11)
 
 
 @pytest.fixture(scope="module")
@@ -253,11 +253,13 @@ def test_the_same_arguments_give_the_same_numbers(
 
 
 OPTIONS = {
-    "explicit": SolveOptions(loss="none", landmarks="explicit"),
-    "firm tie": SolveOptions(loss="none", tie="soft", flex=Flex(rotation_rad=1e-6, translation_m=1e-5)),
-    "soft tie": SolveOptions(loss="none", tie="soft"),
-    "circle": SolveOptions(loss="none", model="circle"),
-    "free": SolveOptions(loss="none", model="free"),
+    "explicit": SolveOptions(rig="held", loss="none", landmarks="explicit"),
+    "firm tie": SolveOptions(
+        rig="held", loss="none", tie="soft", flex=Flex(rotation_rad=1e-6, translation_m=1e-5)
+    ),
+    "soft tie": SolveOptions(rig="held", loss="none", tie="soft"),
+    "circle": SolveOptions(rig="held", loss="none", model="circle"),
+    "free": SolveOptions(rig="held", loss="none", model="free"),
 }
 
 
@@ -351,7 +353,7 @@ def test_an_empty_half_says_nothing() -> None:
 
 
 def test_a_half_that_does_not_converge_says_nothing(traverse: Traverse) -> None:
-    options = SolveOptions(loss="none", max_iterations=1, relative_decrease=0.0)
+    options = SolveOptions(rig="held", loss="none", max_iterations=1, relative_decrease=0.0)
     found = cross_validate(traverse, options, halvings=1)
     assert np.isnan(found.pointing.honest).all()
     text = "\n".join(found.warnings)
@@ -408,7 +410,7 @@ def test_solutions_of_others_are_refused(
 ) -> None:
     other = simulate(mer_navcam(), options, seed=seed).traverse
     with pytest.raises(InputError, match=f"^solution: expected one of .*found .*{what}$"):
-        cross_validate(other, SolveOptions(model=model), solution=solution)  # type: ignore[arg-type]  # parametrised
+        cross_validate(other, SolveOptions(rig="held", model=model), solution=solution)  # type: ignore[arg-type]  # parametrised
 
 
 def test_equal_observations_in_other_arrays_are_the_same(

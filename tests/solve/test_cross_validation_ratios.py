@@ -18,7 +18,7 @@ from pancam_graph.base.geometry import FloatArray
 from pancam_graph.data import Sigmas, Spread
 from pancam_graph.rigs import Rig, exomars_pancam, mer_navcam
 
-PLAIN = SolveOptions(loss="none")
+PLAIN = SolveOptions(rig="held", loss="none")
 
 
 class Linear:

@@ -22,9 +22,9 @@ from support.solving import fitted, solution_from
 SMALL = SimulationOptions(stops=2, pans=3, sweep_rad=1.5, points_per_image=15)
 NEAR_M = 20.0
 MODELS = {
-    "mast": SolveOptions(tie="soft", flex=Flex(rotation_rad=1e-4, translation_m=1e-3)),
-    "circle": SolveOptions(model="circle"),
-    "free": SolveOptions(model="free"),
+    "mast": SolveOptions(rig="held", tie="soft", flex=Flex(rotation_rad=1e-4, translation_m=1e-3)),
+    "circle": SolveOptions(rig="held", model="circle"),
+    "free": SolveOptions(rig="held", model="free"),
 }
 
 
@@ -81,7 +81,11 @@ def test_with_landmarks_on_the_horizon_the_optimum_is_no_worse_than_the_explicit
 @pytest.mark.parametrize("model", [*MODELS, "hard"])
 def test_without_noise_the_truth_comes_back(model: str) -> None:
     simulation = simulate(mer_navcam(), replace(SMALL, noise_px=0.0, prior="truth"), seed=3)
-    options = SolveOptions(loss="none", relative_decrease=1e-12) if model == "hard" else to_the_end(model)
+    options = (
+        SolveOptions(rig="held", loss="none", relative_decrease=1e-12)
+        if model == "hard"
+        else to_the_end(model)
+    )
     solution = solve(simulation.traverse, options, start=start_of(simulation))
     assert solution.cost_initial > 1e3
     assert solution.cost_final < 1e-12
@@ -159,14 +163,14 @@ def test_what_telemetry_alone_holds_is_no_surer_than_telemetry(sigma_m: float) -
     """Where two stops stand together no image tells: half the variance of either one."""
     t = small().traverse
     stops = tuple(replace(s, sigma_rotation_rad=0.1, sigma_translation_m=sigma_m) for s in t.stops)
-    solution = solve(replace(t, stops=stops), SolveOptions(loss="none"))
+    solution = solve(replace(t, stops=stops), SolveOptions(rig="held", loss="none"))
     for stop in range(2):
         variance = np.linalg.eigvalsh(solution.stop_covariance[stop][3:, 3:])
         assert np.sqrt(variance.min()) > 0.99 * sigma_m / np.sqrt(2)
 
 
 def test_covariances_of_landmarks_are_there_only_where_asked_for() -> None:
-    assert solve(small().traverse, SolveOptions(loss="none")).landmark_covariance_m2 is None
+    assert solve(small().traverse, SolveOptions(rig="held", loss="none")).landmark_covariance_m2 is None
 
 
 # --- hard and soft ---
@@ -174,12 +178,13 @@ def test_covariances_of_landmarks_are_there_only_where_asked_for() -> None:
 
 def test_a_soft_tie_meets_the_hard_one_as_its_sigma_goes_to_zero() -> None:
     """What flex gains shrinks with the square of its sigma, once that is small against what images know."""
-    hard = solve(small().traverse, SolveOptions(loss="none", relative_decrease=1e-12))
+    hard = solve(small().traverse, SolveOptions(rig="held", loss="none", relative_decrease=1e-12))
     gains, turns, shifts = [], [], []
     for sigma in (1e-4, 1e-5, 1e-6, 1e-7):
         flex = Flex(rotation_rad=sigma, translation_m=10 * sigma)
         soft = solve(
-            small().traverse, SolveOptions(loss="none", relative_decrease=1e-12, tie="soft", flex=flex)
+            small().traverse,
+            SolveOptions(rig="held", loss="none", relative_decrease=1e-12, tie="soft", flex=flex),
         )
         gains.append((hard.cost_final - soft.cost_final) / hard.cost_final)
         turns.append(np.abs(soft.final.pan_tilt_rad - hard.final.pan_tilt_rad).max())
@@ -205,7 +210,9 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch: pytest.MonkeyPatch, l
     found = []
     for threads in ("1", "3"):
         monkeypatch.setenv("PANCAM_GRAPH_THREADS", threads)
-        found.append(solve(simulation.traverse, SolveOptions(loss=loss, landmark_covariances=True)))
+        found.append(
+            solve(simulation.traverse, SolveOptions(rig="held", loss=loss, landmark_covariances=True))
+        )
     one, three = found
     assert one.cost_history == three.cost_history
     assert one.cost_final == three.cost_final
@@ -283,7 +290,7 @@ def moved(a: Solution, b: Solution) -> float:
     ("loss", "reason"), [("none", "behind"), ("huber", "outlier"), ("cauchy", "outlier")]
 )
 def test_what_matches_behind_a_camera_is_named_and_harms_nobody(loss: LossName, reason: str) -> None:
-    traverse, options = small().traverse, SolveOptions(loss=loss)
+    traverse, options = small().traverse, SolveOptions(rig="held", loss=loss)
     tracks = Cameras(small()).false_matches(5)
     last = np.cumsum([len(track) for track in tracks]) - 1
     without, solution = solve(traverse, options), solve(with_tracks(traverse, tracks), options)
@@ -315,14 +322,14 @@ def test_a_pair_whose_rays_diverge_goes_and_harms_nobody() -> None:
     for rows in pairs:
         uv[rows] = uv[rows[::-1]]
     spoilt = np.isin(np.arange(len(obs)), pairs)
-    options = SolveOptions(relative_decrease=1e-10)
+    options = SolveOptions(rig="held", relative_decrease=1e-10)
     without = solve(traverse.with_observations(obs.select(~spoilt)), options)
     solution = solve(traverse.with_observations(replace(obs, uv_px=uv)), options)
     assert spoilt.sum() == 12
     assert {solution.reason[i] for i in np.flatnonzero(spoilt)} <= {"outlier", "behind"}
     assert solution.used[~spoilt].tolist() == without.used.tolist()
     assert moved(solution, without) < 1e-6
-    kept = solve(traverse.with_observations(replace(obs, uv_px=uv)), SolveOptions(loss="none"))
+    kept = solve(traverse.with_observations(replace(obs, uv_px=uv)), SolveOptions(rig="held", loss="none"))
     named = next(w for w in kept.warnings if "diverge" in w)
     assert str(obs.track[pairs[0][0]]) in named
 
@@ -339,7 +346,7 @@ def test_a_horizon_that_one_stop_sees_keeps_its_place(loss: LossName) -> None:
             point = cameras.t[a] + distance * cameras.ray(a, rng.uniform(100, 900, 2))
             tracks.append([(i, cameras.pixel(i, point)[0] + rng.normal(0, 0.3, 2)) for i in (a, b)])
     traverse = with_tracks(t, tracks)
-    solution = solve(traverse, SolveOptions(loss=loss))
+    solution = solve(traverse, SolveOptions(rig="held", loss=loss))
     assert solution.converged
     assert solution.iterations <= 8
     assert t.observations is not None
@@ -354,7 +361,7 @@ def test_what_starts_beyond_infinity_comes_back(loss: LossName) -> None:
     """Telemetry three times as wrong as it says turns the rays of far landmarks apart."""
     options = replace(SMALL, noise_px=0.0, prior="truth", pointing_scale=3.0, reach_m=400.0)
     simulation = simulate(mer_navcam(), options, seed=3)
-    prepared = prepare(simulation.traverse, SolveOptions(loss=loss), start_of(simulation))
+    prepared = prepare(simulation.traverse, SolveOptions(rig="held", loss=loss), start_of(simulation))
     assert (prepared.problem.landmarks.vector[:, 3] < 0).sum() > 3
     adjustment = fit(screen(prepared))
     solution = solution_from(adjustment)
@@ -375,7 +382,7 @@ def camera_on_the_axes() -> Rig:
 @pytest.mark.parametrize("loss", ["none", "huber"])
 def test_rays_from_one_centre_tell_pointing_and_a_warning_names_their_tracks(loss: LossName) -> None:
     simulation = simulate(camera_on_the_axes(), replace(SMALL, stops=1, pans=5), seed=0)
-    solution = solve(simulation.traverse, SolveOptions(loss=loss))
+    solution = solve(simulation.traverse, SolveOptions(rig="held", loss=loss))
     assert solution.converged
     assert solution.used.all()
     n = len(solution.landmark_track)
@@ -390,7 +397,7 @@ def test_rays_from_one_centre_tell_pointing_and_a_warning_names_their_tracks(los
 def test_where_telemetry_holds_everything_landmarks_are_placed(loss: LossName) -> None:
     held = replace(SMALL, sigma_stop_m=0.0, sigma_stop_rad=0.0, pointing_scale=0.0)
     simulation = simulate(mer_navcam(), held, seed=0)
-    solution = solve(simulation.traverse, SolveOptions(loss=loss, landmark_covariances=True))
+    solution = solve(simulation.traverse, SolveOptions(rig="held", loss=loss, landmark_covariances=True))
     assert solution.converged
     assert solution.used.mean() > 0.99
     assert not solution.stop_covariance.any()

@@ -18,7 +18,7 @@ from pancam_graph.solve._range_prior import RangePrior
 from support.far_scenes import FarScene, far_scene
 from support.solving import fitted
 
-PLAIN = SolveOptions(loss="none")
+PLAIN = SolveOptions(rig="held", loss="none")
 Ranges = Callable[[np.random.Generator], FloatArray]
 
 

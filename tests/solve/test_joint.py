@@ -25,7 +25,7 @@ MODELS: tuple[Model, ...] = ("free", "circle", "projective")
 def problem_of(model: Model, *, shared: bool = False) -> Problem:
     flex = None if model == "circle" else Flex(rotation_rad=0.02, translation_m=0.3)
     sharing = Sharing(calibration=Freedom(scope="eye", free=("focal",))) if shared else None
-    options = SolveOptions(model=model, loss="none", flex=flex, sharing=sharing)
+    options = SolveOptions(rig="held", model=model, loss="none", flex=flex, sharing=sharing)
     return prepare(simulate(mer_navcam(), OPTIONS, seed=3).traverse, options).problem
 
 
@@ -98,7 +98,7 @@ def test_what_no_damping_lets_lower_the_cost_stays_where_it_is() -> None:
     """At an optimum; each bit of it."""
     adjustment = fitted(
         simulate(mer_navcam(), OPTIONS, seed=3).traverse,
-        SolveOptions(model="free", loss="none", relative_decrease=1e-14, max_iterations=100),
+        SolveOptions(rig="held", model="free", loss="none", relative_decrease=1e-14, max_iterations=100),
     )
     problem = adjustment.problem
     joint = joint_of(problem)

@@ -18,7 +18,7 @@ from pancam_graph.rigs import mer_navcam
 from pancam_graph.simulate import Simulation
 
 SMALL = SimulationOptions(stops=2, pans=3, sweep_rad=1.5, points_per_image=15)
-TO_THE_END = SolveOptions(model="projective", loss="none", relative_decrease=1e-12)
+TO_THE_END = SolveOptions(rig="held", model="projective", loss="none", relative_decrease=1e-12)
 
 
 @cache
@@ -170,7 +170,7 @@ def test_the_worlds_origin_does_not_matter() -> None:
     Without conditioning, Cholesky fails on that and QR goes on, with fewer digits.
     """
     here, away = small(), elsewhere(small(), np.array([1000.0, -1000.0, 100.0]))
-    options = SolveOptions(model="projective", loss="none", max_iterations=30)
+    options = SolveOptions(rig="held", model="projective", loss="none", max_iterations=30)
     found = [
         solve(s.traverse, replace(options, normalise=n), start=telemetry(s, disturbed(s)))
         for s, n in ((here, True), (away, True), (away, False))
@@ -205,7 +205,7 @@ def test_a_mast_starts_on_its_chain_whatever_cameras_are_given() -> None:
     given = start_from_cameras(simulation.traverse, cameras_of(simulation, shift_m=0.01).projections)
     assert given.cameras is not None
     with_cameras, without = (
-        solve(simulation.traverse, SolveOptions(loss="none"), start=start)
+        solve(simulation.traverse, SolveOptions(rig="held", loss="none"), start=start)
         for start in (given, replace(given, cameras=None))
     )
     assert with_cameras.cost_history == without.cost_history
@@ -217,7 +217,7 @@ def test_start_from_camera_matrices_has_the_cameras_themselves() -> None:
     start = start_from_cameras(simulation.traverse, -3 * given.projections)
     assert start.cameras is not None
     assert start.cameras.projections == pytest.approx(given.projections, rel=1e-9, abs=1e-9)
-    options = SolveOptions(model="projective", loss="none")
+    options = SolveOptions(rig="held", model="projective", loss="none")
     assert solve(simulation.traverse, options, start=start).converged
 
 
@@ -249,7 +249,7 @@ def true_angles(simulation: Simulation, cameras: FreeCameras) -> FloatArray:
 def test_errors_are_as_large_as_the_sigmas_say() -> None:
     """Cameras off the mast, and K off the rig's, by what the tie says; over drives that differ in all."""
     flex = Flex(rotation_rad=1e-3, translation_m=2e-3, calibration=1e-3)
-    options = SolveOptions(model="projective", loss="none", flex=flex)
+    options = SolveOptions(rig="held", model="projective", loss="none", flex=flex)
     angles, stops = [], []
     for seed in range(40):
         simulation = simulate(mer_navcam(), SMALL, seed=seed)
@@ -281,7 +281,7 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch: pytest.MonkeyPatch, l
     found = []
     for threads in ("1", "3"):
         monkeypatch.setenv("PANCAM_GRAPH_THREADS", threads)
-        found.append(solve(simulation.traverse, SolveOptions(model="projective", loss=loss)))  # type: ignore[arg-type]  # a loss by name
+        found.append(solve(simulation.traverse, SolveOptions(rig="held", model="projective", loss=loss)))  # type: ignore[arg-type]  # a loss by name
     one, three = found
     assert one.cost_history == three.cost_history
     assert np.array_equal(one.calibration, three.calibration)
@@ -293,7 +293,7 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch: pytest.MonkeyPatch, l
 def test_outliers_are_left_out() -> None:
     """But for some of two or three rays, which move along their lines of sight and fit all the same."""
     simulation = simulate(mer_navcam(), replace(SMALL, outliers=0.03), seed=1)
-    solution = solve(simulation.traverse, SolveOptions(model="projective"))
+    solution = solve(simulation.traverse, SolveOptions(rig="held", model="projective"))
     assert solution.converged
     outlier = simulation.truth.outlier
     obs = simulation.traverse.observations
@@ -307,7 +307,7 @@ def test_outliers_are_left_out() -> None:
 def test_held_telemetry_stays_bit_for_bit() -> None:
     t = small().traverse
     frames = tuple(replace(f, sigma_pan_rad=0.0, sigma_tilt_rad=0.0) for f in t.frames)
-    solution = solve(replace(t, frames=frames), SolveOptions(model="projective", loss="none"))
+    solution = solve(replace(t, frames=frames), SolveOptions(rig="held", model="projective", loss="none"))
     assert solution.converged
     first, given = solution.final.world_T_mast[0], t.stops[0].world_T_mast
     assert first.matrix().tolist() == given.matrix().tolist()
@@ -318,12 +318,12 @@ def test_held_telemetry_stays_bit_for_bit() -> None:
 
 def test_refusals() -> None:
     with pytest.raises(InputError, match="landmarks: expected eliminated for the model projective"):
-        SolveOptions(model="projective", landmarks="explicit")
+        SolveOptions(rig="held", model="projective", landmarks="explicit")
     with pytest.raises(InputError, match="tie: expected soft for the model projective, found hard"):
-        SolveOptions(model="projective", tie="hard")
+        SolveOptions(rig="held", model="projective", tie="hard")
     with pytest.raises(InputError, match="normalise: expected True for the model free"):
-        SolveOptions(model="free", normalise=False)
+        SolveOptions(rig="held", model="free", normalise=False)
     with pytest.raises(InputError, match="projective, whose matrices have calibrations"):
-        SolveOptions(model="projective", sharing=Sharing(calibration=Freedom(scope="eye")))
+        SolveOptions(rig="held", model="projective", sharing=Sharing(calibration=Freedom(scope="eye")))
     with pytest.raises(InputError, match="flex: calibration: expected a number above 0, found 0"):
         Flex(rotation_rad=0.02, translation_m=0.02, calibration=0.0)

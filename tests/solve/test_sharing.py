@@ -84,6 +84,7 @@ def test_without_noise_the_true_rig_comes_back(name: str, tie: Tie) -> None:
     tilts = (-0.3,) if "radius" in name else TWO_TILTS.tilts_rad  # an error of radius is one at one tilt
     simulation = simulated(1, noise_px=0.0, prior="truth", tilts_rad=tilts, **wrong)
     options = SolveOptions(
+        rig="held",
         loss="none",
         model=model,
         tie=tie,
@@ -128,10 +129,10 @@ def equal_bits(a: Solution, b: Solution) -> bool:
 
 
 @pytest.mark.parametrize("model", ["mast", "circle", "free"])
-def test_saying_the_default_changes_no_bit(model: str) -> None:
+def test_saying_that_all_is_held_changes_no_bit(model: Model) -> None:
     t = simulated().traverse
-    plain = solve(t, SolveOptions(model=model))  # type: ignore[arg-type]  # parametrised
-    said = solve(t, SolveOptions(model=model, sharing=parse_sharing(["calibration=fixed", "mounts=fixed"])))  # type: ignore[arg-type]  # parametrised
+    plain = solve(t, SolveOptions(rig="held", model=model))
+    said = solve(t, SolveOptions(model=model, sharing=parse_sharing(["calibration=fixed", "mounts=fixed"])))
     assert equal_bits(plain, replace(said, warnings=plain.warnings))
     assert (plain.final.rig is None) == (model != "circle")
     assert plain.rig.eyes == t.rig.eyes
@@ -146,7 +147,7 @@ def test_what_is_held_stays_bit_for_bit(tie: str) -> None:
         pan_T_tilt=Freedom(scope="all", free=("x_m",)),
     )
     t = simulated(**WRONG).traverse
-    solution = solve(t, SolveOptions(loss="none", tie=tie, sharing=sharing))  # type: ignore[arg-type]  # parametrised
+    solution = solve(t, SolveOptions(rig="held", loss="none", tie=tie, sharing=sharing))  # type: ignore[arg-type]  # parametrised
     for found, given_ in zip(solution.rig.eyes, t.rig.eyes, strict=True):
         before, after = given_.camera.pinhole, found.camera.pinhole
         assert (after.cx_px, after.cy_px, after.skew_px) == (before.cx_px, before.cy_px, before.skew_px)
@@ -167,7 +168,7 @@ def test_what_is_held_stays_bit_for_bit(tie: str) -> None:
 def test_a_fixed_radius_is_the_rigs() -> None:
     t = simulated().traverse
     free, fixed = (
-        solve(t, SolveOptions(model="circle", loss="none", sharing=Sharing(radius=radius)))
+        solve(t, SolveOptions(rig="held", model="circle", loss="none", sharing=Sharing(radius=radius)))
         for radius in (None, Freedom())
     )
     assert fixed.refined == ()
@@ -209,7 +210,7 @@ def test_a_distorted_camera_keeps_its_distortion_as_its_calibration_moves(scope:
     sharing = Sharing(calibration=loose("calibration", scope, "fx_px", "fy_px", "cx_px", "cy_px"))
     solution = solve(
         simulation.traverse,
-        SolveOptions(loss="none", sharing=sharing, relative_decrease=1e-12),
+        SolveOptions(rig="held", loss="none", sharing=sharing, relative_decrease=1e-12),
         start=start_of(simulation),
     )
     assert solution.converged
@@ -292,7 +293,10 @@ def test_a_hard_tie_has_the_explicit_optimum_too() -> None:
         calibration=Freedom(scope="eye"), mounts=Freedom(scope="eye"), pan_T_tilt=Freedom(scope="all")
     )
     ours, theirs = (
-        solve(near(), SolveOptions(loss="none", landmarks=way, sharing=sharing, relative_decrease=1e-12))
+        solve(
+            near(),
+            SolveOptions(rig="held", loss="none", landmarks=way, sharing=sharing, relative_decrease=1e-12),
+        )
         for way in ("eliminated", "explicit")
     )
     assert ours.cost_final == pytest.approx(theirs.cost_final, rel=1e-6)
@@ -325,5 +329,5 @@ def test_sigmas_are_gtsams(name: str) -> None:
 
 def test_pointing_is_less_sure_where_the_rig_is() -> None:
     t, mounts = near(), Sharing(mounts=Freedom(scope="eye"))
-    fixed, free = (solve(t, SolveOptions(loss="none", sharing=s)) for s in (None, mounts))
+    fixed, free = (solve(t, SolveOptions(rig="held", loss="none", sharing=s)) for s in (None, mounts))
     assert np.all(free.angle_sigma_rad[:, 1] > 1.2 * fixed.angle_sigma_rad[:, 1])

@@ -45,7 +45,7 @@ def test_errors_have_the_variance_that_their_sigmas_say(
     for seed in range(60):
         simulation = simulated.__wrapped__(seed, **wrong)
         t, truth = simulation.traverse, simulation.truth
-        solution = solve(t, SolveOptions(loss="none", model=model, sharing=sharing))  # type: ignore[arg-type]  # parametrised
+        solution = solve(t, SolveOptions(rig="held", loss="none", model=model, sharing=sharing))  # type: ignore[arg-type]  # parametrised
         assert solution.converged
         error = solution.final.pan_tilt_rad - truth.pan_tilt_rad
         angles.append(np.mean((error / solution.angle_sigma_rad) ** 2))
@@ -74,7 +74,7 @@ def test_a_wrong_rig_is_no_reason_to_reject() -> None:
     """At the start residuals are 6 px, of mounts that are as wrong as their priors say."""
     simulation = simulated(4, outliers=0.03, min_views=3, **DRAWN)
     sharing = Sharing(calibration=Freedom(scope="eye", free=FOCAL), mounts=Freedom(scope="eye"))
-    solution = solve(simulation.traverse, SolveOptions(sharing=sharing))
+    solution = solve(simulation.traverse, SolveOptions(rig="held", sharing=sharing))
     outlier = simulation.truth.outlier
     assert solution.rms_initial_px > 2
     assert (~outlier & solution.used).sum() >= 0.99 * (~outlier).sum()
@@ -91,7 +91,7 @@ def unseen(solution: Solution) -> str:
 def test_what_images_do_not_tell_is_named() -> None:
     """A turn of both mounts about the tilt axis is a change of all tilts; its lift is the mast's."""
     t = simulated().traverse
-    mounts = solve(t, SolveOptions(loss="none", sharing=Sharing(mounts=Freedom(scope="eye"))))
+    mounts = solve(t, SolveOptions(rig="held", loss="none", sharing=Sharing(mounts=Freedom(scope="eye"))))
     assert "rx_rad" in unseen(mounts)
     assert "mounts left" in unseen(mounts)
     assert "mounts right" in unseen(mounts)
@@ -99,7 +99,10 @@ def test_what_images_do_not_tell_is_named() -> None:
     # Telemetry of 16 frames knows their mean tilt to a quarter of what it knows of each: no better the turn.
     assert 1.34e-3 / 4 < by_name["left", "rx_rad"].sigma < 1.3 * 1.34e-3 / 4
     axis = solve(
-        t, SolveOptions(loss="none", sharing=Sharing(pan_T_tilt=Freedom(scope="all", free=("z_m", "ry_rad"))))
+        t,
+        SolveOptions(
+            rig="held", loss="none", sharing=Sharing(pan_T_tilt=Freedom(scope="all", free=("z_m", "ry_rad")))
+        ),
     )
     assert unseen(axis).startswith("images say next to nothing of 2 directions (")
     lift = next(r for r in axis.refined if r.entry == "z_m")
@@ -108,7 +111,7 @@ def test_what_images_do_not_tell_is_named() -> None:
 
 def test_what_images_do_tell_is_not_named() -> None:
     sharing = Sharing(calibration=Freedom(scope="eye", free=FOCAL))
-    assert unseen(solve(simulated().traverse, SolveOptions(loss="none", sharing=sharing))) == ""
+    assert unseen(solve(simulated().traverse, SolveOptions(rig="held", loss="none", sharing=sharing))) == ""
 
 
 def test_what_nothing_holds_is_named_however_it_comes_out() -> None:
@@ -118,7 +121,8 @@ def test_what_nothing_holds_is_named_however_it_comes_out() -> None:
     """
     t = simulated(2, stops=1).traverse
     solution = solve(
-        t, SolveOptions(loss="none", sharing=Sharing(pan_T_tilt=loose("pan_T_tilt", "all", "z_m")))
+        t,
+        SolveOptions(rig="held", loss="none", sharing=Sharing(pan_T_tilt=loose("pan_T_tilt", "all", "z_m"))),
     )
     assert len([w for w in solution.warnings if "pan_T_tilt z_m" in w]) == 1
     assert not solution.refined[0].sigma < 1.0
@@ -130,7 +134,7 @@ def test_where_nothing_holds_an_entry_there_are_no_uncertainties_and_it_is_named
     blind = 3
     seen = t.with_observations(t.observations.select(t.observations.image != blind))
     sharing = Sharing(calibration=loose("calibration", "image", *FOCAL))
-    solution = solve(seen, SolveOptions(loss="none", sharing=sharing))
+    solution = solve(seen, SolveOptions(rig="held", loss="none", sharing=sharing))
     [warning] = [w for w in solution.warnings if w.startswith("no uncertainties")]
     assert f"nothing holds calibration {t.images[blind].id} focal of the rig" in warning
     assert np.isnan([r.sigma for r in solution.refined]).all()
@@ -150,7 +154,7 @@ def test_eyes_without_images_have_no_variables() -> None:
         t, images=tuple(t.images[i] for i in kept), observations=replace(obs, image=row[obs.image])
     )
     sharing = Sharing(calibration=Freedom(scope="eye", free=FOCAL))
-    solution = solve(without, SolveOptions(loss="none", sharing=sharing))
+    solution = solve(without, SolveOptions(rig="held", loss="none", sharing=sharing))
     assert [r.camera for r in solution.refined] == ["wac-left", "wac-right"]
     assert solution.rig.eyes[2] == t.rig.eyes[2]
 
@@ -160,7 +164,7 @@ def test_eyes_may_share_a_correction_though_their_numbers_differ() -> None:
     simulation = simulate(rig, replace(TWO_TILTS, stops=1, tilts_rad=(-0.2,)), seed=0)
     sharing = Sharing(calibration=Freedom(scope="all", free=("focal", "cx_px")))
     assert len({p.fx_px for p in rig.pinholes}) > len({p.cx_px for p in rig.pinholes}) == 1
-    solution = solve(simulation.traverse, SolveOptions(loss="none", sharing=sharing))
+    solution = solve(simulation.traverse, SolveOptions(rig="held", loss="none", sharing=sharing))
     focal, column = solution.refined
     assert (focal.nominal, column.nominal) == (1.0, rig.pinholes[0].cx_px)
     for found, given_ in zip(solution.rig.pinholes, rig.pinholes, strict=True):
@@ -168,7 +172,10 @@ def test_eyes_may_share_a_correction_though_their_numbers_differ() -> None:
         assert found.fy_px / given_.fy_px == pytest.approx(1 + focal.change, rel=1e-12)
         assert found.cx_px - given_.cx_px == pytest.approx(column.change, abs=1e-9)
     common = Sharing(calibration=Freedom(scope="all", free=("fx_px",)))
-    assert solve(simulation.traverse, SolveOptions(loss="none", sharing=common)).refined[0].nominal is None
+    assert (
+        solve(simulation.traverse, SolveOptions(rig="held", loss="none", sharing=common)).refined[0].nominal
+        is None
+    )
 
 
 # --- real ---
@@ -186,7 +193,9 @@ def test_a_free_focal_length_of_opportunity(request: pytest.FixtureRequest) -> N
     t = matched.with_observations(kept)
     sharing = Sharing(calibration=Freedom(scope="eye", free=FOCAL))
     for model in ("mast", "circle", "free"):
-        fixed, free = (solve(t, SolveOptions(model=model, loss="none", sharing=s)) for s in (None, sharing))
+        fixed, free = (
+            solve(t, SolveOptions(rig="held", model=model, loss="none", sharing=s)) for s in (None, sharing)
+        )
         assert free.converged
         assert free.cost_final < fixed.cost_final
         focal = free.refined[0]

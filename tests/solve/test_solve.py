@@ -75,7 +75,7 @@ def test_optimum_of_an_independent_solver(
     """The traverses of the benchmark end at Ceres's cost: the soft tie is as good as rigid."""
     monkeypatch.setattr(sys, "argv", [str(bench_generator), str(tmp_path), "--rig", rig, "--stops", "3"])
     runpy.run_path(str(bench_generator), run_name="__main__")
-    solution = solve(read_traverse(tmp_path), SolveOptions(loss="none"))
+    solution = solve(read_traverse(tmp_path), SolveOptions(rig="held", loss="none"))
     assert solution.converged
     assert solution.cost_final == pytest.approx(CERES_COST[rig], rel=1e-4)
 
@@ -133,7 +133,7 @@ def test_covariances_agree_with_gtsam_marginals() -> None:
     distance = np.linalg.norm(simulation.truth.landmarks_m, axis=1)
     near = t.with_observations(t.observations.select((distance < 20.0)[t.observations.track]))
     flex = Flex(rotation_rad=1e-7, translation_m=1e-6)
-    options = SolveOptions(loss="none", landmarks="explicit", tie="soft", flex=flex)
+    options = SolveOptions(rig="held", loss="none", landmarks="explicit", tie="soft", flex=flex)
     adjustment = fitted(near, options)
     solution = solution_from(adjustment)
     problem = adjustment.problem
@@ -155,10 +155,10 @@ def test_a_firm_tie_makes_all_models_agree() -> None:
     """Free cameras on a tie as firm as the mast's are the mast; looser, they fit better, never worse."""
     simulation = simulate(mer_navcam(), SMALL, seed=7)
     flex = Flex(rotation_rad=1e-7, translation_m=1e-6)
-    mast = solve(simulation.traverse, SolveOptions(loss="none"))
-    firm = solve(simulation.traverse, SolveOptions(loss="none", model="free", flex=flex))
-    free = solve(simulation.traverse, SolveOptions(loss="none", model="free"))
-    circle = solve(simulation.traverse, SolveOptions(loss="none", model="circle"))
+    mast = solve(simulation.traverse, SolveOptions(rig="held", loss="none"))
+    firm = solve(simulation.traverse, SolveOptions(rig="held", loss="none", model="free", flex=flex))
+    free = solve(simulation.traverse, SolveOptions(rig="held", loss="none", model="free"))
+    circle = solve(simulation.traverse, SolveOptions(rig="held", loss="none", model="circle"))
     assert firm.final.pan_tilt_rad == pytest.approx(mast.final.pan_tilt_rad, abs=1e-6)
     assert firm.angle_sigma_rad == pytest.approx(mast.angle_sigma_rad, rel=0.02)
     assert free.rms_final_px < circle.rms_final_px < mast.rms_final_px

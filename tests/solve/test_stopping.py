@@ -21,7 +21,7 @@ from pancam_graph.solve._stopping import criteria, sigmas_left
 from support.solving import fitted, solution_from
 
 SMALL = SimulationOptions(stops=2, pans=2, sweep_rad=0.8, points_per_image=12)
-BARE = SolveOptions(loss="none", relative_decrease=0.0, residual_sigmas=0.0)
+BARE = SolveOptions(rig="held", loss="none", relative_decrease=0.0, residual_sigmas=0.0)
 FIRM = Flex(rotation_rad=1e-4, translation_m=1e-3)
 SOLVERS = {
     "eliminated": BARE,
@@ -101,7 +101,7 @@ def test_without_any_criterion_only_the_lack_of_a_better_step_ends_it(solver: st
 
 def test_what_is_left_at_its_default_ends_nothing_early() -> None:
     """Of the five only the limit and the relative decrease end a solve that has noise."""
-    default = fitted(traverse(), SolveOptions(loss="none"))
+    default = fitted(traverse(), SolveOptions(rig="held", loss="none"))
     assert default.outcome.reason == "relative decrease below 1e-07"
     assert default.outcome.costs == ended(replace(BARE, relative_decrease=1e-7)).outcome.costs
 
@@ -288,8 +288,8 @@ def test_a_small_share_of_a_large_cost_is_no_optimum() -> None:
     t = simulate(mer_navcam(), options, seed=1).traverse
     assert t.observations is not None
     told = t.with_observations(replace(t.observations, sigma_px=0.01 * t.observations.sigma_px))
-    solution = solve(told, SolveOptions(model="free"))
-    best = solve(told, SolveOptions(model="free", relative_decrease=0.0))
+    solution = solve(told, SolveOptions(rig="held", model="free"))
+    best = solve(told, SolveOptions(rig="held", model="free", relative_decrease=0.0))
     assert solution.stop_reason == "relative decrease below 1e-07"
     assert solution.cost_final - best.cost_final < 0.1**2 / 2
     assert solution.verdict is not None

@@ -124,7 +124,7 @@ def test_corrections_over_their_sigmas_are_standard_normal() -> None:
 
 def test_the_score_of_a_held_number_is_what_freeing_it_gains() -> None:
     traverse = drive(focal_error=2e-3).traverse
-    options = SolveOptions(loss="none")
+    options = SolveOptions(loss="none", rig="held")
     held = {(e.camera, e.entry): e for e in held_entries(fitted(traverse, options).problem)}
     sharing = Sharing(calibration=Freedom(scope="eye", free=("focal",)))
     freed = fitted(traverse, replace(options, sharing=sharing))
@@ -137,7 +137,9 @@ def test_the_score_of_a_held_number_is_what_freeing_it_gains() -> None:
 
 def test_the_score_of_a_long_drive_comes_from_part_of_its_stops(monkeypatch: pytest.MonkeyPatch) -> None:
     """Within a factor of two of what all observations say, of the same number."""
-    problem = fitted(drive(focal_error=2e-3, stops=8, pans=6).traverse, SolveOptions(loss="none")).problem
+    problem = fitted(
+        drive(focal_error=2e-3, stops=8, pans=6).traverse, SolveOptions(rig="held", loss="none")
+    ).problem
     monkeypatch.setattr(_rig_score, "_ENOUGH", 10**9)
     whole = max(held_entries(problem), key=lambda e: e.gain)
     monkeypatch.setattr(_rig_score, "_ENOUGH", 300)
@@ -150,8 +152,13 @@ def test_the_score_of_a_long_drive_comes_from_part_of_its_stops(monkeypatch: pyt
     assert 0.4 * whole.gain < part.gain < 2.5 * whole.gain
 
 
-def test_a_rig_that_is_wrong_is_advised_of() -> None:
-    note = named(solve(drive(focal_error=4e-3).traverse))["held rig"]
-    assert note.passed
-    assert note.is_note
-    assert "--sharing calibration=eye:focal" in note.says
+def test_a_held_rig_that_is_wrong_fails_with_advice() -> None:
+    test = named(solve(drive(focal_error=4e-3).traverse, SolveOptions(rig="held")))["held rig"]
+    assert not test.passed
+    assert "--rig estimated" in test.says
+    assert "--sharing calibration=eye:focal" in test.says
+
+
+def test_a_considered_rig_that_is_wrong_is_advised_of() -> None:
+    solution = solve(drive(focal_error=4e-3).traverse, SolveOptions(rig="considered"))
+    assert named(solution)["held rig"].is_note

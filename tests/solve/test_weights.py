@@ -27,7 +27,7 @@ from support.truth import errors_in_sigmas
 
 SMALL = SimulationOptions(stops=2, pans=3, sweep_rad=1.5, points_per_image=15, noise_stretch=5.0)
 NEAR_M = 20.0
-PLAIN = SolveOptions(loss="none", relative_decrease=0.0)
+PLAIN = SolveOptions(rig="held", loss="none", relative_decrease=0.0)
 
 
 def cahvor_navcam() -> Rig:
@@ -188,7 +188,7 @@ def test_round_covariances_are_sigmas(loss: str) -> None:
     by_sigma = replace(observed(t), sigma_px=sigma)
     by_covariance = by_sigma.with_covariance(sigma[:, None, None] ** 2 * np.eye(2))
     a, b = (
-        solve(t.with_observations(obs), SolveOptions(loss=loss, relative_decrease=1e-12))  # type: ignore[arg-type]  # parametrised
+        solve(t.with_observations(obs), SolveOptions(rig="held", loss=loss, relative_decrease=1e-12))  # type: ignore[arg-type]  # parametrised
         for obs in (by_sigma, by_covariance)
     )
     assert a.used.tolist() == b.used.tolist()
@@ -255,7 +255,7 @@ def test_without_noise_the_truth_comes_back(rig: str) -> None:
     simulation = simulate(RIGS[rig](), replace(SMALL, noise_px=0.0, prior="truth"), seed=3)
     telemetry = simulation.telemetry_start
     start = Start(world_T_mast=telemetry.world_T_mast, pan_tilt_rad=telemetry.pan_tilt_rad)
-    solution = solve(simulation.traverse, SolveOptions(loss="none"), start=start)
+    solution = solve(simulation.traverse, SolveOptions(rig="held", loss="none"), start=start)
     assert observed(simulation.traverse).covariance_px2 is not None
     assert solution.cost_initial > 1e3
     assert solution.cost_final < 1e-12
@@ -267,7 +267,7 @@ def test_without_noise_the_truth_comes_back(rig: str) -> None:
 def test_the_narrow_axis_of_an_ellipse_bears_the_errors_of_telemetry_at_the_start() -> None:
     """Widened as the mean sigma is, it would not: a share of good observations would go at once."""
     simulation = simulate(mer_navcam(), replace(SMALL, noise_stretch=20.0, pointing_scale=3.0), seed=1)
-    rounds = ScreeningRounds(prepare(simulation.traverse, SolveOptions()))
+    rounds = ScreeningRounds(prepare(simulation.traverse, SolveOptions(rig="held")))
     rounds.from_telemetry()
     assert rounds.problem.accepted.mean() > 0.999
 
@@ -291,7 +291,7 @@ def test_noise_that_is_a_guess_is_rescaled_with_its_shape() -> None:
     given = observed(simulation.traverse)
     assert given.covariance_px2 is not None
     guess = replace(given.with_covariance(given.covariance_px2 / 4), origin="images")
-    solution = solve(simulation.traverse.with_observations(guess), SolveOptions(loss="none"))
+    solution = solve(simulation.traverse.with_observations(guess), SolveOptions(rig="held", loss="none"))
     assert solution.covariance_px2 is not None
     ratio = solution.covariance_px2 / given.covariance_px2
     assert ratio == pytest.approx(ratio[0, 0, 0])
@@ -301,7 +301,7 @@ def test_noise_that_is_a_guess_is_rescaled_with_its_shape() -> None:
 
 def test_residuals_are_written_with_the_covariances() -> None:
     traverse = simulated("pinhole").traverse
-    solution = solve(traverse, SolveOptions(loss="none"))
+    solution = solve(traverse, SolveOptions(rig="held", loss="none"))
     lines = residuals_csv(solution).decode().splitlines()
     names = lines[0].split(",")
     assert names[-3:] == ["cov_uu_px2", "cov_uv_px2", "cov_vv_px2"]
@@ -338,7 +338,7 @@ def test_the_spread_is_as_the_covariance_says_and_larger_where_correlation_is_ig
         assert obs.covariance_px2 is not None
         for name, weigh in WEIGHTS.items():
             t = simulation.traverse.with_observations(weigh(obs, obs.covariance_px2))
-            solution = solve(t, SolveOptions(loss="none"))
+            solution = solve(t, SolveOptions(rig="held", loss="none"))
             shift = truth.world_T_mast[1].localCoordinates(solution.final.world_T_mast[1])
             error[name].append(shift[3:])
             if name == "covariance":
@@ -356,7 +356,7 @@ def test_the_spread_is_as_the_covariance_says_and_larger_where_correlation_is_ig
 def test_ellipses_10000_to_1_take_no_more_steps_than_round_ones(seed: int) -> None:
     """GTSAM's Cholesky calls such a system indeterminate; damped until it does not, the solve crawled."""
     simulation = simulate(mer_navcam(), replace(SMALL, noise_stretch=1e4), seed=seed)
-    solution = solve(simulation.traverse, SolveOptions(loss="none"))
+    solution = solve(simulation.traverse, SolveOptions(rig="held", loss="none"))
     angles, stops = errors_in_sigmas(simulation, solution)
     assert solution.converged
     assert solution.iterations <= 6

@@ -15,8 +15,8 @@ __all__ = ["HARD", "NEAR_M", "SMALL", "SOFT", "near_part", "simulated"]
 SMALL = SimulationOptions(stops=2, pans=3, sweep_rad=1.5, points_per_image=15)
 NEAR_M = 20.0
 """Landmarks farther away end at infinity where they are explicit variables."""
-HARD = SolveOptions(loss="none", relative_decrease=1e-12)
-"""Every observation, to the end, with a hard tie."""
+HARD = SolveOptions(rig="held", loss="none", relative_decrease=1e-12)
+"""Every observation, to the end, with a hard tie and the rig as it is."""
 SOFT = replace(HARD, tie="soft", flex=Flex(rotation_rad=1e-4, translation_m=1e-3))
 
 
