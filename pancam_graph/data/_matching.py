@@ -19,6 +19,8 @@ class Refusal(IntEnum):
     """Too few look alike where the corrected geometry leaves a place for them."""
     FEW_ON_LINES = 4
     """Too few lie on their epipolar lines, or where the corrected pose has them."""
+    CONTRADICTION = 5
+    """The terrain of either stop, sought in the other's images, says another pose between the two."""
 
     @property
     def text(self) -> str:
@@ -32,6 +34,7 @@ _TEXTS = {
     Refusal.CHANCE: "no more agree than by chance",
     Refusal.FEW_GUIDED: "too few look alike under the corrected geometry",
     Refusal.FEW_ON_LINES: "too few fit the corrected geometry",
+    Refusal.CONTRADICTION: "the two directions contradict each other",
 }
 
 

@@ -13,7 +13,15 @@ from pancam_graph.images._match import beyond_chance, match_in_windows
 from pancam_graph.images._pairs import Segments
 from pancam_graph.images._terrain import Sighting, StopTerrain
 
-__all__ = ["Alignment", "Ties", "align_stops", "fit_pose", "telemetry_alignment", "whitened_distance"]
+__all__ = [
+    "Alignment",
+    "Ties",
+    "align_stops",
+    "believed",
+    "fit_pose",
+    "telemetry_alignment",
+    "whitened_distance",
+]
 
 _MAX_TURN_COSINE = float(np.cos(np.deg2rad(40.0)))
 _MAX_ZOOM = 2.5
@@ -22,6 +30,7 @@ _STEPS_PER_OCTAVE = 2
 _FINAL_STEPS = 6
 _AGREE_SIGMAS = 3.0
 _ROUNDS = 2
+_CONTRADICTED_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -109,12 +118,15 @@ def align_stops(
     """Stop b relative to stop a from features whose descriptors agree, or why these may agree by chance.
 
     Each point of a's terrain is looked for among the first sightings of b's, around where telemetry has it;
-    what most of these matches say corrects the pose, and the search is repeated in the smaller windows.
+    what most of these matches say corrects the pose, and the search is repeated in the smaller windows. Where
+    they contradict telemetry, it is repeated with a telemetry that pulls less (see `believed`).
     `feature_of` is the feature of each of the terrain's observations.
     """
-    prior = telemetry_alignment(terrain, a, b)
-    correction = prior
-    for _ in range(_ROUNDS):
+    telemetry = telemetry_alignment(terrain, a, b)
+    prior = correction = telemetry
+    rounds = _ROUNDS
+    while rounds:
+        rounds -= 1
         ties, half_width = _matched(terrain, features, feature_of, (a, b), correction, options)
         if len(ties) < options.min_pair_matches:
             return Refusal.FEW_ALIKE
@@ -125,7 +137,21 @@ def align_stops(
         chance = np.minimum(1.0, (_AGREE_SIGMAS / half_width) ** 2)
         if not beyond_chance(distance < _AGREE_SIGMAS, chance, options):
             return Refusal.CHANCE
+        loosened = believed(telemetry, correction)
+        if prior is telemetry and loosened is not telemetry:
+            prior, rounds = loosened, _ROUNDS
     return correction
+
+
+def believed(telemetry: Alignment, found: Alignment) -> Alignment:
+    """Telemetry as a prior beside what images found: with larger sigmas where they contradict it.
+
+    Beyond three of its sigmas telemetry would only pull what was found away from where it is: all its sigmas
+    then grow until the largest correction is one of them.
+    """
+    gone = gtsam.Pose3.Logmap(telemetry.world_T_mast.between(found.world_T_mast))
+    largest = float(np.abs(np.linalg.lstsq(telemetry.root, gone, rcond=None)[0]).max())
+    return replace(telemetry, root=telemetry.root * largest) if largest > _CONTRADICTED_SIGMAS else telemetry
 
 
 def _matched(

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +16,7 @@ from pancam_graph.images._alignment import (
     Alignment,
     Ties,
     align_stops,
+    believed,
     fit_pose,
     telemetry_alignment,
     whitened_distance,
@@ -28,7 +30,7 @@ from pancam_graph.images._patches import MAX_REACH_PX, QUALITIES, Coefficients, 
 from pancam_graph.images._splines import Splines
 from pancam_graph.images._terrain import Sighting, StopTerrain
 
-__all__ = ["StopMatcher", "StopTies", "joined", "near_stops", "on_terrain", "stereo_stops"]
+__all__ = ["StopMatcher", "StopTies", "agreeing", "joined", "near_stops", "on_terrain", "stereo_stops"]
 
 _CELL_PX = 64.0
 _PER_CELL = 2
@@ -46,6 +48,7 @@ _FITS = 4
 _MAX_RETURN_PX = 0.3
 _LEAST_NOISE_PX = 0.05
 _COMMON = 2.5
+_GAP_SIGMAS, _GAP_SHARE, _GAP_RAD = 8.0, 0.02, 3e-3
 _GROUP, _MOST_GROUPS = 100, 6
 _COUNTS = ("a", "b", "sought", "unlike", "ambiguous", "unstable", "masked", "off_pose", "kept", "refusal")
 
@@ -72,6 +75,8 @@ class StopTies:
 
     ties: Ties
     report: StopMatching
+    pose: Alignment
+    """The second stop in a world where the first stands at its own, by these ties; without, by telemetry."""
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Everything as arrays, for the cache."""
@@ -81,6 +86,8 @@ class StopTies:
             **vars(self.ties),
             "noise_px": noise_px,
             "counts": np.array(counts),
+            "pose": self.pose.world_T_mast.matrix(),
+            "root": self.pose.root,
         }
 
     @staticmethod
@@ -91,6 +98,7 @@ class StopTies:
         return StopTies(
             ties=Ties(**{name: arrays[name] for name in ("row", "image", "uv_px", "covariance_px2")}),
             report=StopMatching(**counts, noise_px=noise_px, refusal=refusal),
+            pose=Alignment(world_T_mast=gtsam.Pose3(arrays["pose"]), root=arrays["root"]),
         )
 
 
@@ -117,7 +125,7 @@ class StopMatcher:
         """
         alignment = align_stops(self.terrain, self.features, self.feature_of, one, other, self.options)
         if isinstance(alignment, Refusal):
-            return _nothing(one, other, _Sought(), alignment)
+            return _nothing(self.terrain, (one, other), _Sought(), alignment)
         t = self.terrain.traverse
         ours, theirs = (np.flatnonzero(t.image_stop == s).tolist() for s in (one, other))
         rows_of = {i: np.flatnonzero(self._chosen & (self.terrain.image == i)) for i in ours}
@@ -133,9 +141,9 @@ class StopMatcher:
         sought += _Sought(masked=int(np.count_nonzero(~shown)))
         ties = ties.select(shown)
         if len(ties) < self.options.min_pair_matches:
-            return _nothing(one, other, sought, Refusal.FEW_GUIDED)
+            return _nothing(self.terrain, (one, other), sought, Refusal.FEW_GUIDED)
         n_ties = len(ties)
-        ties = _measured(self.terrain, ties, (one, other), alignment, self.options)
+        ties, alignment = _measured(self.terrain, ties, (one, other), alignment, self.options)
         report = StopMatching(
             a=one,
             b=other,
@@ -147,16 +155,54 @@ class StopMatcher:
         ties = _with_common_errors(ties)
         # Ties of one point in several images err alike, by the point's own patch: they count as one.
         _, of, times = np.unique(ties.row, return_inverse=True, return_counts=True)
-        return StopTies(ties=ties.scaled(np.sqrt(times[of])), report=report)
+        return StopTies(ties=ties.scaled(np.sqrt(times[of])), report=report, pose=alignment)
 
     @cached_property
     def _chosen(self) -> BoolArray:
         return _spread(self.terrain)
 
 
-def _nothing(one: int, other: int, sought: "_Sought", refusal: Refusal) -> StopTies:
-    report = StopMatching(a=one, b=other, **vars(sought), off_pose=0, kept=0, noise_px=0.0, refusal=refusal)
-    return StopTies(ties=Ties.concatenate([]), report=report)
+def _nothing(terrain: StopTerrain, stops: tuple[int, int], sought: "_Sought", refusal: Refusal) -> StopTies:
+    a, b = stops
+    report = StopMatching(a=a, b=b, **vars(sought), off_pose=0, kept=0, noise_px=0.0, refusal=refusal)
+    return StopTies(ties=Ties.concatenate([]), report=report, pose=telemetry_alignment(terrain, a, b))
+
+
+def agreeing(terrain: StopTerrain, there: StopTies, back: StopTies) -> tuple[StopTies, StopTies]:
+    """The ties of two stops in both directions; none at all where the two contradict each other.
+
+    Either stop's terrain in the images of the other says where the two stand relative to each other. That is
+    the same twice, unless one of them, or both, fitted what is alike by chance.
+    """
+    if there.report.refusal or back.report.refusal:
+        return there, back
+    a, b = there.report.a, there.report.b
+    masts = [terrain.traverse.stops[s].world_T_mast for s in (a, b)]
+    a_T_b, b_T_a = masts[0].between(there.pose.world_T_mast), masts[1].between(back.pose.world_T_mast)
+    gap = gtsam.Pose3.Logmap(a_T_b.compose(b_T_a))
+    moved = b_T_a.inverse().AdjointMap()
+    covariance = moved @ there.pose.covariance @ moved.T + back.pose.covariance
+    sigmas = np.sqrt(gap @ np.linalg.lstsq(covariance, gap, rcond=None)[0] / len(gap))
+    apart_m = float(np.linalg.norm(a_T_b.translation()))
+    far = np.linalg.norm(gap[3:]) > _GAP_SHARE * apart_m or np.linalg.norm(gap[:3]) > _GAP_RAD
+    if not (far and sigmas > _GAP_SIGMAS):
+        return there, back
+    return _contradicted(terrain, there), _contradicted(terrain, back)
+
+
+def _contradicted(terrain: StopTerrain, stop_ties: StopTies) -> StopTies:
+    report = stop_ties.report
+    return StopTies(
+        ties=Ties.concatenate([]),
+        report=replace(
+            report,
+            off_pose=report.off_pose + report.kept,
+            kept=0,
+            noise_px=0.0,
+            refusal=Refusal.CONTRADICTION,
+        ),
+        pose=telemetry_alignment(terrain, report.a, report.b),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,14 +243,14 @@ def _spread(terrain: StopTerrain) -> BoolArray:
 
 def _measured(
     terrain: StopTerrain, ties: Ties, stops: tuple[int, int], alignment: Alignment, options: FrontEndOptions
-) -> Ties:
-    """The ties that agree with the pose of most ties, with covariances whose size is from their scatter.
+) -> tuple[Ties, Alignment]:
+    """The ties that agree with the pose of most ties, and that pose; covariances are from their scatter.
 
     Far terrain looks the same from both stops and gives ties several times better than near terrain, but near
     terrain is what places the stop: the scatter is therefore measured in groups of ties of about the same
     quality. Within a group the covariances keep their shapes and relative sizes.
     """
-    prior, n = telemetry_alignment(terrain, *stops), len(ties)
+    prior, n = believed(telemetry_alignment(terrain, *stops), alignment), len(ties)
     quality = ties.sigma_px
     groups = np.array_split(np.argsort(quality, kind="stable"), np.clip(n // _GROUP, 1, _MOST_GROUPS))
     start_px = options.max_epipolar_px / options.epipolar_scales
@@ -217,7 +263,7 @@ def _measured(
             factor[group] = min(1.0, float(np.median(distance[group])) / 1.177)
         ties = ties.scaled(np.maximum(factor, _LEAST_NOISE_PX / ties.sigma_px))
     distance = whitened_distance(terrain, ties, alignment.world_T_mast)
-    return ties.select(distance < options.epipolar_scales)
+    return ties.select(distance < options.epipolar_scales), alignment
 
 
 def _with_common_errors(ties: Ties) -> Ties:

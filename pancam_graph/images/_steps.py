@@ -21,7 +21,15 @@ from pancam_graph.base.sources import source_digest
 from pancam_graph.base.threads import in_order
 from pancam_graph.data import Observations, StopMatching, Traverse
 from pancam_graph.images._alignment import Ties
-from pancam_graph.images._between import StopMatcher, StopTies, joined, near_stops, on_terrain, stereo_stops
+from pancam_graph.images._between import (
+    StopMatcher,
+    StopTies,
+    agreeing,
+    joined,
+    near_stops,
+    on_terrain,
+    stereo_stops,
+)
 from pancam_graph.images._cache import Arrays, Cache, digest
 from pancam_graph.images._features import Features, find_features
 from pancam_graph.images._front_end_options import FrontEndOptions
@@ -337,7 +345,9 @@ class Steps:
             self.tell("ties between stops", k + 1, len(directed))
 
         directed = [d for a, b in self.stop_pairs for d in ((a, b), (b, a))]
-        stop_ties = in_order(tie, directed, tell)
+        found = in_order(tie, directed, tell)
+        both = [agreeing(terrain, *pair) for pair in zip(found[::2], found[1::2], strict=True)]
+        stop_ties = [each for pair in both for each in pair]
         ties = Ties.concatenate([each.ties for each in stop_ties])
         ties = ties.scaled(np.full(len(ties), unit))
         return joined(observations, terrain, ties), [each.report for each in stop_ties]

@@ -28,10 +28,10 @@ from pancam_graph import (
 from pancam_graph.base.geometry import HEAD_R_FORWARD_CAMERA, FloatArray
 from pancam_graph.base.threads import n_workers
 from pancam_graph.cameras import Pinhole
-from pancam_graph.data import StopMatching
+from pancam_graph.data import Refusal, StopMatching
 from pancam_graph.images import FrontEndOptions, _refine, _steps
-from pancam_graph.images._alignment import Ties, fit_pose, telemetry_alignment
-from pancam_graph.images._between import StopMatcher, StopTies
+from pancam_graph.images._alignment import Alignment, Ties, believed, fit_pose, telemetry_alignment
+from pancam_graph.images._between import StopMatcher, StopTies, agreeing
 from pancam_graph.images._local_map import local_map
 from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._patches import QUALITIES, align_patches
@@ -138,6 +138,64 @@ def seen_rows(terrain: StopTerrain, mast: gtsam.Pose3) -> Ties:
                 )
             )
     return Ties.concatenate(parts)
+
+
+def test_telemetry_that_ties_contradict_pulls_less(
+    simulated: tuple[StopTerrain, tuple[gtsam.Pose3, ...]],
+) -> None:
+    terrain, _ = simulated
+    telemetry = telemetry_alignment(terrain, 0, 1)
+    sigma = float(np.sqrt(telemetry.covariance[3, 3]))
+    for off, grown in ((2.0, 1.0), (6.0, 6.0)):
+        found = replace(telemetry, world_T_mast=moved_by(telemetry.world_T_mast, off * sigma))
+        assert believed(telemetry, found).root == pytest.approx(grown * telemetry.root)
+
+
+def moved_by(pose: gtsam.Pose3, forward_m: float) -> gtsam.Pose3:
+    return pose.compose(gtsam.Pose3(gtsam.Rot3(), np.array([forward_m, 0.0, 0.0])))
+
+
+def test_directions_that_contradict_each_other_give_no_ties(
+    simulated: tuple[StopTerrain, tuple[gtsam.Pose3, ...]],
+) -> None:
+    terrain, _ = simulated
+    masts = [s.world_T_mast for s in terrain.traverse.stops]
+
+    def found(a: int, b: int, off_m: float, sigma_m: float) -> StopTies:
+        count = 20
+        return StopTies(
+            ties=Ties(
+                row=np.arange(count),
+                image=np.zeros(count, dtype=np.int64),
+                uv_px=np.zeros((count, 2)),
+                covariance_px2=np.tile(np.eye(2), (count, 1, 1)),
+            ),
+            report=StopMatching(
+                a=a,
+                b=b,
+                sought=25,
+                unlike=0,
+                ambiguous=0,
+                unstable=0,
+                masked=0,
+                off_pose=5,
+                kept=count,
+                noise_px=0.1,
+            ),
+            pose=Alignment(world_T_mast=moved_by(masts[b], off_m), root=sigma_m * np.eye(6)),
+        )
+
+    there = found(0, 1, 0.0, 0.02)
+    # Within their sigmas, and within a fiftieth of the way however small these are.
+    for off_m, sigma_m in ((0.3, 0.2), (0.05, 1e-4)):
+        back = found(1, 0, off_m, sigma_m)
+        assert agreeing(terrain, there, back) == (there, back)
+    refused = agreeing(terrain, there, found(1, 0, 1.0, 0.02))
+    for each in refused:
+        assert each.report.refusal is Refusal.CONTRADICTION
+        assert len(each.ties) == each.report.kept == 0
+        assert each.report.sought == each.report.off_pose
+        assert StopTies.of_arrays(each.arrays()).report == each.report
 
 
 def test_derivatives_of_sightings(simulated: tuple[StopTerrain, tuple[gtsam.Pose3, ...]]) -> None:
