@@ -225,6 +225,7 @@ def test_a_signal_ends_the_program_after_it_has_cleaned_up(sent: str) -> None:
 import signal, sys, time
 from pancam_graph.cli import run
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background would ignore it
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # and one under nohup this
 def work():
     try:
         print("ready", flush=True)

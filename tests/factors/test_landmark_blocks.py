@@ -22,7 +22,7 @@ from support.elimination_reference import Dense, assert_systems_agree, dense_of,
 
 TINY = SimulationOptions(stops=2, pans=2, sweep_rad=0.7, tilts_rad=(-0.2,), points_per_image=5)
 MODELS = {
-    "hard": SolveOptions(loss="none"),
+    "hard": SolveOptions(loss="none", rig="held"),
     "soft": SolveOptions(loss="none", tie="soft", flex=Flex(rotation_rad=1e-4, translation_m=1e-3)),
     "circle": SolveOptions(loss="none", model="circle"),
 }

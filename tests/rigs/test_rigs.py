@@ -349,7 +349,7 @@ def test_the_zoomed_eye_sharpens_pan_and_tilt() -> None:
         truth = simulation.truth.pan_tilt_rad
         t = first_frame_known(simulation.traverse, truth[0])
         for zoomed, traverse in ((True, t), (False, without(t, "hrc"))):
-            solution = solve(traverse, SolveOptions(loss="none"))
+            solution = solve(traverse, SolveOptions(loss="none", rig="held"))
             errors[zoomed].append((solution.final.pan_tilt_rad - truth)[1:])
             sigmas[zoomed].append(solution.angle_sigma_rad[1:])
     formal = {z: np.mean(sigmas[z], axis=(0, 1)) for z in sigmas}

@@ -306,8 +306,8 @@ def test_an_unknown_method_is_refused() -> None:
 @pytest.mark.parametrize(
     "options",
     [
-        SolveOptions(),
-        SolveOptions(model="free"),
+        SolveOptions(rig="held"),
+        SolveOptions(model="free", rig="held"),
         SolveOptions(model="projective"),
         SolveOptions(sharing=Sharing(calibration=firm("calibration", "stop", 0.1))),
         SolveOptions(model="circle", sharing=Sharing(radius=Freedom())),

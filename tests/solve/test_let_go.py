@@ -148,7 +148,7 @@ def test_where_too_much_is_wrong_nothing_is_let_go() -> None:
 
 
 def test_a_wrong_rig_is_not_taken_for_wrong_telemetry() -> None:
-    solution = solve(drive(54, replace(DRIVE, focal_error=2e-3)).traverse)
+    solution = solve(drive(54, replace(DRIVE, focal_error=2e-3)).traverse, SolveOptions(rig="held"))
     assert not solution.passed
     assert not let_go(solution)
 
