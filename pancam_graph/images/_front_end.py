@@ -15,7 +15,7 @@ from pancam_graph.images._match_pair import PairMatches
 from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._read import image_name, listed
 from pancam_graph.images._steps import Progress, Steps
-from pancam_graph.images._tracks import Links, apart_tracks, join_tracks, spread_tracks
+from pancam_graph.images._tracks import Links, apart_tracks, join_tracks, shared_still, spread_tracks
 
 __all__ = ["find_masks", "find_observations"]
 
@@ -94,10 +94,13 @@ def find_observations(
     image, feature, uv_px, size_px = image[kept], feature[kept], uv_px[kept], size_px[kept]
     track = np.unique(track[kept], return_inverse=True)[1]
     as_found_px = np.hypot(options.sigma_px, options.sigma_per_size * size_px)
-    uv_px, covariance = work.refined(image, track, uv_px, as_found_px)
+    uv_px, covariance, spare = work.refined(image, track, uv_px, as_found_px)
+    used = shared_still(track, ~spare)
+    image, feature, uv_px, as_found_px = image[used], feature[used], uv_px[used], as_found_px[used]
+    track = np.unique(track[used], return_inverse=True)[1]
     observations = Observations(
         image=image, track=track, uv_px=uv_px, sigma_px=as_found_px, origin="images"
-    ).with_covariance(covariance)
+    ).with_covariance(covariance[used])
     stops: list[StopMatching] = []
     if work.stop_pairs:
         observations, stops = work.tied(observations, feature)

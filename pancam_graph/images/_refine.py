@@ -29,6 +29,8 @@ _MAX_SHIFT_PX = 1.0
 _MIN_CORRELATION = 0.8
 _MAX_MAGNIFICATION = 2.0
 _LEAST_PARALLAX_PX = 1e-9
+_ENOUGH = 50
+"""Points that two images share, and that look alike, from which on they do without those that look unlike."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -41,6 +43,8 @@ class RefinedTracks:
     """(n,) which observations were fitted to the first of their track."""
     unlike: BoolArray
     """(n,) which were compared with the first of their track and look unlike."""
+    spare: BoolArray
+    """(n,) which of these the two images do without: they share enough points that look alike."""
     covariance_px2: FloatArray
     """(n, 2, 2) of these two: the noise against the first of the track; 0 of others."""
     in_first_px2: FloatArray
@@ -68,6 +72,7 @@ def refine_tracks(
         uv_px=uv_px.copy(),
         moved=np.zeros(len(image), dtype=bool),
         unlike=np.zeros(len(image), dtype=bool),
+        spare=np.zeros(len(image), dtype=bool),
         covariance_px2=np.zeros((len(image), 2, 2)),
         in_first_px2=np.zeros((len(image), 2, 2)),
     )
@@ -81,6 +86,7 @@ def refine_tracks(
         missed = fit.compared & ~fit.good
         good, unlike = rows[fit.good], rows[missed]
         out.uv_px[good], out.moved[good], out.unlike[unlike] = fit.uv_px[fit.good], True, True
+        out.spare[unlike] = len(good) >= _ENOUGH
         covariance = patch_covariance_px2(
             fit.fit_px2[fit.good], fit.along[fit.good], one_pointing=pair.same_frame
         )

@@ -260,8 +260,10 @@ class Steps:
 
     def refined(
         self, image: IntArray, track: IntArray, uv_px: FloatArray, as_found_px: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Positions (n, 2) after least-squares matching, and covariances (n, 2, 2); see `refine_tracks`.
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Positions (n, 2) after least-squares matching, covariances (n, 2, 2), and which (n,) to leave out.
+
+        See `refine_tracks`; left out are points that look unlike, where two images share enough others.
 
         One part of the work are the tracks that begin in one image. An observation keeps its position, to
         `as_found_px` (n,), if the patch around it, or around the first of its track, has pixels that are left
@@ -292,7 +294,7 @@ class Steps:
         covariance = np.where((moved | unlike)[:, None, None], fitted.covariance_px2, as_found)
         frame = self.traverse.image_frame[image]
         covariance = shared_by_tracks(covariance, fitted.in_first_px2, moved, track, frame)
-        return np.where(moved[:, None], fitted.uv_px, uv_px), covariance
+        return np.where(moved[:, None], fitted.uv_px, uv_px), covariance, fitted.spare & clear
 
     def tied(self, observations: Observations, feature: IntArray) -> tuple[Observations, list[StopMatching]]:
         """Observations within stops, with ties between stops added, and a report of each pair of stops.

@@ -7,7 +7,7 @@ import scipy
 
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 
-__all__ = ["Links", "apart_tracks", "join_tracks", "spread_tracks"]
+__all__ = ["Links", "apart_tracks", "join_tracks", "shared_still", "spread_tracks"]
 
 _CELLS = 16
 
@@ -98,6 +98,11 @@ def apart_tracks(image: IntArray, track: IntArray, uv_px: FloatArray, least_px: 
         if stays[keep]:
             stays[gone] = False
     return np.asarray(np.array(stays, dtype=bool)[track])
+
+
+def shared_still(track: IntArray, kept: BoolArray) -> IntArray:
+    """Rows of the observations that are `kept` (n,) and whose tracks (n,) keep two or more."""
+    return np.flatnonzero(kept & (np.bincount(track, kept)[track] >= 2))
 
 
 def spread_tracks(

@@ -84,8 +84,8 @@ class EliminatedSolver(Solver):
         if not template.linkage.touched.any():
             return _only_landmarks(problem, loss)
         system, rows = system_of(problem, loss)
-        # Images alone leave directions of a free rig next to undetermined, and their square root would be off by
-        # more than the priors say of these: such a system is eliminated with its priors in it.
+        # Images alone leave directions of a free rig next to undetermined, and rounding in their square root
+        # exceeds what priors say of these: such a system is eliminated with its priors in it.
         alone = not (template.has_cameras or template.rig_variables.variables)
         minimise = self._by_blocks if alone else self._by_groups
         outcome, joint = minimise(problem, system, rule, stage, left_sigmas)
@@ -94,7 +94,10 @@ class EliminatedSolver(Solver):
     def _by_groups(
         self, problem: Problem, system: LandmarkSystem, rule: StopRule, stage: str, left_sigmas: float
     ) -> tuple[Outcome, Root | None]:
-        """Minimise on the last group, others eliminated, priors included: for a variable per image, or a free rig."""
+        """Minimise on the last group, others eliminated with all priors in the system.
+
+        For models with a variable per image, and where the rig is free.
+        """
         joint = JointSystem(problem, system)
 
         outcome = optimise(
@@ -111,7 +114,7 @@ class EliminatedSolver(Solver):
     def _by_blocks(
         self, problem: Problem, system: LandmarkSystem, rule: StopRule, stage: str, left_sigmas: float
     ) -> tuple[Outcome, Root | None]:
-        """Minimise by GTSAM on landmark blocks: for variables that each move many images, with the rig held."""
+        """Minimise by GTSAM on landmark blocks: for variables that each move many images, the rig held."""
         template = problem.template
         blocks = LandmarkBlocks(system, read_variable, template.posture)
         graph = gtsam.NonlinearFactorGraph(problem.factors.graph)

