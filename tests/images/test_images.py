@@ -279,7 +279,7 @@ def test_opportunity(opportunity_folder: Path) -> None:
     obs = found_in(found)
     pairs = {tuple(obs.image[obs.track == t].tolist()) for t in np.unique(obs.track)}
     assert pairs == {(0, 1), (2, 3), (3, 4)}
-    assert len(np.unique(obs.track)) > 3000
+    assert len(np.unique(obs.track)) > 1800
     assert np.mean(obs.sigma_px < FrontEndOptions().sigma_px) > 0.85
     again = found_in(find_observations(disturbed(traverse, 0.5, seed=0)))
     assert len(again) == pytest.approx(len(obs), rel=0.02)
