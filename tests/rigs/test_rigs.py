@@ -296,7 +296,7 @@ def test_a_ladybugs_errors_have_the_variance_that_the_covariance_says(model: str
     for seed in range(60):
         change = 1e-3 * np.random.default_rng(seed).standard_normal(6) if model == "circle" else np.zeros(6)
         simulation = simulate(with_radii(rig, change), LADYBUG_DRIVE, seed=seed)
-        options = SolveOptions(loss="none", model=model, flex=firm if model == "circle" else None)  # type: ignore[arg-type]  # parametrised
+        options = SolveOptions(loss="none", rig="held", model=model, flex=firm if model == "circle" else None)  # type: ignore[arg-type]  # parametrised
         solution = solve(replace(simulation.traverse, rig=rig), options)
         shift = simulation.truth.world_T_mast[2].localCoordinates(solution.final.world_T_mast[2])
         misses.append(shift @ np.linalg.solve(solution.stop_covariance[2], shift))
