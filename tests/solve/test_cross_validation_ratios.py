@@ -165,14 +165,20 @@ def test_a_wrong_focal_length_shows_in_image_halves_not_in_random_ones() -> None
 
 @pytest.mark.slow
 def test_opportunity_formal_sigmas_are_too_small(opportunity_folder: Path) -> None:
-    """As RIGS says: formal 0.02 to 0.09 mrad of relative pan, image halves 0.15 to 1.1 mrad apart."""
-    found = cross_validate(find_observations(read_pds(opportunity_folder)))
+    """With the rig held: formal sigmas of relative pan 0.02 to 0.09 mrad, image halves up to 1.1 mrad apart.
+
+    An estimated rig explains most of that.
+    """
+    traverse = find_observations(read_pds(opportunity_folder))
+    found = cross_validate(traverse, SolveOptions(rig="held"))
     assert found.pairs.tolist() == [[0, 1], [2, 3], [3, 4]]
     formal, halves = found.relative_pointing.formal, found.relative_pointing.upper_lower
     assert ((formal[:, 0] > 0.02e-3) & (formal[:, 0] < 0.09e-3)).all()
-    assert ((halves.difference[:, 0] > 0.15e-3) & (halves.difference[:, 0] < 1.1e-3)).all()
+    assert ((halves.difference[:, 0] > 0.05e-3) & (halves.difference[:, 0] < 1.1e-3)).all()
     assert halves.overall > 5
     assert found.relative_pointing.random.overall < 2
     other, expected = found.score_px("upper_lower")
     assert other > 2 * expected
     assert found.score_px("random")[0] == pytest.approx(found.score_px("random")[1], rel=0.15)
+    estimated = cross_validate(traverse).relative_pointing.upper_lower
+    assert estimated.overall < halves.overall / 2.5
