@@ -185,10 +185,14 @@ def test_eyes_may_share_a_correction_though_their_numbers_differ() -> None:
 def test_a_free_focal_length_of_opportunity(request: pytest.FixtureRequest) -> None:
     """Over the same observations, weighted alike, it fits better; by half a per cent it is not wrong."""
     matched = find_observations(read_pds(request.getfixturevalue("opportunity_folder")))
-    first = solve(matched)
+    first = solve(matched, SolveOptions(rig="held"))
     assert matched.observations is not None
+    assert first.covariance_px2 is not None
     kept = replace(
-        matched.observations.select(first.used), origin="given", sigma_px=first.sigma_px[first.used]
+        matched.observations.select(first.used),
+        origin="given",
+        sigma_px=first.sigma_px[first.used],
+        covariance_px2=first.covariance_px2[first.used],
     )
     t = matched.with_observations(kept)
     sharing = Sharing(calibration=Freedom(scope="eye", free=FOCAL))

@@ -115,7 +115,8 @@ def test_errors_have_the_variance_that_the_covariance_says(name: str, model: str
     angles, stops = [], []
     for seed in range(seeds):
         simulation = simulate(TEMPLATES[name](), SMALL, seed=seed)
-        solution = solve(simulation.traverse, SolveOptions(loss="none", model=model))  # type: ignore[arg-type]  # parametrised
+        options = SolveOptions(rig="held", loss="none", model=model)  # type: ignore[arg-type]  # parametrised
+        solution = solve(simulation.traverse, options)
         error = solution.final.pan_tilt_rad - simulation.truth.pan_tilt_rad
         angles.append(np.mean((error / solution.angle_sigma_rad) ** 2))
         shift = simulation.truth.world_T_mast[1].localCoordinates(solution.final.world_T_mast[1])
