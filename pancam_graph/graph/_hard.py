@@ -1,4 +1,4 @@
-"""Camera poses computed from the mast: the rig as a factor template without flex.
+"""Camera poses computed from the mast: the rig as a factor template whose cameras are no variables.
 
 Variables: `M` mast pose per stop (Pose3), `A` pan and tilt of a stop's frames, stacked (vector), `F` how the
 heads of these frames stand off the rigid mast, stacked (vector), where that is free, and the free entries of
@@ -44,6 +44,8 @@ __all__ = ["HardTemplate"]
 
 _ANGLES, _MAST, _FLEX, _AXIS, _MOUNT, _CALIBRATION = range(6)
 """Kinds of segments, in their order within a unit."""
+_FLEX_COLUMNS = np.array([0, 3, 4, 5])
+"""Components of a head's correction, a turn and a shift, that the entries of its flex are."""
 _TILT = np.array([[0.0], [-1.0], [0.0], [0.0], [0.0], [0.0]])
 """Twist of the tilt axis's own frame: about minus its y."""
 
@@ -57,7 +59,7 @@ class HardTemplate(FactorTemplate):
         sigmas = np.array([[f.sigma_pan_rad, f.sigma_tilt_rad] for f in traverse.frames]).reshape(-1, 2)
         self._sigmas = sigmas
         self._flex = self.rig_variables.sharing.flex.entries("flex")
-        self._flex_columns = np.array([(0, 3, 4, 5)[ENTRIES["flex"].index(e)] for e in self._flex], dtype=int)
+        self._flex_columns = _FLEX_COLUMNS[[ENTRIES["flex"].index(e) for e in self._flex]]
         free = sigmas.any(axis=1)
         self._frames = tuple(
             np.flatnonzero((traverse.frame_stop == stop) & free) for stop in range(len(traverse.stops))
@@ -260,11 +262,11 @@ class HardTemplate(FactorTemplate):
         if flex is None:
             return found
         found = found or RigCorrection.to_calibrations(self.traverse, self.traverse.calibration)
-        return replace(found, flex=flex[:, [0, 3, 4, 5]])
+        return replace(found, flex=flex[:, _FLEX_COLUMNS])
 
-    def flex_factors(self, stop: int | None) -> FactorList:
+    def flex_factors(self, stop: int) -> FactorList:
         """The prior of how a stop's heads stand off the rigid mast, if they may."""
-        if stop is None or not self._flex or not len(self._frames[stop]):
+        if not self._flex or not len(self._frames[stop]):
             return []
         sigmas = np.tile(self._flex_sigma, len(self._frames[stop]))
         noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
@@ -299,7 +301,7 @@ class HardTemplate(FactorTemplate):
                 if self._flex:
                     known = None if state.rig is None else state.rig.flex
                     flex = np.zeros((len(self.traverse.frames), 6))
-                    flex[:, [0, 3, 4, 5]] = 0.0 if known is None else known
+                    flex[:, _FLEX_COLUMNS] = 0.0 if known is None else known
                     values.insert(self.flex_key(stop), flex[np.ix_(frames, self._flex_columns)].ravel())
             if isinstance(slot := self.mast(stop), Key):
                 values.insert(slot.key, state.world_T_mast[stop])

@@ -85,14 +85,14 @@ class FactorTemplate(ABC):
         template lacks. `apart` as for `ties`: it keeps the graph sparse for elimination by GTSAM.
         """
         seats = self.seats(given, present)
-        owners: tuple[int | None, ...] = (*range(len(self.traverse.stops)), None)
+        stops = range(len(self.traverse.stops))
         placed = (seated(one, seats) for one in given)
         return Factors(
             telemetry=tuple(self.telemetry_priors()),
             ties=tuple(self.ties(apart=apart)),
             rig=(
-                *(factor for owner in owners for factor in self.rig_variables.prior_factors(owner)),
-                *(factor for stop in owners[:-1] for factor in self.flex_factors(stop)),
+                *(factor for owner in (*stops, None) for factor in self.rig_variables.prior_factors(owner)),
+                *(factor for stop in stops for factor in self.flex_factors(stop)),
             ),
             given=tuple(given),
             seated=tuple(factor for factor in placed if factor is not None),
@@ -208,7 +208,7 @@ class FactorTemplate(ABC):
             return diagonal_noise(self.let_go.widened(stated, extra).ravel())
         return gtsam.noiseModel.Gaussian.Covariance(covariance)
 
-    def flex_factors(self, stop: int | None) -> FactorList:
+    def flex_factors(self, stop: int) -> FactorList:
         """The prior of how a stop's heads stand off the rigid mast; none here."""
         return []
 

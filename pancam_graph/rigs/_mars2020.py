@@ -203,13 +203,9 @@ _MASTCAM_Z = {
 def mars2020_uncertainty(side_px: int) -> RigUncertainty:
     """Uncertainty of cameras and axes in the unit's labels."""
     return replace(
-        RigUncertainty.usual(side_px),
+        RigUncertainty.of_unit(side_px),
         focal=3e-3,
         aspect=2e-4,
-        mount_rad=5e-4,
-        mount_m=5e-4,
-        tilt_axis_rad=5e-4,
-        tilt_axis_m=1e-3,
         source="turns of mounts: the toe-in of Mastcam-Z is published to 0.03 degrees; focal length: "
         "those of the two Navcams differ by 0.23 %; else our stated assumption",
     )

@@ -43,12 +43,8 @@ def mer_uncertainty(side_px: int) -> RigUncertainty:
     not cover. Only labels say where.
     """
     return replace(
-        RigUncertainty.usual(side_px),
+        RigUncertainty.of_unit(side_px),
         focal=3e-3,
-        mount_rad=5e-4,
-        mount_m=5e-4,
-        tilt_axis_rad=5e-4,
-        tilt_axis_m=1e-3,
         source="focal length: those published of one Pancam, 3571 to 3583 px; principal point: the left "
         "Navcam of Opportunity is 7 px off its label, 10 px where nothing else is free; mounts and axes: "
         "our stated assumption for a calibrated unit",

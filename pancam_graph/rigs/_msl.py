@@ -77,12 +77,8 @@ _MASTCAM_RIGHT_AT = {"azimuth_rad": 5.367043, "elevation_rad": 0.727572}
 def msl_uncertainty(side_px: int) -> RigUncertainty:
     """Uncertainty of the cameras in labels of the unit, and of the mast's axes."""
     return replace(
-        RigUncertainty.usual(side_px),
+        RigUncertainty.of_unit(side_px),
         aspect=2e-4,
-        mount_rad=5e-4,
-        mount_m=5e-4,
-        tilt_axis_rad=5e-4,
-        tilt_axis_m=1e-3,
         source="focal length: a closed ring of 12 images of the left Navcam, sol 3560, is 0.4 % off its "
         "label; else our stated assumption, in which the ring lies",
     )

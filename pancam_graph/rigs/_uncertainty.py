@@ -74,3 +74,17 @@ class RigUncertainty:
         CAHV labels are off a right angle by up to 0.012 degrees).
         """
         return RigUncertainty(principal_point_px=_PRINCIPAL_POINT * side_px, skew_px=_SKEW * side_px)
+
+    @staticmethod
+    def of_unit(side_px: int) -> "RigUncertainty":
+        """Of one flight unit as its own calibration has it: mounts and axes are better known than usual ones.
+
+        Our stated assumption.
+        """
+        return replace(
+            RigUncertainty.usual(side_px),
+            mount_rad=5e-4,
+            mount_m=5e-4,
+            tilt_axis_rad=5e-4,
+            tilt_axis_m=1e-3,
+        )

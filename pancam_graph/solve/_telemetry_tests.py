@@ -306,12 +306,9 @@ def _entry_errors(
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _EntryErrors:
-    """Errors of entries of one stop's telemetry; fields as in `Correction`."""
+class _ShownErrors:
+    """How far k errors of telemetry show; fields as in `Correction`."""
 
-    of: StopTelemetry
-    shape: FloatArray
-    """(k, n) share in each entry"""
     size: FloatArray
     pull: FloatArray
     """(k,) a'z"""
@@ -321,6 +318,15 @@ class _EntryErrors:
     def sigmas(self) -> FloatArray:
         """(k,) as in `Correction`."""
         return np.asarray(np.abs(self.pull) / np.sqrt(self.shown))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _EntryErrors(_ShownErrors):
+    """Errors of entries of one stop's telemetry; fields as in `Correction`."""
+
+    of: StopTelemetry
+    shape: FloatArray
+    """(k, n) share in each entry"""
 
     def correction(self, i: int) -> Correction:
         """The i-th error."""
@@ -402,7 +408,7 @@ def leg_errors(
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _LegErrors:
+class _LegErrors(_ShownErrors):
     """Shifts of all stops after a leg; fields as in `Correction`."""
 
     telemetry: Sequence[StopTelemetry]
@@ -410,14 +416,6 @@ class _LegErrors:
     """(stops, 3, 3) of the masts as telemetry has them"""
     leg: IntArray
     """(k,) three times the row of the stop before, and the axis"""
-    size: FloatArray
-    pull: FloatArray
-    shown: FloatArray
-
-    @property
-    def sigmas(self) -> FloatArray:
-        """(k,) as in `Correction`."""
-        return np.asarray(np.abs(self.pull) / np.sqrt(self.shown))
 
     def correction(self, i: int) -> Correction:
         """The i-th error."""
