@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 
 from pancam_graph.base.errors import SolveError
-from pancam_graph.base.geometry import FloatArray, IntArray
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 
 __all__ = ["Covariance", "FreeDirectionError", "Panels", "Pattern", "Root", "pattern"]
 
@@ -336,28 +336,56 @@ class Root:
         return half.T @ half, -half.T @ np.concatenate([rows[:, -1] for rows in self.rows])
 
     def covariance(self) -> "Covariance":
-        """The blocks of the inverse of R'R where R is filled (Takahashi's recursion).
+        """The blocks of the inverse of R'R where R is filled.
 
-        Raises FreeDirectionError where R leaves a direction free.
+        Groups are taken from the last to be eliminated back to the first. Each group's factor F, with FF' the
+        covariance of itself and the groups after it, follows from its parent's by orthogonal
+        transformations. The recursion for the covariances themselves (Takahashi, Fagan and Chen 1973) loses
+        all digits along a chain of 80 stops. Raises FreeDirectionError where R leaves a direction free.
         """
         st = self.structure
+        children = np.bincount([a[1] for a in st.after if len(a) > 1], minlength=len(st.dim))
+        factors: dict[int, FloatArray] = {}
         blocks: dict[tuple[int, int], FloatArray] = {}
         for g in reversed(st.order):
-            n, rows = int(st.dim[g]), self.rows[g]
+            n, rows, (_, *rest) = int(st.dim[g]), self.rows[g], st.after[g]
             if len(rows) < n:
                 raise FreeDirectionError(g, _loosest(rows[:, :n]))
             half = np.linalg.inv(rows[:, :n])
-            blocks[g, g] = half @ half.T
-            rest = st.after[g][1:]
-            if not rest:
-                continue
-            to_rest = half @ rows[:, n:-1]
-            around = np.block([[_block(blocks, h, k) for k in rest] for h in rest])
-            across = -to_rest @ around
-            blocks[g, g] -= across @ to_rest.T
-            for h, first, last in zip(rest, st.begin[g][1:-1] - n, st.begin[g][2:] - n, strict=True):
-                blocks[g, h] = across[:, first:last]
+            factor = np.zeros((int(st.begin[g][-1]),) * 2, order="F")
+            factor[:n, :n] = scipy.linalg.rq(half, mode="r")
+            if rest:
+                parent = rest[0]
+                around = _factor_of_some(factors[parent], st.begin[parent], np.isin(st.after[parent], rest))
+                factor[n:, n:] = around
+                factor[:n, n:] = scipy.linalg.blas.dtrmm(-1.0, around, half @ rows[:, n:-1], side=1)
+                children[parent] -= 1
+                if not children[parent]:
+                    del factors[parent]
+            if children[g]:
+                factors[g] = factor
+            own = scipy.linalg.blas.dtrmm(1.0, factor, factor[:n], side=1, trans_a=1)
+            for h, first, last in zip(st.after[g], st.begin[g], st.begin[g][1:], strict=False):
+                blocks[g, h] = own[:, first:last]
         return Covariance(blocks)
+
+
+def _factor_of_some(factor: FloatArray, begin: IntArray, wanted: BoolArray) -> FloatArray:
+    """Upper triangular factor of the covariance of some groups, from the factor of more.
+
+    `factor` (n, n) is upper triangular; group i has rows `begin[i]` to `begin[i + 1]`; `wanted` says which
+    groups stay. Rows above those of a group that leaves lose its columns by orthogonal transformations from
+    the right (trapezoid to triangle); rows below have zeros there.
+    """
+    for i in np.flatnonzero(~wanted)[::-1]:
+        first, last = begin[i], begin[i + 1]
+        above = factor[:first, :last]
+        kept = np.r_[:first, last : len(factor)]
+        factor = np.asfortranarray(factor[:, kept][kept])
+        if first > 0:
+            triangle, _, _ = scipy.linalg.lapack.dtzrzf(above)
+            factor[:first, :first] = np.triu(triangle[:, :first])
+    return factor
 
 
 def _loosest(rows: FloatArray) -> int:
