@@ -10,7 +10,8 @@ __all__ = ["RigTreatment", "sharing_for", "sharing_within"]
 
 RigTreatment = Literal["estimated", "held", "considered"]
 """What becomes of a rig's uncertainty: "estimated": it is the prior of what is estimated; "held": the rig
-counts as exact; "considered": the rig is not moved, but its uncertainty is in every sigma."""
+counts as exact; "considered": the rig is not moved, but its uncertainty is in every sigma. A frame's flex is
+no number of the rig: it is estimated with the frame's pan and tilt, unless the rig is held."""
 
 _SCOPE: Mapping[Quantity, Scope] = {"pan_T_tilt": "all", "flex": "frame"}
 """Who shares a correction, where it is not the images of an eye."""
@@ -41,11 +42,12 @@ def sharing_within(uncertainty: RigUncertainty, model: str) -> Sharing:
 def sharing_for(rig: Rig, model: str, treatment: RigTreatment, given: Sharing | None) -> Sharing:
     """The sharing of a solve, as `Sharing.for_model` returns it.
 
-    What is `given` counts; where nothing is, an estimated rig has `sharing_within`, and another is fixed.
-    Raises InputError as `Sharing.for_model` does.
+    What is `given` counts; where nothing is, an estimated rig has `sharing_within`, one that is considered
+    the flex of that alone, and a held one is fixed. Raises InputError as `Sharing.for_model` does.
     """
-    if given is None and treatment == "estimated":
-        given = sharing_within(rig.uncertainty, model)
+    if given is None and treatment != "held":
+        within = sharing_within(rig.uncertainty, model)
+        given = within if treatment == "estimated" else Sharing(flex=within.flex)
     return (given or Sharing()).for_model(model)
 
 

@@ -26,7 +26,7 @@ _CALLED: dict[Quantity, str] = {
 
 
 class GraphKeys:
-    """Keys of the masts, the pan and tilt angles, and the free entries of the rig of one traverse.
+    """Keys of masts, of pan and tilt, of flexes, and of the free entries of the rig, of one traverse.
 
     Masts are gtsam.Pose3 (`world_T_mast`; tangent in the mast's frame, rotation first, radians and metres).
     Angles are vectors (2,): pan and tilt of one frame, radians. Variables of the rig are vectors of
@@ -41,9 +41,13 @@ class GraphKeys:
         self._frame = {frame.id: key_of(Kind.ANGLES, i) for i, frame in enumerate(traverse.frames)}
         self._name = {key: f"mast of {stop}" for stop, key in self._stop.items()}
         self._name |= {key: f"angles of {frame}" for frame, key in self._frame.items()}
+        flex = rig.sharing.flex.entries("flex")
+        self._flex = {f.id: key_of(Kind.FLEX, i) for i, f in enumerate(traverse.frames) if flex}
+        self._name |= {key: f"flex of {frame}" for frame, key in self._flex.items()}
         self._name |= {v.key: self._name_of(v) for v in rig.variables}
         self._entries: dict[int, tuple[str, ...]] = dict.fromkeys(self._stop.values(), ENTRIES["mounts"])
         self._entries |= dict.fromkeys(self._frame.values(), ("pan_rad", "tilt_rad"))
+        self._entries |= dict.fromkeys(self._flex.values(), flex)
         self._entries |= {v.key: v.entries for v in rig.variables}
 
     def mast(self, stop: str) -> int:
@@ -60,6 +64,17 @@ class GraphKeys:
         if frame not in self._frame:
             raise InputError(expected_one_of("frame", frame, list(self._frame)))
         return self._frame[frame]
+
+    def flex(self, frame: str) -> int:
+        """Key of how a frame's head stands off the rigid mast, by its id: entries as in `Sharing.flex`.
+
+        Raises InputError for an unknown id, and where heads do not flex.
+        """
+        if not self._flex:
+            raise InputError("flex: expected it to be free, found it fixed; Sharing(flex=...) frees it")
+        if frame not in self._flex:
+            raise InputError(expected_one_of("frame", frame, list(self._flex)))
+        return self._flex[frame]
 
     def calibration(
         self, camera: str | None = None, *, stop: str | None = None, image: str | None = None

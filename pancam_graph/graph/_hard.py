@@ -5,6 +5,7 @@ heads of these frames stand off the rigid mast, stacked (vector), where that is 
 the rig (`_rig_variables`). Quantities that telemetry holds (sigma 0) are not variables.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -23,14 +24,11 @@ from pancam_graph.base.geometry import (
     twists_in_parent,
 )
 from pancam_graph.data import (
-    ENTRIES,
     FIXED,
     Quantity,
-    RigCorrection,
     Sharing,
     State,
     Traverse,
-    default_sigma,
 )
 from pancam_graph.elimination import Covariance, Linkage, Posture
 from pancam_graph.factors import Key
@@ -44,8 +42,6 @@ __all__ = ["HardTemplate"]
 
 _ANGLES, _MAST, _FLEX, _AXIS, _MOUNT, _CALIBRATION = range(6)
 """Kinds of segments, in their order within a unit."""
-_FLEX_COLUMNS = np.array([0, 3, 4, 5])
-"""Components of a head's correction, a turn and a shift, that the entries of its flex are."""
 _TILT = np.array([[0.0], [-1.0], [0.0], [0.0], [0.0], [0.0]])
 """Twist of the tilt axis's own frame: about minus its y."""
 
@@ -58,8 +54,6 @@ class HardTemplate(FactorTemplate):
         super().__init__(traverse, "mast", replace(sharing or Sharing(), radius=FIXED))
         sigmas = np.array([[f.sigma_pan_rad, f.sigma_tilt_rad] for f in traverse.frames]).reshape(-1, 2)
         self._sigmas = sigmas
-        self._flex = self.rig_variables.sharing.flex.entries("flex")
-        self._flex_columns = _FLEX_COLUMNS[[ENTRIES["flex"].index(e) for e in self._flex]]
         free = sigmas.any(axis=1)
         self._frames = tuple(
             np.flatnonzero((traverse.frame_stop == stop) & free) for stop in range(len(traverse.stops))
@@ -74,18 +68,6 @@ class HardTemplate(FactorTemplate):
     def flex_key(stop: int) -> int:
         """Key of how the heads of those frames stand off the rigid mast."""
         return key_of(Kind.FLEX, stop)
-
-    @cached_property
-    def angle_sigmas_rad(self) -> FloatArray:
-        """As in the base class, widened where heads may flex about the pan and the tilt axis."""
-        twist = self._flex_sigma[0] if "twist_rad" in self._flex else 0.0
-        return np.where(self._sigmas > 0, np.hypot(self._sigmas, twist), 0.0)
-
-    @cached_property
-    def _flex_sigma(self) -> FloatArray:
-        """(entries,) of the priors of a frame's flex."""
-        stated = self.rig_variables.sharing.flex.sigma
-        return np.array([stated.get(entry, default_sigma(entry, 1.0)) for entry in self._flex])
 
     @cached_property
     def linkage(self) -> Linkage:
@@ -107,8 +89,8 @@ class HardTemplate(FactorTemplate):
                 add(slot.key, 6, stop)
             for v in free.of_stop(stop):
                 add(v.key, len(v.entries), stop)
-            if self._flex and len(frames):
-                add(self.flex_key(stop), len(self._flex) * len(frames), stop)
+            if self.head_flex and len(frames):
+                add(self.flex_key(stop), len(self.head_flex) * len(frames), stop)
         for v in free.of_stop(None):
             add(v.key, len(v.entries), len(t.stops))
 
@@ -124,8 +106,8 @@ class HardTemplate(FactorTemplate):
         column[:, _ANGLES] = 2 * place[seg.frame]
         variable[:, _ANGLES] = np.array([row.get(self.angles_key(stop), -1) for stop in stops])[stop_of]
         variable[:, _MAST] = np.array([-1 if key is None else row[key] for key in masts])[stop_of]
-        width[:, _ANGLES], width[:, _MAST], width[:, _FLEX] = 2, 6, len(self._flex)
-        column[:, _FLEX] = len(self._flex) * place[seg.frame]
+        width[:, _ANGLES], width[:, _MAST], width[:, _FLEX] = 2, 6, len(self.head_flex)
+        column[:, _FLEX] = len(self.head_flex) * place[seg.frame]
         variable[:, _FLEX] = np.array([row.get(self.flex_key(stop), -1) for stop in stops])[stop_of]
         sites: tuple[tuple[int, Quantity, IntArray], ...] = (
             (_AXIS, "pan_T_tilt", stop_of),
@@ -162,7 +144,7 @@ class HardTemplate(FactorTemplate):
         present[:, _ANGLES] = np.any(self._sigmas, axis=1)[frame]
         moved = np.array([isinstance(self.mast(stop), Key) for stop in range(len(t.stops))])
         present[:, _MAST] = moved[t.frame_stop[frame]]
-        present[:, _FLEX] = present[:, _ANGLES] & bool(self._flex)
+        present[:, _FLEX] = present[:, _ANGLES] & bool(self.head_flex)
         present[:, _AXIS] = bool(free.of["pan_T_tilt"])
         present[:, _MOUNT] = bool(free.of["mounts"])
         present[:, _CALIBRATION] = bool(free.of["calibration"])
@@ -173,7 +155,7 @@ class HardTemplate(FactorTemplate):
     def posture(self, values: gtsam.Values) -> Posture:
         """Cameras at the values; a unit's base is the mast of its stop."""
         t, free, seg = self.traverse, self.rig_variables, self._segments
-        angles, axes, flex = self._angles(values), free.axes(values), self._flexes(values)
+        angles, axes, flex = self._angles(values), free.axes(values), self.flexes(values)
         masts = pose_arrays(self.masts(values))
         frame, stop = seg.frame, t.frame_stop[seg.frame]
         widest = max([6, *(len(v.entries) for v in free.variables)])
@@ -188,8 +170,8 @@ class HardTemplate(FactorTemplate):
             chain[:, _AXIS, :6, : twists.shape[2]] = twists_in_parent(*pose, twists)
         if flex is not None:
             pose = self._mast_T_head(angles, axes, flex)
-            moved = correction_twists(flex)[:, :, self._flex_columns]
-            chain[:, _FLEX, :6, : len(self._flex)] = twists_in_parent(*pose, moved)[frame]
+            moved = correction_twists(flex)[:, :, self.head_flex.columns]
+            chain[:, _FLEX, :6, : len(self.head_flex)] = twists_in_parent(*pose, moved)[frame]
         if free.of["mounts"]:
             head_R, head_t = self._mast_T_head(angles, axes, flex)
             pose = compose(head_R[frame], head_t[frame], *free.mounts(values))
@@ -232,7 +214,7 @@ class HardTemplate(FactorTemplate):
     ) -> CameraViews:
         t, free = self.traverse, self.rig_variables
         # Once per frame, not once per image: the eyes share their head.
-        mast_T_head = self._mast_T_head(angles, free.axes(values), self._flexes(values))
+        mast_T_head = self._mast_T_head(angles, free.axes(values), self.flexes(values))
         head = compose(masts[0][t.frame_stop], masts[1][t.frame_stop], *mast_T_head)
         image = t.image_frame
         return self.views_of(*compose(head[0][image], head[1][image], *free.mounts(values)), values)
@@ -245,32 +227,22 @@ class HardTemplate(FactorTemplate):
         head = t.rig.mast_T_head(angles[:, 0], angles[:, 1], axis_of_frame)
         return head if flex is None else corrected_poses(*head, flex)
 
-    def _flexes(self, values: gtsam.Values) -> FloatArray | None:
-        """Corrections (frames, 6) of the heads, in their own frames; None where the mast is rigid."""
-        if not self._flex:
+    def flexes(self, values: gtsam.Values) -> FloatArray | None:
+        """As in the base class; 0 for frames whose angles are held."""
+        if not self.head_flex:
             return None
         out = np.zeros((len(self.traverse.frames), 6))
         for stop, frames in enumerate(self._frames):
             if len(frames):
                 flex = values.atVector(self.flex_key(stop)).reshape(len(frames), -1)
-                out[np.ix_(frames, self._flex_columns)] = flex
+                out[np.ix_(frames, self.head_flex.columns)] = flex
         return out
-
-    def correction(self, values: gtsam.Values) -> RigCorrection | None:
-        """As in the base class, with the flex of frames."""
-        found, flex = super().correction(values), self._flexes(values)
-        if flex is None:
-            return found
-        found = found or RigCorrection.to_calibrations(self.traverse, self.traverse.calibration)
-        return replace(found, flex=flex[:, _FLEX_COLUMNS])
 
     def flex_factors(self, stop: int) -> FactorList:
         """The prior of how a stop's heads stand off the rigid mast, if they may."""
-        if not self._flex or not len(self._frames[stop]):
+        if not self.head_flex or not len(self._frames[stop]):
             return []
-        sigmas = np.tile(self._flex_sigma, len(self._frames[stop]))
-        noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
-        return [gtsam.PriorFactorVector(self.flex_key(stop), np.zeros(len(sigmas)), noise)]
+        return [self.head_flex.prior(self.flex_key(stop), len(self._frames[stop]))]
 
     def _angles(self, values: gtsam.Values) -> FloatArray:
         angles: FloatArray = self.traverse.pan_tilt_rad.copy()
@@ -295,14 +267,12 @@ class HardTemplate(FactorTemplate):
     def values(self, state: State) -> gtsam.Values:
         """The variables at a state."""
         values = gtsam.Values()
+        flex = self.head_flex.start(state.rig, len(self.traverse.frames))
         for stop, frames in enumerate(self._frames):
             if len(frames):
                 values.insert(self.angles_key(stop), state.pan_tilt_rad[frames].ravel())
-                if self._flex:
-                    known = None if state.rig is None else state.rig.flex
-                    flex = np.zeros((len(self.traverse.frames), 6))
-                    flex[:, _FLEX_COLUMNS] = 0.0 if known is None else known
-                    values.insert(self.flex_key(stop), flex[np.ix_(frames, self._flex_columns)].ravel())
+                if self.head_flex:
+                    values.insert(self.flex_key(stop), flex[frames].ravel())
             if isinstance(slot := self.mast(stop), Key):
                 values.insert(slot.key, state.world_T_mast[stop])
         self.rig_variables.insert(values, state.rig)
@@ -356,13 +326,22 @@ class HardTemplate(FactorTemplate):
         """Two entries of its stop's vector of angles; fixed where both sigmas are 0."""
         if not self._sigmas[frame].any():
             return Seat.fixed(self.traverse.pan_tilt_rad[frame])
+        return self._part(frame, self.angles_key, np.flatnonzero(self._sigmas[frame]), 2)
+
+    def flex_seat(self, frame: int) -> Seat:
+        """The entries of its stop's vector of flexes; fixed where its angles are."""
+        if not self._sigmas[frame].any():
+            return Seat.fixed(np.zeros(len(self.head_flex)))
+        n = len(self.head_flex)
+        return self._part(frame, self.flex_key, np.arange(n), n)
+
+    def _part(self, frame: int, key_of_stop: Callable[[int], int], free: IntArray, size: int) -> Seat:
+        """The `size` entries of a frame in its stop's vector, of which those in `free` move."""
         stop = int(self.traverse.frame_stop[frame])
-        key, n = self.angles_key(stop), 2 * len(self._frames[stop])
-        begin = 2 * int(np.searchsorted(self._frames[stop], frame))
-        moves = np.zeros((2, n))
-        free = np.flatnonzero(self._sigmas[frame])
+        key, begin = key_of_stop(stop), size * int(np.searchsorted(self._frames[stop], frame))
+        moves = np.zeros((size, size * len(self._frames[stop])))
         moves[free, begin + free] = 1.0
-        return Seat(read=lambda values: values.atVector(key)[begin : begin + 2], parts=((key, moves),))
+        return Seat(read=lambda values: values.atVector(key)[begin : begin + size], parts=((key, moves),))
 
     def angle_rows(self, frame: int, state: State) -> tuple[IntArray, FloatArray]:
         """A frame's pan and tilt are variables: columns (2,), rows (2, 2); no columns where they are held."""

@@ -16,7 +16,7 @@ class Kind(Enum):
     ANGLES = "A"
     """Pan and tilt: of one frame (vector of 2), or stacked of all frames of a stop that are not held."""
     FLEX = "F"
-    """How the heads of all frames of a stop that are not held stand off the rigid mast, stacked (vector)."""
+    """How a head stands off the rigid mast (vector): of one frame, or stacked as angles are."""
     CAMERA = "X"
     """Camera pose of an image (Pose3)."""
     PROJECTION = "P"

@@ -1,8 +1,8 @@
 """Camera poses as variables, tied to the mast: the rig as a factor template with flex.
 
-Variables: `M` mast pose per stop (Pose3), `A` pan and tilt per frame (vector of 2), `X` camera pose per image
-(Pose3), and the free entries of the rig (`_rig_variables`). Quantities that telemetry holds (sigma 0) are not
-variables.
+Variables: `M` mast pose per stop (Pose3), `A` pan and tilt per frame (vector of 2), `F` how a frame's head
+stands off the mast (vector), where that is free, `X` camera pose per image (Pose3), and the free entries of
+the rig (`_rig_variables`). Quantities that telemetry holds (sigma 0) are not variables.
 """
 
 from functools import cached_property
@@ -68,6 +68,11 @@ class SoftTemplate(FactorTemplate):
             return Fixed(self.traverse.pan_tilt_rad[frame])
         return Key(key_of(Kind.ANGLES, frame))
 
+    def flex_key(self, frame: int) -> int | None:
+        """Key of a frame's flex; None where the frame is held, or no head flexes."""
+        free = bool(self.head_flex) and isinstance(self.pan_tilt(frame), Key)
+        return key_of(Kind.FLEX, frame) if free else None
+
     @classmethod
     def camera_key(cls, image: int) -> int:
         """Key of an image's camera."""
@@ -84,6 +89,8 @@ class SoftTemplate(FactorTemplate):
             dim |= {self.camera_key(int(i)): self._camera_dim for i in np.flatnonzero(t.image_stop == stop)}
             angles = (self.pan_tilt(int(f)) for f in np.flatnonzero(t.frame_stop == stop))
             dim |= {slot.key: 2 for slot in angles if isinstance(slot, Key)}
+            flexes = map(self.flex_key, np.flatnonzero(t.frame_stop == stop).tolist())
+            dim |= {key: len(self.head_flex) for key in flexes if key is not None}
             if isinstance(mast := self.mast(stop), Key):
                 dim[mast.key] = 6
             dim |= {v.key: len(v.entries) for v in free.of_stop(stop)}
@@ -143,6 +150,28 @@ class SoftTemplate(FactorTemplate):
             for f in frames
         ]
 
+    def flex_factors(self, stop: int) -> FactorList:
+        """The priors of how a stop's heads stand off the mast, if they may."""
+        keys = map(self.flex_key, np.flatnonzero(self.traverse.frame_stop == stop).tolist())
+        return [self.head_flex.prior(key, 1) for key in keys if key is not None]
+
+    def flexes(self, values: gtsam.Values) -> FloatArray | None:
+        """As in the base class; 0 for frames whose angles are held."""
+        if not self.head_flex:
+            return None
+        out = np.zeros((len(self.traverse.frames), 6))
+        for frame in range(len(out)):
+            if (key := self.flex_key(frame)) is not None:
+                out[frame, self.head_flex.columns] = values.atVector(key)
+        return out
+
+    def flex_seat(self, frame: int) -> Seat:
+        """The variable of the frame; fixed where its angles are."""
+        key = self.flex_key(frame)
+        return (
+            Seat.fixed(np.zeros(len(self.head_flex))) if key is None else Seat.same(key, len(self.head_flex))
+        )
+
     def tie_factors(self, images: IntArray) -> FactorList:
         """The ties of some images' camera poses to the mast, in the model `circle` also to their circles.
 
@@ -156,7 +185,9 @@ class SoftTemplate(FactorTemplate):
         axis = [free.axis_slot(int(s)) for s in t.image_stop[images]]
         if self.model != "circle":
             sigmas = np.repeat([flex.rotation_rad, flex.translation_m], 3)
-            return [mast_factor(diagonal_noise(np.tile(sigmas, len(images))), *chain, axis)]
+            heads = [self.head_flex.slot(self.flex_key(int(f))) for f in t.image_frame[images]]
+            flexed = [slot for slot in heads if slot is not None] or None
+            return [mast_factor(diagonal_noise(np.tile(sigmas, len(images))), *chain, axis, flexed)]
 
         # The chain ties the rotation loosely; the centre is tied by the circle alone.
         tilts = [t.frames[int(f)].tilt_rad for f in t.image_frame[images]]
@@ -218,6 +249,9 @@ class SoftTemplate(FactorTemplate):
         for i, angles in enumerate(state.pan_tilt_rad):
             if isinstance(slot := self.pan_tilt(i), Key):
                 values.insert(slot.key, angles)
+        for i, flex in enumerate(self.head_flex.start(state.rig, len(self.traverse.frames))):
+            if (key := self.flex_key(i)) is not None:
+                values.insert(key, flex)
         self.insert_cameras(values, state)
         self.rig_variables.insert(values, state.rig)
         return values

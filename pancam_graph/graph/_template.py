@@ -18,6 +18,7 @@ from pancam_graph.graph._factors import FactorList, Factors
 from pancam_graph.graph._given import GivenFactor, Seat, seated
 from pancam_graph.graph._graph_keys import GraphKeys
 from pancam_graph.graph._graph_options import Model
+from pancam_graph.graph._head_flex import HeadFlex
 from pancam_graph.graph._keys import Kind, index_of, key_of, kind_of, read_variable
 from pancam_graph.graph._let_go import LetGo
 from pancam_graph.graph._rig_variables import RigVariables
@@ -37,6 +38,7 @@ class FactorTemplate(ABC):
         self.traverse = traverse
         self.model: Model = model
         self.rig_variables = RigVariables(traverse, sharing or Sharing().for_model(model))
+        self.head_flex = HeadFlex(self.rig_variables.sharing.flex)
         self.let_go = LetGo.nothing(traverse)
 
     def letting_go(self, let_go: LetGo) -> Self:
@@ -112,6 +114,8 @@ class FactorTemplate(ABC):
         kind = kind_of(key)
         if kind is Kind.ANGLES:
             return self.angle_seat(index_of(key))
+        if kind is Kind.FLEX and self.head_flex:
+            return self.flex_seat(index_of(key))
         if kind is Kind.MAST and isinstance(slot := self.mast(index_of(key)), Fixed):
             return Seat.fixed(slot.value)
         if key not in self.linkage.row:
@@ -126,6 +130,10 @@ class FactorTemplate(ABC):
     @abstractmethod
     def angle_seat(self, frame: int) -> Seat:
         """Seat of a frame's pan and tilt among the variables."""
+
+    def flex_seat(self, frame: int) -> Seat:
+        """Seat of a frame's flex among the variables, where heads flex."""
+        raise NotImplementedError  # no head flexes in the other models
 
     @property
     @abstractmethod
@@ -181,7 +189,12 @@ class FactorTemplate(ABC):
 
     def correction(self, values: gtsam.Values) -> RigCorrection | None:
         """Corrections of the traverse's rig at the values; None where nothing of it is free."""
-        return self.rig_variables.correction(values)
+        found = self.rig_variables.correction(values)
+        return self.head_flex.with_flex(found, self.flexes(values), self.traverse)
+
+    def flexes(self, values: gtsam.Values) -> FloatArray | None:
+        """Corrections (frames, 6) of the heads, in their own frames; None where the mast is rigid."""
+        return None
 
     def rig_sigmas(self, covariance: Covariance, values: gtsam.Values) -> list[FloatArray]:
         """Standard deviations of the free entries of the rig, as `refined` takes them."""
@@ -214,8 +227,9 @@ class FactorTemplate(ABC):
 
     @cached_property
     def angle_sigmas_rad(self) -> FloatArray:
-        """(frames, 2) sigmas of the priors of pan and tilt; 0 where held."""
-        return np.array([frame.sigmas_rad for frame in self.traverse.frames]).reshape(-1, 2)
+        """(frames, 2) sigmas of the priors of pan and tilt, widened where heads flex; 0 where held."""
+        stated = np.array([frame.sigmas_rad for frame in self.traverse.frames]).reshape(-1, 2)
+        return self.head_flex.widened(stated)
 
     def held_of_stops(self) -> dict[int, IntArray]:
         """`held_columns` of the masts."""

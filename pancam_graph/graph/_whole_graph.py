@@ -49,6 +49,10 @@ def whole_graph(
         if not values.exists(key := keys.angles(frame.id)):
             values.insert(key, angles)
             graph.push_back(gtsam.PriorFactorVector(key, angles, diagonal_noise(np.zeros(2))))
+        if template.head_flex and not values.exists(key := keys.flex(frame.id)):
+            none = np.zeros(len(template.head_flex))
+            values.insert(key, none)
+            graph.push_back(gtsam.PriorFactorVector(key, none, diagonal_noise(none)))
     seen = np.zeros(len(points_m), dtype=bool)
     seen[explicit.measurements.landmark[kept]] = True
     explicit.insert_points(values, points_m, seen)
@@ -82,6 +86,7 @@ def _rigid_graph(
                 rig.mount_slot(image),
                 rig.axis_slot(int(t.image_stop[image])),
                 calibration,
+                template.head_flex.slot(template.flex_key(int(t.image_frame[image]))),
                 nominal=t.calibration[image : image + 1],
                 basis=basis,
                 lens=lenses[int(t.image_eye[image])],

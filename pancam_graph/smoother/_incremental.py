@@ -92,7 +92,7 @@ def solve_incrementally(
         SmootherOptions(
             # What is considered enters sigmas alone, and these are `solve`'s.
             rig="estimated" if options.rig == "estimated" else "held",
-            sharing=options.sharing or traverse.sharing,
+            sharing=free_numbers(traverse, options),
             outlier_sigma=None if options.loss == "none" else options.outlier_sigma,
         ),
     )

@@ -1,9 +1,9 @@
 """Uncertainties of a solution whose rig was held, with the rig's own uncertainty in them.
 
 Consider covariance (Bierman, Factorization methods for discrete sequential estimation, 1977, chapter 8): with
-x estimated and the rig's numbers r held at their values, whose covariance is P, an error of r moves the
-optimum by G = -H_xx^-1 H_xr. So x has the covariance H_xx^-1 + G P G', and with r the joint one that is the
-inverse of
+x estimated (the flex of frames with their pans and tilts) and the rig's numbers r held at their values, whose
+covariance is P, an error of r moves the optimum by G = -H_xx^-1 H_xr. So x has the covariance
+H_xx^-1 + G P G', and with r the joint one that is the inverse of
 
     [ H_xx    H_xr                        ]
     [ H_rx    P^-1 + H_rx H_xx^-1 H_xr    ]
@@ -52,13 +52,12 @@ def with_rig(fitted: Fitted, problem: Problem) -> tuple[Problem, ReducedSystem] 
     """
     prepared = fitted.screened.prepared
     sharing = sharing_within(prepared.traverse.rig.uncertainty, prepared.options.model)
-    sharing = replace(sharing, flex=FIXED)  # not of the rig, but of each frame
-    if not sharing.any_free:
+    if not replace(sharing, flex=FIXED).any_free:
         return None
     if isinstance(problem.template, HardTemplate):
         wide = problem.on(HardTemplate(prepared.traverse, sharing))
-    else:
-        wide = problem.on(template_for(prepared.traverse, prepared.options, sharing))
+    else:  # its tie is its flex
+        wide = problem.on(template_for(prepared.traverse, prepared.options, replace(sharing, flex=FIXED)))
     system, rows = system_of(wide)
     panels = landmark_panels(wide, system, without=fitted.doubt)
     rig, link = len(prepared.traverse.stops), wide.template.linkage

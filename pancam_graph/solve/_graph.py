@@ -18,7 +18,7 @@ __all__ = ["build_graph", "graph_keys"]
 
 
 def graph_keys(traverse: Traverse, options: SolveOptions | None = None) -> GraphKeys:
-    """Keys of masts, angles and free entries of the rig, for factors that `solve` is given and `build_graph`.
+    """Keys of masts, angles, flexes and the free rig, for `build_graph` and factors that `solve` is given.
 
     The options determine the free entries of the rig, or else the traverse. Raises InputError as
     `solve` does for these.
@@ -45,7 +45,7 @@ def build_graph(
     `used` (observations,) is the mask of the observations to take, by least squares, as in `Solution.used`.
     Default: all observations of tracks with two or more, unscreened and therefore under the robust loss of
     the options; the loss "none" gives least squares. `start` has initial mast poses and angles; default:
-    telemetry's. Heads of frames do not flex, as where landmarks are explicit.
+    telemetry's.
 
     Raises InputError for the model `projective`, for which GTSAM has no projection factor, and as `solve`.
     """

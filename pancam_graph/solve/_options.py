@@ -40,7 +40,8 @@ class SolveOptions(StopRule):
     rig: RigTreatment = "estimated"
     """What becomes of the rig's uncertainty (`Rig.uncertainty`): "estimated": what images say of the rig's
     numbers is estimated, with these sigmas as priors; "held": the rig counts as exact; "considered": it is
-    not moved, but its uncertainty is in every sigma of the solution (model "mast" only)."""
+    not moved, but its uncertainty is in every sigma of the solution (model "mast" only). A frame's flex is
+    estimated with its pan and tilt where the rig is estimated or considered."""
     sharing: Sharing | None = None
     """Free numbers of the rig, and images that share them, in place of those that `rig` makes free; default:
     the traverse's own."""

@@ -191,12 +191,12 @@ def free_numbers(traverse: Traverse, options: SolveOptions) -> Sharing:
             "numbers that are not moved"
         )
     sharing = sharing_for(traverse.rig, options.model, options.rig, given)
-    if sharing.flex == FIXED or (options.firm_tie == "hard" and options.landmarks == "eliminated"):
+    if sharing.flex == FIXED or options.firm_tie == "hard":
         return sharing
     if given is not None:
         raise InputError(
-            "sharing: flex: expected fixed with a soft tie, whose sigma is another flex, and with explicit "
-            f"landmarks; found {sharing.flex.scope}"
+            "sharing: flex: expected fixed with a soft tie, whose sigma is another flex; "
+            f"found {sharing.flex.scope}"
         )
     return replace(sharing, flex=FIXED)
 

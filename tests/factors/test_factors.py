@@ -21,7 +21,7 @@ from pancam_graph.factors import (
 from pancam_graph.rigs import Eye, Rig, exomars_pancam
 
 UNIT3, UNIT6 = gtsam.noiseModel.Unit.Create(3), gtsam.noiseModel.Unit.Create(6)
-X, M, A, E, R, T = (gtsam.symbol(c, 0) for c in "XMAERT")
+X, M, A, E, R, T, F = (gtsam.symbol(c, 0) for c in "XMAERTF")
 PAN_T_TILT = gtsam.Pose3(gtsam.Rot3.Rodrigues(0.02, -0.01, 0.03), np.array([0.03, -0.02, 0.05]))
 
 
@@ -112,6 +112,24 @@ def test_mast_jacobians_by_corrections(free: tuple[int, ...], size: float) -> No
     known.insert(A, values.atVector(A))
     same = mast_factor(UNIT6, Key(X), Key(M), Key(A), Key(E), Key(T))
     assert factor.unwhitenedError(values) == pytest.approx(same.unwhitenedError(known), abs=1e-14)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-7, 0.1, 1.0])
+@pytest.mark.parametrize("free", [(0,), (0, 3, 4, 5), tuple(range(6))])
+def test_mast_jacobians_by_a_head_that_flexes(free: tuple[int, ...], size: float) -> None:
+    """The head's turn and shift stand between the tilt joint and the mount."""
+    rng = np.random.default_rng(len(free))
+    values = mast_values(rng, 0.1, 0.1)
+    values.insert(F, size * rng.normal(size=len(free)))
+    head = Corrected(F, gtsam.Pose3(), free)
+    slots = Key(X), Key(M), Key(A), Key(E), Fixed(PAN_T_TILT)
+    factor = mast_factor(UNIT6, *slots, head)
+    check_jacobians(factor, values, tolerance=1e-6, vectors=(F,))
+    assert list(factor.keys()) == [X, M, A, E, F]
+    moved = gtsam.Values(values)
+    moved.update(E, head.pose(values)[0] * values.atPose3(E))
+    rigid = mast_factor(UNIT6, *slots)
+    assert factor.unwhitenedError(values) == pytest.approx(rigid.unwhitenedError(moved), abs=1e-13)
 
 
 def test_mast_residual_is_zero_on_the_chain_and_the_offset_beside_it() -> None:

@@ -8,7 +8,7 @@ from pancam_graph.base.geometry import FloatArray
 from pancam_graph.cameras import Pinhole
 from pancam_graph.factors import Corrected, Fixed, Key, mast_projection_factor
 
-L, M, A, E, T, K = (gtsam.symbol(c, 0) for c in "LMAETK")
+L, M, A, E, T, K, F = (gtsam.symbol(c, 0) for c in "LMAETKF")
 NOMINAL = np.array([[1100.0, 0.3, 512.0], [0.0, 1090.0, 500.0], [0.0, 0.0, 1.0]])
 CAMERA_R = gtsam.Rot3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
 MOUNT = gtsam.Pose3(CAMERA_R * gtsam.Rot3.Rodrigues(0.02, 0.01, -0.03), np.array([0.1, 0.2, 0.05]))
@@ -39,7 +39,7 @@ def random_values(rng: np.random.Generator, depth_m: float) -> gtsam.Values:
     return values
 
 
-def made(uv_px: FloatArray) -> gtsam.CustomFactor:
+def made(uv_px: FloatArray, head: Corrected | None = None) -> gtsam.CustomFactor:
     basis = np.zeros((1, 5, 2))
     basis[0, ENTRIES, (0, 1)] = 1.0
     return mast_projection_factor(
@@ -50,6 +50,7 @@ def made(uv_px: FloatArray) -> gtsam.CustomFactor:
         Corrected(E, MOUNT, (0, 4)),
         Corrected(T, AXIS, (1,)),
         Key(K),
+        head,
         nominal=NOMINAL[None],
         basis=basis,
         lens=LENS,
@@ -69,15 +70,17 @@ def test_the_residual_is_that_of_gtsams_camera(depth_m: float) -> None:
         assert made(uv).unwhitenedError(values) == pytest.approx(seen - uv, abs=1e-7)
 
 
+@pytest.mark.parametrize("head", [None, Corrected(F, gtsam.Pose3(), (0, 3, 4, 5))])
 @pytest.mark.parametrize("depth_m", [0.5, 5.0, 1e4])
-def test_jacobians_are_those_of_differences(depth_m: float) -> None:
+def test_jacobians_are_those_of_differences(depth_m: float, head: Corrected | None) -> None:
     rng = np.random.default_rng(2)
     for _ in range(5):
         values = random_values(rng, depth_m)
-        factor = made(np.array([500.0, 400.0]))
+        values.insert(F, 1e-3 * rng.normal(size=4))
+        factor = made(np.array([500.0, 400.0]), head)
         jacobian, column = factor.linearize(values).jacobian()[0], 0
         for key in factor.keys():  # noqa: SIM118  a gtsam factor, not a dictionary
-            dim = {L: 3, M: 6, A: 2, E: 2, T: 1, K: 2}[key]
+            dim = {L: 3, M: 6, A: 2, E: 2, T: 1, K: 2, F: 4}[key]
             step = 1e-5 * depth_m if key == L else 1e-6
             for i in range(dim):
                 errors = []

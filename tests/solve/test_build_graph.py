@@ -19,6 +19,7 @@ from pancam_graph import (
     solve,
 )
 from pancam_graph.base.errors import InputError
+from pancam_graph.data import RigTreatment
 from pancam_graph.rigs import mer_navcam
 from support.parameters import slow_for
 from support.small_drives import HARD, SMALL, SOFT, near_part, simulated
@@ -63,6 +64,44 @@ def test_gtsams_own_levenberg_marquardt_ends_at_our_optimum(way: str) -> None:
     assert graph.error(values) == pytest.approx(ours.cost_final, rel=1e-6)
     for stop, pose in zip(near().stops, ours.final.world_T_mast, strict=True):
         assert np.abs(pose.localCoordinates(values.atPose3(keys.mast(stop.id)))).max() < 1e-5
+
+
+@pytest.mark.parametrize("rig", ["estimated", "considered"])
+def test_the_cost_is_that_of_solve_where_heads_flex(rig: RigTreatment) -> None:
+    """At the solution, whose values are put under the keys of the graph; and it has no gradient there."""
+    t, options = near(), replace(HARD, rig=rig)
+    ours, keys = solve(t, options), graph_keys(t, options)
+    assert ours.final.rig is not None
+    assert ours.final.rig.flex is not None
+    graph, values = build_graph(t, options)
+    for stop, pose in zip(t.stops, ours.final.world_T_mast, strict=True):
+        values.update(keys.mast(stop.id), pose)
+    for i, frame in enumerate(t.frames):
+        values.update(keys.angles(frame.id), ours.final.pan_tilt_rad[i])
+        assert keys.entries(keys.flex(frame.id)) == ("twist_rad",)
+        values.update(keys.flex(frame.id), ours.final.rig.flex[i, :1])
+    for quantity, corrections in (
+        (keys.calibration, {r.camera for r in ours.refined if r.quantity == "calibration"}),
+        (keys.mount, {r.camera for r in ours.refined if r.quantity == "mounts"}),
+    ):
+        for camera in corrections:
+            key = quantity(camera)
+            name = {keys.calibration: "calibration", keys.mount: "mounts"}[quantity]
+            of_it = [r.change for r in ours.refined if (r.quantity, r.camera) == (name, camera)]
+            values.update(key, np.array(of_it))
+    if axis := [r.change for r in ours.refined if r.quantity == "pan_T_tilt"]:
+        values.update(keys.tilt_axis(), np.array(axis))
+    for i, point in enumerate(ours.final.landmarks_m):
+        if values.exists(key := gtsam.symbol("L", i)):
+            values.update(key, point)
+    assert graph.error(values) == pytest.approx(ours.cost_final, rel=1e-6)
+
+
+def test_heads_that_do_not_flex_have_no_key() -> None:
+    with pytest.raises(InputError, match="flex: expected it to be free, found it fixed"):
+        graph_keys(near(), HARD).flex("frame00000")
+    with pytest.raises(InputError, match=r"frame: expected one of frame00000, .*; found 'f'"):
+        graph_keys(near()).flex("f")
 
 
 @pytest.mark.parametrize("way", ["hard", "soft", "circle"])

@@ -171,7 +171,10 @@ def test_a_held_rig_is_that_of_a_sharing_of_nothing() -> None:
 
 
 def test_a_considered_rig_moves_nothing() -> None:
-    held, considered = solved("held"), solved("considered")
+    stiff = replace(mer_navcam(), uncertainty=replace(mer_navcam().uncertainty, flex_rad=0.0))
+    held, considered = (
+        solve(with_rig(drive().traverse, stiff), SolveOptions(rig=rig)) for rig in ("held", "considered")
+    )
     np.testing.assert_array_equal(held.residual_final_px, considered.residual_final_px)
     assert not considered.refined
     assert np.all(considered.angle_sigma_rad > held.angle_sigma_rad)
@@ -219,6 +222,35 @@ def test_a_considered_rig_adds_what_its_errors_do_to_the_solution() -> None:
     more_points = (stated.landmark_covariance_m2 - held.landmark_covariance_m2)[near]
     size = np.sqrt(np.einsum("nii,njj->n", points[near], points[near]))
     assert np.all(np.abs(more_points - points[near]).max(axis=(1, 2)) < 0.05 * size)
+
+
+def test_the_flex_of_frames_is_estimated_where_the_rig_is_considered() -> None:
+    """It is no number of the rig: where nothing else is uncertain, considered and estimated are the same."""
+    bends = with_rig(drive().traverse, replace(mer_navcam(), uncertainty=replace(EXACT, flex_rad=1e-3)))
+    estimated, considered = (solve(bends, SolveOptions(rig=rig)) for rig in ("estimated", "considered"))
+    np.testing.assert_array_equal(estimated.final.pan_tilt_rad, considered.final.pan_tilt_rad)
+    np.testing.assert_array_equal(estimated.angle_sigma_rad, considered.angle_sigma_rad)
+    held = solve(bends, SolveOptions(rig="held"))
+    assert np.all(considered.angle_sigma_rad > 1.01 * held.angle_sigma_rad)
+    by_steps = solve_incrementally(bends, SolveOptions(rig="considered"))
+    np.testing.assert_allclose(by_steps.angle_sigma_rad, considered.angle_sigma_rad, rtol=1e-3)
+    off = by_steps.final.pan_tilt_rad - considered.final.pan_tilt_rad
+    assert np.abs(off / considered.angle_sigma_rad).max() < 0.05
+
+
+@pytest.mark.slow
+def test_errors_of_drawn_rigs_that_are_considered_agree_with_their_sigmas() -> None:
+    """Squared error over variance of neighbours' pans and tilts and of the second stop, over seeds."""
+    squares = list[tuple[float, float]]()
+    options = SimulationOptions(stops=2, pans=9, points_per_image=20, rig_error="drawn")
+    for seed in range(400, 430):
+        made = simulate(mer_navcam(), options, seed=seed)
+        # Without screening: residuals of a rig that is not moved are not noise.
+        found = solve(made.traverse, SolveOptions(rig="considered", loss="none"))
+        off = wrap_angle(found.final.pan_tilt_rad - made.truth.pan_tilt_rad) / found.angle_sigma_rad
+        pose = made.truth.world_T_mast[1].localCoordinates(found.final.world_T_mast[1])
+        squares.append((float(np.mean(off**2)), float(np.mean(pose**2 / np.diag(found.stop_covariance[1])))))
+    np.testing.assert_allclose(np.mean(squares, axis=0), 1.0, atol=0.35)
 
 
 def test_an_exact_rig_that_is_considered_is_held() -> None:

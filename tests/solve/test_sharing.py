@@ -18,7 +18,7 @@ from pancam_graph import (
     solve,
 )
 from pancam_graph.cameras import CAHVOR, Brown
-from pancam_graph.data._sharing import Scope, parse_sharing
+from pancam_graph.data._sharing import FIXED, Scope, parse_sharing
 from pancam_graph.graph import ExplicitLandmarks, Flex, Model, SoftTemplate, Tie
 from pancam_graph.rigs import Eye, Rig, mer_navcam
 from support.shared_rigs import FOCAL, TWO_TILTS, WRONG, loose, simulated, start_of
@@ -288,18 +288,33 @@ def test_landmarks_eliminated_or_explicit_give_one_optimum(name: str) -> None:
     assert max(abs(a.change) / a.sigma for a in ours.refined) > 1  # or else nothing was compared
 
 
-def test_a_hard_tie_has_the_explicit_optimum_too() -> None:
-    sharing = Sharing(
+HARD_TIES = {
+    "chosen": Sharing(
         calibration=Freedom(scope="eye"), mounts=Freedom(scope="eye"), pan_T_tilt=Freedom(scope="all")
-    )
+    ),
+    "all that flexes": Sharing(flex=Freedom(scope="frame", sigma={"twist_rad": 2e-3})),
+    "by default": None,
+}
+
+
+@pytest.mark.parametrize("sharing", HARD_TIES.values(), ids=HARD_TIES)
+def test_a_hard_tie_has_the_explicit_optimum_too(sharing: Sharing | None) -> None:
     ours, theirs = (
         solve(
             near(),
-            SolveOptions(rig="held", loss="none", landmarks=way, sharing=sharing, relative_decrease=1e-12),
+            SolveOptions(loss="none", landmarks=way, sharing=sharing, relative_decrease=1e-12),
         )
         for way in ("eliminated", "explicit")
     )
     assert ours.cost_final == pytest.approx(theirs.cost_final, rel=1e-6)
+    off = ours.final.pan_tilt_rad - theirs.final.pan_tilt_rad
+    assert np.abs(off / ours.angle_sigma_rad).max() < 0.01
+    np.testing.assert_allclose(ours.angle_sigma_rad, theirs.angle_sigma_rad, rtol=1e-4)
+    if sharing is None or sharing.flex != FIXED:
+        rigs = ours.final.rig, theirs.final.rig
+        twist, other = (rig.flex[:, 0] for rig in rigs if rig is not None and rig.flex is not None)
+        assert np.abs(twist).max() > 1e-6
+        np.testing.assert_allclose(twist, other, atol=0.01 * np.abs(twist).max())
     for a, b in zip(ours.refined, theirs.refined, strict=True):
         assert a.change == pytest.approx(b.change, abs=0.01 * a.sigma)
         assert a.sigma == pytest.approx(b.sigma, rel=1e-3)
