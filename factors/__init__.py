@@ -16,6 +16,8 @@ from pancam_graph.factors.camera_projection import camera_projection_residual as
 from pancam_graph.factors.circle import CircleOffset as CircleOffset
 from pancam_graph.factors.circle import circle_factor as circle_factor
 from pancam_graph.factors.circle import circle_residual as circle_residual
+from pancam_graph.factors.joint_prior import conditional_prior_factor as conditional_prior_factor
+from pancam_graph.factors.joint_prior import conditional_prior_residual as conditional_prior_residual
 from pancam_graph.factors.joint_prior import joint_prior_factor as joint_prior_factor
 from pancam_graph.factors.joint_prior import joint_prior_residual as joint_prior_residual
 from pancam_graph.factors.landmark_blocks import LandmarkBlocks as LandmarkBlocks

@@ -4,7 +4,9 @@ For each rig and error a line: draws, how many failed their tests; the squared e
 relative pan and tilt (frames next to each other), of later stops' poses, each with its standard error over
 drives, and of terrain points (median of all drives' points); the largest error of a relative angle or stop in
 sigmas; and the RMS errors themselves. The error "drawn" is as large as the rig's own uncertainty says, in all
-its numbers. The same options give the same numbers.
+its numbers. With --calibrated N the rig of each drive is first calibrated in another drive with the same
+errors, of N points an image, and used with its covariance; the drive itself is the one that is solved without
+that option. The same options give the same numbers.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,10 +15,11 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from pancam_graph import SolveOptions, Traverse, simulate
+from pancam_graph import SolveOptions, Traverse, simulate, solve
 from pancam_graph.base.errors import InputError, PancamGraphError
 from pancam_graph.base.geometry import FloatArray, IntArray, wrap_angle
 from pancam_graph.cli import Progress, ScriptParser, run
+from pancam_graph.results import calibrated_rig
 from pancam_graph.rigs import Rig, RigUncertainty, rig_template
 from pancam_graph.simulate import Simulation, SimulationOptions
 from pancam_graph.solve import fit, judge, prepare, reconsidered, screen
@@ -94,8 +97,22 @@ class Outcome:
     """Errors in sigmas; of points such that the median of their squares is 1 where covariances are right."""
 
 
-def measure(rig: Rig, error: str, options: SimulationOptions, seed: int, solving: SolveOptions) -> Outcome:
-    """Simulate, claim another rig, solve, compare with the truth; without errors where nothing was solved."""
+_ANOTHER = 100_000
+"""Distance of the seed of a drive from that of the drive that its rig is calibrated with."""
+
+
+def measure(
+    rig: Rig,
+    error: str,
+    options: SimulationOptions,
+    seed: int,
+    solving: SolveOptions,
+    calibration: SimulationOptions | None = None,
+) -> Outcome:
+    """Simulate, claim another rig, solve, compare with the truth; without errors where nothing was solved.
+
+    With `calibration`, the claimed rig is first calibrated in a drive of these options.
+    """
     flexes = error == "flex 0.2 mrad"
     drawn = replace(options, rig_error="drawn") if flexes or error == "drawn" else options
     true = replace(rig, uncertainty=_FLEX_ALONE) if flexes else rig
@@ -103,6 +120,13 @@ def measure(rig: Rig, error: str, options: SimulationOptions, seed: int, solving
     claimed = rig if flexes else ERRORS[error](simulation.traverse.rig)
     traverse = replace(simulation.traverse, rig=claimed)
     try:
+        if calibration is not None:
+            first = replace(calibration, rig_error=drawn.rig_error)
+            other = simulate(true, first, seed=seed + _ANOTHER).traverse
+            calibrated = solve(replace(other, rig=claimed), solving)
+            if not calibrated.passed:
+                return Outcome(failed=("calibration",), errors={}, sigmas={})
+            traverse = replace(traverse, rig=calibrated_rig(calibrated))
         return _compared(traverse, simulation, solving)
     except PancamGraphError as refused:
         return Outcome(failed=(str(refused)[:40],), errors={}, sigmas={})
@@ -189,6 +213,7 @@ def main() -> int:
     add("--stops", type=int, default=2, help="stops of each drive (%(default)s)")
     add("--pans", type=int, help="frames per row of a panorama; default: all around")
     add("--points-per-image", type=int, default=25, help="(%(default)s)")
+    add("--calibrated", type=int, metavar="N", help="calibrate the rig first, with N points an image")
     add("--one-eye", action="store_true", help="without stereo: the rig's first eye alone")
     add(
         "--rigs",
@@ -207,6 +232,9 @@ def main() -> int:
         points_per_image=a.points_per_image,
         sweep_rad=None if a.pans else 2 * np.pi,
     )
+    calibration = None
+    if a.calibrated:
+        calibration = SimulationOptions(stops=1, points_per_image=a.calibrated, sweep_rad=2 * np.pi)
     solving = SolveOptions(rig=a.treatment, landmark_covariances=True)
     progress = Progress()
     heads = [("draws", 5), ("failed", 6), *((kind, 13) for kind in KINDS[:3]), ("point", 6), ("worst", 6)]
@@ -217,7 +245,10 @@ def main() -> int:
         rig = replace(rig, eyes=rig.eyes[: 1 if a.one_eye else 2])
         for error in a.errors:
             with progress.shown(f"{name}, {error}"):
-                drives = [measure(rig, error, options, a.first_seed + i, solving) for i in range(a.draws)]
+                drives = [
+                    measure(rig, error, options, a.first_seed + i, solving, calibration)
+                    for i in range(a.draws)
+                ]
             solved = [o for o in drives if o.errors]
             square = [f"{_square(solved, k):>5.2f} +- {_standard_error(solved, k):<4.2f}" for k in KINDS[:3]]
             square.append(f"{_square(solved, 'point'):>6.2f}")

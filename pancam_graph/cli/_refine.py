@@ -92,6 +92,13 @@ def _add_options(parser: CommandParser) -> None:
         "uncertainty (default); held: the rig counts as exact; considered: it is not moved, but its "
         "uncertainty is in every sigma",
     )
+    add(
+        "--use-rig",
+        type=Path,
+        metavar="FILE",
+        help="rig.json of an earlier run with --export rig, of the same unit and other pictures: it takes "
+        "the place of the rig of FOLDER, and its covariance is the prior",
+    )
     add("--sharing", action=Several, type=Assignment(), default=(), metavar="WORD", help=_SHARING_HELP)
     add(
         "--incremental",
@@ -110,8 +117,9 @@ def _add_options(parser: CommandParser) -> None:
         default=(),
         metavar="FORMAT",
         help="write a folder more into OUT for each of one or more FORMATs, such as colmap (undistorted "
-        "images and a model with rigs and frames, for dense reconstruction) and cahvor (the refined cameras "
-        "as text files); an unknown one lists all",
+        "images and a model with rigs and frames, for dense reconstruction), cahvor (the refined cameras "
+        "as text files) and rig (the refined rig with its covariance, for --use-rig); an unknown one lists "
+        "all",
     )
     add(
         "--mosaic",
@@ -128,6 +136,7 @@ def _work(call: Invocation) -> int:
     from pancam_graph.cli._summary import print_summary
     from pancam_graph.data import parse_sharing
     from pancam_graph.images import cache_folder
+    from pancam_graph.io import use_rig
     from pancam_graph.landmarks.kernel import must_compile
     from pancam_graph.mosaic import MosaicOptions
     from pancam_graph.results import check_exports, check_out, write_results
@@ -148,6 +157,8 @@ def _work(call: Invocation) -> int:
     check_out(arguments.out)
     with progress.shown(f"reading {arguments.folder}"), resumable(arguments.out):
         traverse = read_input(arguments.folder)
+        if arguments.use_rig is not None:
+            traverse = use_rig(traverse, arguments.use_rig)
         check_exports(traverse, arguments.export)
         options = replace(options, sharing=parse_sharing(arguments.sharing, traverse.sharing))
         if traverse.observations is None:

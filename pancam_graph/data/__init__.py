@@ -14,10 +14,9 @@ from pancam_graph.data._noise import mean_sigma_px as mean_sigma_px
 from pancam_graph.data._rig_treatment import RigTreatment as RigTreatment
 from pancam_graph.data._rig_treatment import sharing_for as sharing_for
 from pancam_graph.data._rig_treatment import sharing_within as sharing_within
-from pancam_graph.data._sharing import ASPECT as ASPECT
 from pancam_graph.data._sharing import ENTRIES as ENTRIES
 from pancam_graph.data._sharing import FIXED as FIXED
-from pancam_graph.data._sharing import FOCAL as FOCAL
+from pancam_graph.data._sharing import QUANTITIES as QUANTITIES
 from pancam_graph.data._sharing import Freedom as Freedom
 from pancam_graph.data._sharing import Quantity as Quantity
 from pancam_graph.data._sharing import Scope as Scope

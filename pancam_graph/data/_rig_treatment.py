@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Literal
 
-from pancam_graph.data._sharing import ASPECT, ENTRIES, FIXED, FOCAL, Freedom, Quantity, Scope, Sharing
-from pancam_graph.rigs import Rig, RigUncertainty
+from pancam_graph.data._sharing import ENTRIES, FIXED, Freedom, Quantity, Scope, Sharing
+from pancam_graph.rigs import RIG_ENTRIES, Rig, RigUncertainty
 
 __all__ = ["RigTreatment", "sharing_for", "sharing_within"]
 
@@ -23,19 +23,13 @@ def sharing_within(uncertainty: RigUncertainty, model: str) -> Sharing:
     An entry whose sigma is 0 is held. The model `projective` has no number of the rig.
     """
     u, mast = uncertainty, model == "mast"
-    calibration = {
-        FOCAL: u.focal,
-        ASPECT: u.aspect,
-        "skew_px": u.skew_px,
-        "cx_px": u.principal_point_px,
-        "cy_px": u.principal_point_px,
-    }
     shifts = dict.fromkeys(ENTRIES["flex"][1:], u.flex_m)
     return Sharing(
         flex=_freedom("flex", {"twist_rad": u.flex_rad} | shifts) if mast else FIXED,
-        calibration=FIXED if model == "projective" else _freedom("calibration", calibration),
-        mounts=_pose("mounts", u.mount_rad, u.mount_m) if mast else FIXED,
-        pan_T_tilt=_pose("pan_T_tilt", u.tilt_axis_rad, u.tilt_axis_m) if mast else FIXED,
+        calibration=FIXED if model == "projective" else _of_rig("calibration", u),
+        mounts=_of_rig("mounts", u) if mast else FIXED,
+        pan_T_tilt=_of_rig("pan_T_tilt", u) if mast else FIXED,
+        covariance=u.covariance,
     )
 
 
@@ -51,8 +45,8 @@ def sharing_for(rig: Rig, model: str, treatment: RigTreatment, given: Sharing | 
     return (given or Sharing()).for_model(model)
 
 
-def _pose(quantity: Quantity, turn_rad: float, shift_m: float) -> Freedom:
-    return _freedom(quantity, dict(zip(ENTRIES[quantity], (turn_rad,) * 3 + (shift_m,) * 3, strict=True)))
+def _of_rig(quantity: Quantity, uncertainty: RigUncertainty) -> Freedom:
+    return _freedom(quantity, {e: uncertainty.sigma_of(quantity, e) for e in RIG_ENTRIES[quantity]})
 
 
 def _freedom(quantity: Quantity, sigma: Mapping[str, float]) -> Freedom:

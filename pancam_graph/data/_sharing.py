@@ -6,12 +6,22 @@ entries of a quantity can be held while others are free.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
-from typing import Literal, get_args
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, get_args
 
 from pancam_graph.base.errors import InputError
+from pancam_graph.rigs import ASPECT, FOCAL, POSE_ENTRIES, RigCovariance
 
-__all__ = ["ENTRIES", "Freedom", "Quantity", "Scope", "Sharing", "default_sigma", "parse_sharing"]
+__all__ = [
+    "ENTRIES",
+    "QUANTITIES",
+    "Freedom",
+    "Quantity",
+    "Scope",
+    "Sharing",
+    "default_sigma",
+    "parse_sharing",
+]
 
 Scope = Literal["fixed", "all", "eye", "stop", "image", "frame"]
 """Images that share one correction: "fixed" none (there is no correction), "all" all images, "eye" the images
@@ -20,20 +30,17 @@ of an eye, "stop" the images of an eye at a stop, "image" each image alone. `pan
 
 Quantity = Literal["calibration", "mounts", "pan_T_tilt", "radius", "flex"]
 
-_POSE = ("rx_rad", "ry_rad", "rz_rad", "x_m", "y_m", "z_m")
+QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 ENTRIES: Mapping[Quantity, tuple[str, ...]] = {
     "calibration": ("fx_px", "fy_px", "skew_px", "cx_px", "cy_px"),
-    "mounts": _POSE,
-    "pan_T_tilt": _POSE,
+    "mounts": POSE_ENTRIES,
+    "pan_T_tilt": POSE_ENTRIES,
     "radius": ("radius_m",),
     "flex": ("twist_rad", "forward_m", "left_m", "up_m"),
 }
 """Names of the entries of each quantity. `calibration` has two more: `focal`, a common factor on fx and fy,
 and `aspect`, a factor on fy alone, so that priors of the two are independent. Entries of a pose are a
 rotation vector and a shift in the pose's own frame (geometry.corrected_poses)."""
-
-FOCAL = "focal"
-ASPECT = "aspect"
 
 _SCOPES: Mapping[Quantity, tuple[Scope, ...]] = {
     "calibration": ("fixed", "all", "eye", "stop", "image"),
@@ -42,6 +49,14 @@ _SCOPES: Mapping[Quantity, tuple[Scope, ...]] = {
     "radius": ("fixed", "all", "eye", "stop", "image"),
     "flex": ("fixed", "frame"),
 }
+_JOINT: Mapping[Quantity, tuple[Scope, ...]] = {
+    "calibration": ("fixed", "eye"),
+    "mounts": ("fixed", "eye"),
+    "pan_T_tilt": ("fixed", "all"),
+    "radius": _SCOPES["radius"],
+    "flex": _SCOPES["flex"],
+}
+"""Scopes with which a covariance of the rig says what its entries are about."""
 _WHY_NOT: Mapping[tuple[str, str], str] = {
     ("mounts", "all"): "each eye has its own mount",
     ("pan_T_tilt", "eye"): "the eyes have one tilt axis",
@@ -81,9 +96,9 @@ _DEFAULT_SIGMA = {
     "cx_px": 5e-3,
     "cy_px": 5e-3,
     # Two sources give MSL Mastcam's left eye a yaw of 1.48 and of 1.77 degrees.
-    **dict.fromkeys(_POSE[:3], 5e-3),
+    **dict.fromkeys(POSE_ENTRIES[:3], 5e-3),
     # The left Navcams of Opportunity and of Spirit sit 2 mm apart.
-    **dict.fromkeys(_POSE[3:], 2e-3),
+    **dict.fromkeys(POSE_ENTRIES[3:], 2e-3),
     # The circle of Opportunity's five Navcam centres misses them by up to a millimetre.
     "radius_m": 1e-3,
     # Our stated assumption for a mast that stands on its rover.
@@ -147,11 +162,19 @@ class Sharing:
     """How each frame's head stands off the rigid mast: turned about its forward axis (`twist_rad`), and
     shifted along its own axes; model `mast` with a hard tie. Its pan and tilt are those of the head as it
     stood, whose priors are widened by the sigma of the twist."""
+    covariance: RigCovariance | None = None
+    """Joint covariance of the priors of those entries that it names, in place of their sigmas; then
+    calibrations and mounts are of an eye, the tilt axis of all. None: all are independent."""
 
     def __post_init__(self) -> None:
         """Check scopes, entries and sigmas."""
         for quantity, freedom in self._given():
             _check(quantity, freedom)
+            if self.covariance is not None and freedom.scope not in _JOINT[quantity]:
+                raise InputError(
+                    f"sharing: {quantity}: expected {' or '.join(_JOINT[quantity])} with a covariance of "
+                    f"the rig, found {freedom.scope}"
+                )
 
     def _given(self) -> list[tuple[Quantity, Freedom]]:
         freedoms: list[tuple[Quantity, Freedom | None]] = [
@@ -239,13 +262,12 @@ def parse_sharing(words: Sequence[str], base: Sharing | None = None) -> Sharing 
     """
     if not words:
         return base
-    given: dict[str, Freedom] = {}
-    quantities = tuple(f.name for f in fields(Sharing))
+    given: dict[str, Any] = {}
     for word in words:
         quantity, equals, rest = word.partition("=")
-        if not equals or quantity not in quantities:
+        if not equals or quantity not in QUANTITIES:
             raise InputError(
-                f"sharing: expected QUANTITY=SCOPE with one of {', '.join(quantities)}; found {word!r}"
+                f"sharing: expected QUANTITY=SCOPE with one of {', '.join(QUANTITIES)}; found {word!r}"
             )
         if quantity in given:
             raise InputError(f"sharing: expected each quantity once, found {quantity} twice")

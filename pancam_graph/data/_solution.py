@@ -11,11 +11,12 @@ from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, corrected_poses
 from pancam_graph.cameras import CALIBRATION_ENTRIES, Camera, projection_matrix
 from pancam_graph.data._cross_validation import CrossValidation
-from pancam_graph.data._sharing import Quantity
+from pancam_graph.data._rig_treatment import RigTreatment
+from pancam_graph.data._sharing import Quantity, Sharing
 from pancam_graph.data._traverse import Traverse
 from pancam_graph.data._verdict import Verdict
 from pancam_graph.elimination import JointCovariance, relative_pose_covariance
-from pancam_graph.rigs import Rig
+from pancam_graph.rigs import Rig, RigCovariance
 
 __all__ = ["Incremental", "Refined", "RigCorrection", "Seconds", "Solution", "State", "rms_px"]
 
@@ -206,6 +207,14 @@ class Solution:
     """(observations,) whether an observation is used after it had been set aside; None if not recorded."""
     refined: tuple[Refined, ...] = ()
     """Free entries of the rig (`Sharing`), ordered by quantity and owner."""
+    treatment: RigTreatment | None = None
+    """What became of the rig's uncertainty; "estimated" also where a sharing of the user's freed numbers of
+    the rig, "held" where it freed none. None: not recorded."""
+    sharing: Sharing | None = None
+    """What of the rig was estimated, with its priors; None: not recorded."""
+    rig_covariance: RigCovariance | None = None
+    """Joint covariance of the adjusted rig's numbers about their values; None unless the rig was estimated
+    within its own uncertainty."""
     method: str = "joint"
     """Name of the method (`SolveOptions.method`)."""
     cross_validation: CrossValidation | None = None

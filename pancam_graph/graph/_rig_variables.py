@@ -4,12 +4,13 @@ Variables: `K` calibration, `E` mount (`head_T_camera`), `T` tilt axis (`pan_T_t
 to the values of the rig, with free entries alone; `R` radius of a circle (double).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import gtsam
 import numpy as np
+import scipy
 
 from pancam_graph.base.geometry import (
     FloatArray,
@@ -20,9 +21,7 @@ from pancam_graph.base.geometry import (
 )
 from pancam_graph.cameras import CALIBRATION_ENTRIES
 from pancam_graph.data import (
-    ASPECT,
     ENTRIES,
-    FOCAL,
     Freedom,
     Quantity,
     Refined,
@@ -32,8 +31,9 @@ from pancam_graph.data import (
     default_sigma,
 )
 from pancam_graph.elimination import Covariance, Linkage
-from pancam_graph.factors import Corrected, Fixed, Key, PoseSlot, Slot
-from pancam_graph.graph._keys import Kind, key_of
+from pancam_graph.factors import Corrected, Fixed, Key, PoseSlot, Slot, conditional_prior_factor
+from pancam_graph.graph._keys import Kind, index_of, key_of, kind_of
+from pancam_graph.rigs import ASPECT, FOCAL, RIG_ENTRIES, RigCovariance, RigEntry
 
 __all__ = ["RigVariable", "RigVariables"]
 
@@ -110,13 +110,18 @@ class RigVariables:
         out = []
         for i, (number, first) in enumerate(zip(numbers, firsts, strict=True)):
             of_owner = place == i
-            focal = 1.0 if axis else self._focal_px(None if scope == "all" else int(t.image_eye[first]))
+            eye_of_all = None if axis or scope == "all" else int(t.image_eye[first])
+            focal = 1.0 if axis else self._focal_px(eye_of_all)
+            key = key_of(_KIND[quantity], int(number))
+            sigma = np.array([self._own_sigma(quantity, e, eye_of_all) for e in entries])
+            if self.sharing.covariance is not None:
+                sigma = np.sqrt(np.diag(self.sharing.covariance.among(self._entries_of(key), sigma)))
             out.append(
                 RigVariable(
                     quantity=quantity,
-                    key=key_of(_KIND[quantity], int(number)),
+                    key=key,
                     entries=entries,
-                    sigma=np.array([freedom.sigma.get(e, default_sigma(e, focal)) for e in entries]),
+                    sigma=sigma,
                     usual=np.array([default_sigma(e, focal) for e in entries]),
                     eye=None if eye is None or scope == "all" else int(eye[first]),
                     stop=int(stop[first]) if scope in {"stop", "image"} else None,
@@ -176,6 +181,11 @@ class RigVariables:
     def of_stop(self, stop: int | None) -> list[RigVariable]:
         """Variables of one stop alone; None: variables that stops share."""
         return [v for v in self.variables if v.stop == stop]
+
+    @property
+    def keys(self) -> list[int]:
+        """Keys of the variables that stops share, without radii, which follow from a rig's numbers."""
+        return [v.key for v in self.of_stop(None) if v.quantity in RIG_ENTRIES]
 
     def group(self, variable: RigVariable) -> int:
         """Group in which a variable is eliminated: its stop's, or the last one."""
@@ -252,8 +262,10 @@ class RigVariables:
     def prior_factors(self, stop: int | None) -> list[gtsam.NonlinearFactor]:
         """Priors of `of_stop`."""
         out: list[gtsam.NonlinearFactor] = []
+        joint = self.keys if stop is None and self.sharing.covariance is not None else []
+        out += self.joint_priors(joint, ())
         for v in self.of_stop(stop):
-            if not np.isfinite(v.sigma).any():
+            if v.key in joint or not np.isfinite(v.sigma).any():
                 continue
             noise = gtsam.noiseModel.Diagonal.Sigmas(v.sigma)  # an infinite one weighs its row with 0
             if v.quantity == "radius":
@@ -261,6 +273,55 @@ class RigVariables:
             else:
                 out.append(gtsam.PriorFactorVector(v.key, np.zeros(len(v.sigma)), noise))
         return out
+
+    # --- priors whose errors hang together ---
+
+    def _entries_of(self, key: int) -> list[RigEntry]:
+        """The numbers of the rig that a variable of an eye, or of the tilt axis, corrects."""
+        quantity = next(q for q, kind in _KIND.items() if kind is kind_of(key))
+        camera = None if quantity == "pan_T_tilt" else self.traverse.rig.eyes[index_of(key)].name
+        freedom: Freedom = getattr(self.sharing, quantity)
+        return [RigEntry(quantity, camera, entry) for entry in freedom.entries(quantity)]
+
+    def _joint(self, keys: Sequence[int]) -> FloatArray:
+        """Covariance (n, n) of the priors of variables that stops share, also of eyes that no image has."""
+        assert self.sharing.covariance is not None
+        entries = [entry for key in keys for entry in self._entries_of(key)]
+        rig = self.traverse.rig
+        eyes = [None if e.camera is None else rig.eye_index(e.camera) for e in entries]
+        sigma = [self._own_sigma(e.quantity, e.entry, eye) for e, eye in zip(entries, eyes, strict=True)]
+        return self.sharing.covariance.among(entries, np.array(sigma))
+
+    def _own_sigma(self, quantity: str, entry: str, eye: int | None) -> float:
+        """Sigma of the prior of an entry by itself, whatever the covariance says."""
+        freedom: Freedom = getattr(self.sharing, quantity)
+        focal = 1.0 if quantity == "pan_T_tilt" else self._focal_px(eye)
+        return float(freedom.sigma.get(entry, default_sigma(entry, focal)))
+
+    def joint_priors(self, new: Sequence[int], known: Sequence[int]) -> list[gtsam.NonlinearFactor]:
+        """The prior of the variables `new` given those `known`; both are keys of variables that stops share.
+
+        The product of such factors, each with what came before it as known, is the joint prior.
+        """
+        if not new:
+            return []
+        keys = [*known, *new]
+        covariance = self._joint(keys)
+        size = np.sqrt(np.diag(covariance))
+        root = scipy.linalg.cholesky(covariance / np.outer(size, size), lower=True)
+        # The rows of a lower triangular square root of the information are conditional on what stands before.
+        rows = scipy.linalg.solve_triangular(root, np.diag(1 / size), lower=True)
+        first = len(covariance) - sum(len(self._entries_of(key)) for key in new)
+        return [conditional_prior_factor(rows[first:], [Key(key) for key in keys])]
+
+    def prior_information(self) -> FloatArray:
+        """Information (n, n) of the priors of the variables of `keys`, one after the other."""
+        if self.sharing.covariance is None:
+            of_keys = [v.sigma for v in self.of_stop(None) if v.key in self.keys]
+            return np.diag(np.concatenate(of_keys) ** -2.0)
+        covariance = self._joint(self.keys)
+        size = np.sqrt(np.diag(covariance))
+        return np.asarray(np.linalg.inv(covariance / np.outer(size, size)) / np.outer(size, size))
 
     # --- cameras at values of the variables ---
 
@@ -325,6 +386,48 @@ class RigVariables:
         for v in self.variables:
             columns, g = linkage.columns_of(v.key), self.group(v)
             out.append(np.sqrt(np.diag(covariance.block(g, g)[columns, columns])))
+        return out
+
+    def rig_covariance(self, values: gtsam.Values, covariance: Covariance, linkage: Linkage) -> RigCovariance:
+        """Joint covariance of the rig's numbers about their values after the adjustment.
+
+        Of the numbers that belong to the whole traverse; an entry of the prior's covariance whose eye has no
+        image keeps its covariance with the others like it. Corrections of a rig that is corrected already
+        differ from those of this one in the second order: their Jacobian is in it.
+        """
+        variables = [v for v in self.of_stop(None) if v.key in self.keys]
+        g = len(self.traverse.stops)
+        columns = [np.arange(c.start, c.stop) for c in (linkage.columns_of(v.key) for v in variables)]
+        entries = [entry for v in variables for entry in self._entries_of(v.key)]
+        order = np.concatenate([np.zeros(0, dtype=np.int64), *columns])
+        jacobian = scipy.linalg.block_diag(*(self._moved(v, values) for v in variables))
+        matrix = jacobian @ covariance.block(g, g)[np.ix_(order, order)] @ jacobian.T
+        prior = self.sharing.covariance
+        if prior is not None:
+            unseen = [e for e in prior.entries if e not in entries]
+            entries += unseen
+            matrix = scipy.linalg.block_diag(matrix, prior.among(unseen, np.zeros(len(unseen))))
+        return RigCovariance(entries=tuple(entries), matrix=(matrix + matrix.T) / 2)
+
+    def _moved(self, variable: RigVariable, values: gtsam.Values) -> FloatArray:
+        """Derivative (n, n) of corrections of the adjusted rig by those of the rig of the traverse."""
+        at = values.atVector(variable.key)
+        basis = self._basis[variable.quantity][variable.first]
+        if variable.quantity != "calibration":
+            twists = correction_twists(basis @ at)
+            held = ~np.any(basis != 0, axis=1)
+            return np.asarray(twists[np.ix_(~held, ~held)])
+        fx, fy = self._K[variable.first][[0, 1], [0, 1]] + (basis @ at)[:2]
+        nominal = self._K[variable.first][[0, 1], [0, 1]]
+        out = np.eye(len(at))
+        # A share of the adjusted focal length is less of it than the same share of the one of the traverse.
+        place = {entry: i for i, entry in enumerate(variable.entries)}
+        if FOCAL in place:
+            out[place[FOCAL], place[FOCAL]] = nominal[0] / fx
+        if ASPECT in place:
+            out[place[ASPECT], place[ASPECT]] = nominal[1] / fy
+            if FOCAL in place:
+                out[place[ASPECT], place[FOCAL]] = nominal[1] / fy - nominal[0] / fx
         return out
 
     def refined(self, values: gtsam.Values, sigmas: list[FloatArray] | None) -> tuple[Refined, ...]:

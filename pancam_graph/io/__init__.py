@@ -29,8 +29,12 @@ from pancam_graph.io._pictures import picture_file as picture_file
 from pancam_graph.io._pictures import read_picture as read_picture
 from pancam_graph.io._pictures import readable_picture as readable_picture
 from pancam_graph.io._pictures import same_pictures as same_pictures
+from pancam_graph.io._rig_json import read_rig as read_rig
+from pancam_graph.io._rig_json import rig_json as rig_json
+from pancam_graph.io._rig_json import use_rig as use_rig
 from pancam_graph.io._schema import SharingEntry as SharingEntry
 from pancam_graph.io._schema import TraverseFile as TraverseFile
+from pancam_graph.io._seen_pictures import picture_digests as picture_digests
 from pancam_graph.io._traverse_json import read_traverse as read_traverse
 from pancam_graph.io._traverse_json import traverse_entries as traverse_entries
 from pancam_graph.io._traverse_json import traverse_of as traverse_of

@@ -1,22 +1,27 @@
 """Cameras as entries of files: one pydantic model for each registered lens, made from its fields."""
 
-from typing import Annotated, Any, Literal, Union
+from dataclasses import replace
+from typing import Annotated, Any, ClassVar, Literal, Union
 
 from pydantic import Discriminator, Field, GetCoreSchemaHandler, Tag, create_model
 from pydantic_core import CoreSchema
 
 from pancam_graph.cameras import LENSES, Lens, LensField, lens_of
-from pancam_graph.io._entries import Entry, Label, PoseEntry
+from pancam_graph.io._entries import Label, PoseEntry, SparseEntry
 from pancam_graph.io._json import prefixed
 from pancam_graph.rigs import Eye
 
 __all__ = ["AnyCamera", "CameraEntry", "camera_entry"]
 
 
-class CameraEntry(Entry):
+class CameraEntry(SparseEntry):
     """A camera and how it sits on the head; the other entries are those of its lens (`LENSES`)."""
 
+    _OPTIONAL: ClassVar = frozenset({"unit"})
+
     name: Label
+    unit: Label | None = None
+    """The camera that it is, among those of its kind."""
     width_px: int
     height_px: int
     model: str
@@ -29,9 +34,10 @@ class CameraEntry(Entry):
         with prefixed(where):
             camera = lens.camera(width_px=self.width_px, height_px=self.height_px, **numbers)
             if lens.in_head_frame:
-                return Eye.from_head_model(self.name, camera)
+                return replace(Eye.from_head_model(self.name, camera), unit=self.unit or "")
         mount = next(getattr(self, field.key) for field in lens.fields if field.kind == "mount")
-        return Eye(name=self.name, camera=camera, head_T_camera=mount.pose(f"{where}.head_T_camera"))
+        head_T_camera = mount.pose(f"{where}.head_T_camera")
+        return Eye(name=self.name, camera=camera, head_T_camera=head_T_camera, unit=self.unit or "")
 
 
 def _field(field: LensField) -> Any:
@@ -84,6 +90,7 @@ def camera_entry(eye: Eye) -> CameraEntry:
     }
     return _MODELS[lens.name](
         name=eye.name,
+        unit=eye.unit or None,
         width_px=camera.width_px,
         height_px=camera.height_px,
         model=lens.name,

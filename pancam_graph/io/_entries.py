@@ -4,26 +4,29 @@ Keys and units are those of the file contract. Every model is strict: no unknown
 string, nothing that is not finite. References between entries are checked by the data model.
 """
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import gtsam
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
 from pancam_graph.base.errors import GeometryError, InputError
 from pancam_graph.base.geometry import pose_from_wxyz, wxyz_from_rotation
 
 __all__ = [
     "MOSAIC_FORMAT",
+    "RIG_FORMAT",
     "SOLUTION_FORMAT",
     "TRAVERSE_FORMAT",
     "VERSION",
     "Entry",
     "Label",
     "PoseEntry",
+    "SparseEntry",
     "Text",
 ]
 
 TRAVERSE_FORMAT = "pancam-graph/traverse"
+RIG_FORMAT = "pancam-graph/rig"
 SOLUTION_FORMAT = "pancam-graph/solution"
 MOSAIC_FORMAT = "pancam-graph/mosaics"
 VERSION = 1
@@ -38,6 +41,17 @@ class Entry(BaseModel):
     """Base of all entries."""
 
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, frozen=True)
+
+
+class SparseEntry(Entry):
+    """An entry that is written without the keys of `_OPTIONAL` that are null."""
+
+    _OPTIONAL: ClassVar[frozenset[str]] = frozenset()
+
+    @model_serializer(mode="wrap")
+    def _without_nulls(self, handler: SerializerFunctionWrapHandler) -> dict[str, object]:
+        content: dict[str, object] = handler(self)
+        return {k: v for k, v in content.items() if v is not None or k not in self._OPTIONAL}
 
 
 class PoseEntry(Entry):

@@ -130,6 +130,11 @@ def read_pds(folder: Path | str) -> Traverse:
         mast_height_m=kinematics.mast_height_m,
         source=f"PDS labels of {visible(folder.resolve().name)}; {kinematics.source}",
         uncertainty=images[0].rover.uncertainty_of(rig.longest_side_px),
+        rover_T_mast=fit.world_T_mast,
+        eyes=tuple(
+            replace(eye, unit=images[int(np.argmax(eye_of == eye_names.index(eye.name)))].unit)
+            for eye in rig.eyes
+        ),
     )
     return Traverse(
         name=visible(folder.resolve().name),

@@ -7,6 +7,7 @@ import gtsam
 
 from pancam_graph.base.errors import CameraError, GeometryError, InputError
 from pancam_graph.base.geometry import FloatArray, pose_from_wxyz
+from pancam_graph.base.text import visible
 from pancam_graph.cameras import CAHV, cahv_of_vectors
 from pancam_graph.io._pds_label import LabelGroup, PdsLabel, read_label
 from pancam_graph.io._pds_rover import ROVER_FRAMES, LabelledRover, reference_frame
@@ -17,6 +18,7 @@ from pancam_graph.rigs import camera_z_up, pose_z_up
 __all__ = ["LabelledImage", "read_labelled_image"]
 
 _CAMERA_GROUPS = ("GEOMETRIC_CAMERA_MODEL", "GEOMETRIC_CAMERA_MODEL_PARMS")
+_LONGEST_SERIAL = 40
 _CLOCK = "SPACECRAFT_CLOCK_START_COUNT"
 _ROVER_GROUPS = ("ROVER_COORDINATE_SYSTEM", "ROVER_COORDINATE_SYSTEM_PARMS", "ROVER_COORD_SYSTEM_PARMS")
 
@@ -43,6 +45,13 @@ class LabelledImage:
     world_T_rover: gtsam.Pose3
     model: CAHV
     """The camera in the rover frame."""
+    serial: str
+    """Serial number of the camera; "" where the label has none."""
+
+    @property
+    def unit(self) -> str:
+        """The camera that it is: host, instrument and serial number."""
+        return " ".join(part for part in (self.host, self.instrument, self.serial) if part)
 
 
 def read_labelled_image(file: Path) -> LabelledImage:
@@ -85,7 +94,14 @@ def read_labelled_image(file: Path) -> LabelledImage:
         pan_tilt_rad=pan_tilt_rad,
         world_T_rover=pose_z_up(site_T_rover),
         model=camera_z_up(model),
+        serial=_serial(label),
     )
+
+
+def _serial(label: PdsLabel) -> str:
+    """INSTRUMENT_SERIAL_NUMBER, which labels write as a number or as text."""
+    found = label.top.items.get("INSTRUMENT_SERIAL_NUMBER")
+    return "" if found is None else visible(str(found)).strip()[:_LONGEST_SERIAL]
 
 
 def _pose(group: LabelGroup, reference: set[str]) -> gtsam.Pose3:

@@ -1,16 +1,19 @@
 """The entries of `traverse.json`."""
 
 import math
-from dataclasses import fields, replace
-from typing import Annotated, Any, Literal
+from dataclasses import replace
+from typing import Annotated, Any, ClassVar, Literal
 
+import numpy as np
 from pydantic import Discriminator, Tag
 
-from pancam_graph.data import Freedom, Sharing
+from pancam_graph.base.choices import expected_one_of
+from pancam_graph.base.errors import InputError
+from pancam_graph.data import QUANTITIES, Freedom, Sharing
 from pancam_graph.io._camera_entry import AnyCamera, camera_entry
-from pancam_graph.io._entries import Entry, Label, PoseEntry, Text
+from pancam_graph.io._entries import Entry, Label, PoseEntry, SparseEntry, Text
 from pancam_graph.io._json import prefixed
-from pancam_graph.rigs import Rig, RigUncertainty, rig_template
+from pancam_graph.rigs import Rig, RigCovariance, RigEntry, RigUncertainty, rig_template
 
 __all__ = [
     "FrameEntry",
@@ -24,8 +27,58 @@ __all__ = [
 ]
 
 
-class UncertaintyEntry(Entry):
+class RigNumberEntry(Entry):
+    """Which number of a rig a row of a covariance is about."""
+
+    quantity: Label
+    camera: Label | None = None
+    """Name of its eye; missing or null for the tilt axis."""
+    entry: Label
+
+
+class CovarianceEntry(Entry):
+    """Joint covariance of errors of a rig's numbers."""
+
+    entries: list[RigNumberEntry]
+    matrix: list[list[float]]
+    """One row an entry, in their order and units."""
+    pictures: list[Label] = []  # noqa: RUF012  pydantic copies it
+    """Digests of the pictures that the rig was calibrated with."""
+
+    def covariance(self, rig: Rig) -> RigCovariance:
+        """The covariance. Raises InputError naming the entry."""
+        eyes = [eye.name for eye in rig.eyes]
+        for i, entry in enumerate(self.entries):
+            if entry.camera is not None and entry.camera not in eyes:
+                where = f"covariance: entries[{i}]: camera"
+                raise InputError(expected_one_of(where, entry.camera, eyes))
+        for i, row in enumerate(self.matrix):
+            if len(row) != len(self.matrix):
+                raise InputError(
+                    f"covariance: matrix[{i}]: expected {len(self.matrix)} numbers, as there are rows; "
+                    f"found {len(row)}"
+                )
+        n = len(self.matrix)
+        return RigCovariance(
+            entries=tuple(RigEntry(e.quantity, e.camera, e.entry) for e in self.entries),
+            matrix=np.array(self.matrix, dtype=float).reshape(n, n),
+            pictures=tuple(self.pictures),
+        )
+
+    @staticmethod
+    def of(covariance: RigCovariance) -> "CovarianceEntry":
+        """The entry of a covariance."""
+        return CovarianceEntry(
+            entries=[RigNumberEntry(**entry._asdict()) for entry in covariance.entries],
+            matrix=covariance.matrix.tolist(),
+            pictures=list(covariance.pictures),
+        )
+
+
+class UncertaintyEntry(SparseEntry):
     """How far the numbers of a rig may be off; what is not named is that of the rig."""
+
+    _OPTIONAL: ClassVar = frozenset({"covariance"})
 
     focal: float | None = None
     aspect: float | None = None
@@ -38,17 +91,27 @@ class UncertaintyEntry(Entry):
     flex_rad: float | None = None
     flex_m: float | None = None
     source: Text | None = None
+    covariance: CovarianceEntry | None = None
 
     def on(self, rig: Rig) -> Rig:
-        """The rig with this uncertainty. Raises InputError for a negative sigma."""
+        """The rig with this uncertainty. Raises InputError for a negative sigma, and as `RigCovariance`."""
+        told = self.model_dump(exclude_none=True, exclude={"covariance"})
         with prefixed("rig"):
-            return replace(rig, uncertainty=replace(rig.uncertainty, **self.model_dump(exclude_none=True)))
+            if self.covariance is not None:
+                with prefixed("uncertainty"):
+                    told["covariance"] = self.covariance.covariance(rig)
+            return replace(rig, uncertainty=replace(rig.uncertainty, **told))
 
     @staticmethod
     def of(uncertainty: RigUncertainty) -> "UncertaintyEntry":
         """The entry of an uncertainty."""
         sigmas = {name: float(sigma) for name, sigma in uncertainty.sigmas.items()}
-        return UncertaintyEntry(**sigmas, source=uncertainty.source)
+        joint = uncertainty.covariance
+        return UncertaintyEntry(
+            **sigmas,
+            source=uncertainty.source,
+            covariance=None if joint is None else CovarianceEntry.of(joint),
+        )
 
 
 class TemplateRigEntry(Entry):
@@ -64,19 +127,24 @@ class TemplateRigEntry(Entry):
         return self.uncertainty.on(rig)
 
 
-class OwnRigEntry(Entry):
+class OwnRigEntry(SparseEntry):
     """A rig of the user's own."""
+
+    _OPTIONAL: ClassVar = frozenset({"rover_T_mast"})
 
     name: Text = "own rig"
     pan_T_tilt: PoseEntry
     cameras: list[AnyCamera]
     uncertainty: UncertaintyEntry = UncertaintyEntry()
+    rover_T_mast: PoseEntry | None = None
 
     def rig(self) -> Rig:
         """The rig. Raises InputError naming the entry."""
         pan_T_tilt = self.pan_T_tilt.pose("rig.pan_T_tilt")
         eyes = tuple(c.eye(f"rig.cameras[{i}]") for i, c in enumerate(self.cameras))
-        return self.uncertainty.on(Rig(name=self.name, pan_T_tilt=pan_T_tilt, eyes=eyes))
+        of_rover = None if self.rover_T_mast is None else self.rover_T_mast.pose("rig.rover_T_mast")
+        rig = Rig(name=self.name, pan_T_tilt=pan_T_tilt, eyes=eyes, rover_T_mast=of_rover)
+        return self.uncertainty.on(rig)
 
 
 def _rig_tag(value: Any) -> str:
@@ -152,15 +220,14 @@ class SharingEntry(Entry):
 
     def sharing(self) -> Sharing:
         """The sharing. Raises InputError for entries that contradict each other."""
-        given = {field.name: getattr(self, field.name) for field in fields(Sharing)}
+        given = {name: getattr(self, name) for name in QUANTITIES}
         return Sharing(**{name: entry.freedom() for name, entry in given.items() if entry is not None})
 
     @staticmethod
     def of(sharing: Sharing) -> "SharingEntry":
         """The entry of a sharing; it has only the quantities that differ from the default."""
-        quantities = [field.name for field in fields(Sharing)]
-        given = {name: FreedomEntry.of(getattr(sharing, name)) for name in quantities}
-        usual = {name: FreedomEntry.of(getattr(Sharing(), name)) for name in quantities}
+        given = {name: FreedomEntry.of(getattr(sharing, name)) for name in QUANTITIES}
+        usual = {name: FreedomEntry.of(getattr(Sharing(), name)) for name in QUANTITIES}
         return SharingEntry(**{name: entry for name, entry in given.items() if entry != usual[name]})
 
 
@@ -192,4 +259,5 @@ def rig_entry(rig: Rig) -> OwnRigEntry:
         pan_T_tilt=PoseEntry.of(rig.pan_T_tilt),
         cameras=[camera_entry(e) for e in rig.eyes],
         uncertainty=UncertaintyEntry.of(rig.uncertainty),
+        rover_T_mast=None if rig.rover_T_mast is None else PoseEntry.of(rig.rover_T_mast),
     )

@@ -25,6 +25,7 @@ from pancam_graph.io._schema import (
     TraverseFile,
     rig_entry,
 )
+from pancam_graph.io._seen_pictures import require_other_pictures
 
 __all__ = ["TRAVERSE_FOLDER", "read_traverse", "traverse_entries", "traverse_of", "write_traverse"]
 
@@ -69,6 +70,8 @@ def read_traverse(folder: Path | str) -> Traverse:
             source = _inside(folder, entries.observations, "observations")
     observations = None if source is None else read_observations(source)
     traverse = _checked(entries, path, observations, source)
+    with prefixed(f"{path}: rig.uncertainty.covariance"):
+        require_other_pictures(traverse, traverse.rig)
     unusable = _unusable_images(files, traverse)
     # Without observations, the search for them in images gives the same warnings.
     return traverse if source is None else traverse.with_warnings(left_out(unusable))

@@ -38,6 +38,12 @@ def _cahvor() -> OutputWriter:
     return CAMERAS
 
 
+def _rig() -> OutputWriter:
+    from pancam_graph.results._rig import RIG
+
+    return RIG
+
+
 def _residuals() -> OutputWriter:
     from pancam_graph.results._residuals_csv import RESIDUALS
 
@@ -76,6 +82,13 @@ OUTPUTS = (
         when="export",
         says="the refined cameras as text files",
         writer=_cahvor,
+        older=EXPORT_FOLDER,
+    ),
+    Output(
+        name="rig",
+        when="export",
+        says="the refined rig with its covariance, for --use-rig of another run, and its cameras as text",
+        writer=_rig,
         older=EXPORT_FOLDER,
     ),
     Output(name="residuals.csv", when="always", writer=_residuals),

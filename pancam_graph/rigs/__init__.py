@@ -1,5 +1,11 @@
 """Mast rigs: the pan-tilt chain, its eyes, and the templates that ship."""
 
+from pancam_graph.rigs._covariance import ASPECT as ASPECT
+from pancam_graph.rigs._covariance import FOCAL as FOCAL
+from pancam_graph.rigs._covariance import POSE_ENTRIES as POSE_ENTRIES
+from pancam_graph.rigs._covariance import RIG_ENTRIES as RIG_ENTRIES
+from pancam_graph.rigs._covariance import RigCovariance as RigCovariance
+from pancam_graph.rigs._covariance import RigEntry as RigEntry
 from pancam_graph.rigs._exomars import exomars_pancam as exomars_pancam
 from pancam_graph.rigs._mars2020 import MARS2020_MAST as MARS2020_MAST
 from pancam_graph.rigs._mars2020 import mars2020_mastcam_z as mars2020_mastcam_z

@@ -31,6 +31,9 @@ class Eye:
     """The camera model in the camera frame: centre at the origin, z forward."""
     head_T_camera: gtsam.Pose3
     """How the eye sits on the head (x forward, y left, z up), which turns with pan and tilt."""
+    unit: str = ""
+    """The camera that it is among those of its kind: host, instrument and serial number of labels; "": not
+    known."""
 
     @staticmethod
     def from_head_model(name: str, model: CAHV) -> "Eye":
@@ -83,6 +86,8 @@ class Rig:
     """Where the numbers come from."""
     uncertainty: RigUncertainty = None  # type: ignore[assignment]  # __post_init__ puts the default there
     """How far the numbers may be off; default: `RigUncertainty.usual` of the largest image."""
+    rover_T_mast: gtsam.Pose3 | None = None
+    """The mast frame in the rover frame of labels turned to z up; None: not known, or no rover."""
 
     def __post_init__(self) -> None:
         """Check that there are eyes, with different names; state an uncertainty."""

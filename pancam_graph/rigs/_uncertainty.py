@@ -1,25 +1,32 @@
 """How far the numbers of a rig may be off."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
 from pancam_graph.base.errors import InputError
+from pancam_graph.base.geometry import FloatArray
+from pancam_graph.rigs._covariance import ASPECT, FOCAL, RigCovariance, RigEntry
 
 __all__ = ["RigUncertainty"]
 
 _PRINCIPAL_POINT = 5e-3
 _SKEW = 2e-4
 """Usual sigmas of principal point and skew, as shares of the image's longer side."""
+_NO_SIGMA = ("source", "covariance")
+"""Fields that are no standard deviations."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RigUncertainty:
     """Standard deviations of a rig's numbers about the values that it states; 0: known exactly.
 
-    Errors of different eyes, and of different entries, are independent. The defaults are our stated
-    assumption for a calibrated rig of which nothing more is known, with images of 1024 px; `usual` scales
-    them to other images. Raises InputError for a negative sigma, and for one that is not finite.
+    Errors of different eyes, and of different entries, are independent, except for those that the covariance
+    names. The defaults are our stated assumption for a calibrated rig of which nothing more is known, with
+    images of 1024 px; `usual` scales them to other images. Raises InputError for a negative sigma, for one
+    that is not finite, and for a covariance of entries whose sigma here is 0.
     """
 
     focal: float = 5e-3
@@ -45,24 +52,48 @@ class RigUncertainty:
     """Of each frame: how far the head stands shifted, along each of its own axes."""
     source: str = "our stated assumption for a calibrated rig"
     """Where the numbers come from."""
+    covariance: RigCovariance | None = None
+    """Joint covariance of the entries that it names, in place of their sigmas; None: of none."""
 
     def __post_init__(self) -> None:
-        """Check the sigmas."""
+        """Check the sigmas, and that the covariance has no entry that is exact."""
         for name, sigma in self.sigmas.items():
             if not (np.isfinite(sigma) and sigma >= 0):
                 raise InputError(
                     f"uncertainty: {name}: expected 0 (exact) or a positive number, found {sigma}"
                 )
+        for entry in () if self.covariance is None else self.covariance.entries:
+            if self.sigma_of(entry.quantity, entry.entry) == 0:
+                raise InputError(
+                    f"uncertainty: covariance: expected entries whose own sigma is above 0, found "
+                    f"{entry.entry} of {entry.quantity}, which is exact"
+                )
 
     @property
     def sigmas(self) -> dict[str, float]:
         """The standard deviations by name."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "source"}
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _NO_SIGMA}
+
+    def sigma_of(self, quantity: str, entry: str) -> float:
+        """The standard deviation of an entry of `RIG_ENTRIES`, whatever its eye and the covariance."""
+        if quantity == "calibration":
+            of_entry = {FOCAL: self.focal, ASPECT: self.aspect, "skew_px": self.skew_px}
+            return of_entry.get(entry, self.principal_point_px)
+        turn, shift = (
+            (self.mount_rad, self.mount_m) if quantity == "mounts" else (self.tilt_axis_rad, self.tilt_axis_m)
+        )
+        return turn if entry.endswith("_rad") else shift
+
+    def covariance_of(self, entries: Sequence[RigEntry]) -> FloatArray:
+        """Joint covariance (n, n) of some entries; of those that no covariance names the sigmas count."""
+        sigma = np.array([self.sigma_of(entry.quantity, entry.entry) for entry in entries])
+        joint = self.covariance or RigCovariance(entries=(), matrix=np.zeros((0, 0)))
+        return joint.among(entries, sigma)
 
     @staticmethod
     def exact() -> "RigUncertainty":
         """Of a rig whose numbers are all known."""
-        zero = {f.name: 0.0 for f in fields(RigUncertainty) if f.name != "source"}
+        zero: dict[str, Any] = {f.name: 0.0 for f in fields(RigUncertainty) if f.name not in _NO_SIGMA}
         return replace(RigUncertainty(), **zero, source="exact")
 
     @staticmethod

@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 
 from pancam_graph.base.geometry import FloatArray, corrected_poses, rz
-from pancam_graph.rigs import Rig
+from pancam_graph.rigs import RIG_ENTRIES, Rig, RigEntry
 
 __all__ = ["drawn_flex", "drawn_rig", "wrong_rig"]
 
@@ -48,20 +48,27 @@ def wrong_rig(
 
 def drawn_rig(rig: Rig, rng: np.random.Generator) -> Rig:
     """The rig with gaussian errors in all its numbers, as large as its own uncertainty says."""
-    u = rig.uncertainty
-    turn_shift = np.repeat([u.mount_rad, u.mount_m], 3)
+    owners = [(q, eye.name) for eye in rig.eyes for q in ("calibration", "mounts")]
+    entries = [RigEntry(q, owner, e) for q, owner in (*owners, ("pan_T_tilt", None)) for e in RIG_ENTRIES[q]]
+    covariance = rig.uncertainty.covariance_of(entries)
+    size = np.sqrt(np.diag(covariance))
+    known = size > 0
+    root = np.diag(size)
+    root[np.ix_(known, known)] @= np.linalg.cholesky(
+        covariance[np.ix_(known, known)] / np.outer(size[known], size[known])
+    )
+    errors = root @ rng.standard_normal(len(entries))
     eyes = []
-    for eye in rig.eyes:
-        focal, aspect, skew, cx, cy, *mount = rng.standard_normal(11)
+    for eye, of_eye in zip(rig.eyes, errors[:-6].reshape(-1, 11), strict=True):
+        focal, aspect, skew, cx, cy = of_eye[:5]
         K = eye.camera.pinhole.calibration_matrix
-        K[0, 0] *= 1 + u.focal * focal
-        K[1, 1] *= 1 + u.focal * focal + u.aspect * aspect
-        K[0, 1] += u.skew_px * skew
-        K[:2, 2] += u.principal_point_px * np.array([cx, cy])
-        head_T_camera = _corrected(eye.head_T_camera, turn_shift * mount)
+        K[0, 0] *= 1 + focal
+        K[1, 1] *= 1 + focal + aspect
+        K[0, 1] += skew
+        K[:2, 2] += [cx, cy]
+        head_T_camera = _corrected(eye.head_T_camera, of_eye[5:])
         eyes.append(replace(eye, camera=eye.camera.with_calibration(K), head_T_camera=head_T_camera))
-    axis = np.repeat([u.tilt_axis_rad, u.tilt_axis_m], 3) * rng.standard_normal(6)
-    return replace(rig, eyes=tuple(eyes), pan_T_tilt=_corrected(rig.pan_T_tilt, axis))
+    return replace(rig, eyes=tuple(eyes), pan_T_tilt=_corrected(rig.pan_T_tilt, errors[-6:]))
 
 
 def drawn_flex(rig: Rig, n_frames: int, rng: np.random.Generator) -> FloatArray:

@@ -88,8 +88,10 @@ class DriveMap:
 
     def shared_priors(self, station: Station) -> FactorList:
         """Priors of the rig's shared variables that this station is the first of the drive to have."""
+        first = self._first_with
         return station.shared_priors(
-            {k for k in station.shared_keys if self._first_with[k] == station.number}
+            {k for k in station.shared_keys if first[k] == station.number},
+            {k for k in first if first[k] < station.number},
         )
 
     def take_factors(

@@ -133,8 +133,18 @@ class Station:
             out.append(factor.rekey([self.global_key[key] for key in factor.keys()]))  # noqa: SIM118  a gtsam factor
         return out + self._rig_priors(0)
 
-    def shared_priors(self, keys: Collection[int]) -> list[gtsam.NonlinearFactor]:
-        """Priors of those entries of the rig that stops share and whose keys are given."""
+    def shared_priors(
+        self, keys: Collection[int], known: Collection[int] = ()
+    ) -> list[gtsam.NonlinearFactor]:
+        """Priors of those entries of the rig that stops share and whose keys are given.
+
+        `known` are the keys that the drive has without this station: with a covariance of the rig, the priors
+        are those given these.
+        """
+        rig = self.template.rig_variables
+        if rig.sharing.covariance is not None:
+            # A key of the rig's shared entries is the same in the template of a stop and of the drive.
+            return rig.joint_priors(sorted(keys), sorted(known))
         return self._rig_priors(None, keys)
 
     def _rig_priors(

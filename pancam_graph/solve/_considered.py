@@ -62,12 +62,13 @@ def with_rig(fitted: Fitted, problem: Problem) -> tuple[Problem, ReducedSystem] 
     panels = landmark_panels(wide, system, without=fitted.doubt)
     rig, link = len(prepared.traverse.stops), wide.template.linkage
     spread = panels.copy().root().covariance().block(rig, rig)
-    sigma = np.zeros(len(spread))
-    for v in wide.template.rig_variables.of_stop(None):
-        sigma[link.columns_of(v.key)] = v.sigma
+    variables = wide.template.rig_variables
+    order = np.concatenate([np.arange(c.start, c.stop) for c in map(link.columns_of, variables.keys)])
+    prior = np.zeros((len(spread), len(spread)))
+    prior[np.ix_(order, order)] = variables.prior_information()
     own = panels.panel[rig][:, : len(spread)]
     upper = np.triu(own)
     # What is left of the rig's own block once all else is eliminated is the inverse of its covariance.
     told = upper + np.triu(upper, 1).T - scipy.linalg.inv(spread)
-    own[:] = (told + told.T) / 2 + np.diag(sigma**-2.0)
+    own[:] = (told + told.T) / 2 + prior
     return wide, ReducedSystem(system=system, rows=rows, root=panels.root())

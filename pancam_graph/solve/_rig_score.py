@@ -6,12 +6,14 @@ else marginalised) are computed. Freeing entry j lowers the cost by about g_j^2 
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from pancam_graph.base.errors import SolveError
-from pancam_graph.data import FIXED, FOCAL, Freedom, Quantity, Sharing
+from pancam_graph.data import FIXED, Freedom, Quantity, Sharing
 from pancam_graph.graph import HardTemplate, LetGo
+from pancam_graph.rigs import FOCAL
 from pancam_graph.solve._problem import Problem
 from pancam_graph.solve._reduced import ReducedSystem
 
@@ -63,7 +65,8 @@ def held_entries(problem: Problem) -> list[HeldEntry]:
     freed = [q for q in _FREED if getattr(sharing, q) == FIXED]
     if not freed:
         return []
-    wide = replace(sharing, **{q: _FREED[q] for q in freed})
+    freedoms: dict[str, Any] = {q: _FREED[q] for q in freed}
+    wide = replace(sharing, **freedoms)
     part = _part(problem, wide)
     share = part.kept.sum() / max(problem.kept.sum(), 1)
     try:

@@ -3,7 +3,8 @@
 import numpy as np
 
 from pancam_graph.base.geometry import BoolArray, FloatArray
-from pancam_graph.data import PixelNoise, Solution
+from pancam_graph.data import PixelNoise, RigTreatment, Solution
+from pancam_graph.rigs import RigCovariance
 from pancam_graph.solve._fit import Fitted
 from pancam_graph.solve._judge import Judged, state_of
 from pancam_graph.solve._problem import Problem
@@ -43,9 +44,33 @@ def solution_of(judged: Judged) -> Solution:
         mast_covariance=covariances.masts,
         came_back=judged.used & screened.set_aside,
         refined=problem.template.refined(problem.values, covariances.rig_sigmas),
+        treatment=_treatment(fitted),
+        sharing=prepared.sharing,
+        rig_covariance=_rig_covariance(judged),
         verdict=judged.verdict,
         warnings=judged.warnings,
     )
+
+
+def _treatment(fitted: Fitted) -> RigTreatment:
+    """`Solution.treatment` of a fit."""
+    prepared = fitted.screened.prepared
+    given = prepared.options.sharing or prepared.traverse.sharing
+    if given is None:
+        return prepared.options.rig
+    return "estimated" if given.any_free else "held"
+
+
+def _rig_covariance(judged: Judged) -> RigCovariance | None:
+    """`Solution.rig_covariance` of a fit."""
+    fitted, found = judged.fitted, judged.stated.variables
+    prepared, template = fitted.screened.prepared, fitted.problem.template
+    given = prepared.options.sharing or prepared.traverse.sharing
+    if given is not None or prepared.options.rig != "estimated" or found is None:
+        return None
+    if not template.rig_variables.variables:
+        return None
+    return template.rig_variables.rig_covariance(fitted.problem.values, found, template.linkage)
 
 
 def _reasons(fitted: Fitted) -> tuple[str, ...]:

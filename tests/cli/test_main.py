@@ -61,7 +61,7 @@ def test_python_m_is_the_command() -> None:
         (["refine", "F", "--out", "o", "more"], "expected no more arguments, found 'more'"),
         (["refine", "--out", "o"], "FOLDER"),
         (["refine", "F", "--out", "o", "--model", "ring"], "'ring'"),
-        (["refine", "F", "--out", "o", "--export", "colmop"], "expected one of colmap, cahvor; found 'colmop'; is 'colmap' meant?"),  # noqa: E501  the whole sentence
+        (["refine", "F", "--out", "o", "--export", "colmop"], "expected one of colmap, cahvor, rig; found 'colmop'; is 'colmap' meant?"),  # noqa: E501  the whole sentence
         (["drive", "page.html", "--rig", "mer-navcan"], "found 'mer-navcan'; is 'mer-navcam' meant?"),
         (["refine", "F", "--out", "o", "--quiet", "--verbose"], "expected --verbose or --quiet, found both"),
     ],

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from pancam_graph import SimulationOptions, Traverse, TraverseSmoother, simulate, write_traverse
 from pancam_graph.data import Freedom, Sharing
 from pancam_graph.images._cache import Cache
-from pancam_graph.io import read_image, read_input, read_mask, read_pds, read_traverse
+from pancam_graph.io import read_image, read_input, read_mask, read_pds, read_traverse, rig_json, use_rig
 from pancam_graph.rigs import mer_navcam
 from pancam_graph.smoother import SmootherOptions
 from pancam_graph.smoother._incremental import stops_of
@@ -180,6 +180,60 @@ def sharing_traverse() -> Traverse:
         calibration=Freedom(scope="eye", free=("fx_px",), sigma={"fx_px": 2.0}), mounts=Freedom(scope="eye")
     )
     return replace(io_samples.traverse(), sharing=sharing)
+
+
+@kind_of_case
+def rig_json_entries(folder: Path) -> Case:
+    return rigs(folder, lambda rng, good: dumped(mutated_tree(rng, json.loads(good))))
+
+
+@kind_of_case
+def rig_json_covariances(folder: Path) -> Case:
+    """Matrices that are not symmetric, not positive definite, of another size, or have hostile numbers."""
+
+    def change(rng: np.random.Generator, good: bytes) -> bytes:
+        tree = json.loads(good)
+        covariance = tree["rig"]["uncertainty"]["covariance"]
+        matrix = np.array(covariance["matrix"])
+        i, j = rng.integers(0, len(matrix), 2)
+        kind = int(rng.integers(0, 6))
+        if kind == 0:
+            matrix[i, j] += rng.choice([-2.0, 2.0]) * np.sqrt(matrix[i, i] * matrix[j, j])
+        elif kind == 1:
+            matrix[i, j] = matrix[j, i] = 1.5 * np.sqrt(matrix[i, i] * matrix[j, j])
+        elif kind == 2:
+            matrix = matrix[:i] if rng.random() < 0.5 else matrix[:, :j]
+        elif kind == 3:
+            matrix[i, j] = matrix[j, i] = rng.choice([np.nan, np.inf, 0.0, -1.0, 1e308, 1e-320])
+        elif kind == 4:
+            matrix *= rng.choice([0.0, -1.0, 1e300, 1e-300])
+        else:
+            covariance["entries"][int(i)] = covariance["entries"][int(j)]
+        covariance["matrix"] = matrix.tolist()
+        return dumped(tree)
+
+    return rigs(folder, change)
+
+
+@kind_of_case
+def rig_json_bytes(folder: Path) -> Case:
+    def change(rng: np.random.Generator, good: bytes) -> bytes:
+        return mutated_bytes(rng, good) if rng.random() < 0.5 else mutated_text(rng, good.decode()).encode()
+
+    return rigs(folder, change)
+
+
+def rigs(folder: Path, change: Callable[[np.random.Generator, bytes], bytes]) -> Case:
+    sample = io_samples.traverse()
+    rig = io_samples.with_covariance(sample.rig)
+    path = folder / "rig.json"
+    good = rig_json(rig, name="sample", passed=True)
+
+    def case(rng: np.random.Generator) -> str:
+        path.write_bytes(change(rng, good))
+        return outcome(lambda: use_rig(sample, path), folder)
+
+    return case
 
 
 # --- labels ---

@@ -15,6 +15,7 @@ from pancam_graph.factors import (
     Key,
     circle_factor,
     circle_residual,
+    conditional_prior_factor,
     joint_prior_factor,
     mast_factor,
 )
@@ -282,6 +283,24 @@ def test_an_exception_in_a_factor_reaches_the_caller() -> None:
     call: Callable[[gtsam.Values], float] = graph.error
     with pytest.raises(IndexError, match="out of bounds"):
         call(values)
+
+
+def test_conditional_priors_one_after_the_other_are_the_joint_one() -> None:
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(4, 4)) + 2 * np.eye(4)
+    rows = np.linalg.inv(np.linalg.cholesky(root @ root.T))
+    values = gtsam.Values()
+    values.insert(A, rng.normal(size=2))
+    values.insert(A + 1, rng.normal(size=2))
+    parts = [
+        conditional_prior_factor(rows[:2, :2], [Key(A)]),
+        conditional_prior_factor(rows[2:], [Key(A), Key(A + 1)]),
+    ]
+    whole = np.concatenate([values.atVector(A), values.atVector(A + 1)])
+    expected = 0.5 * whole @ np.linalg.inv(root @ root.T) @ whole
+    assert sum(factor.error(values) for factor in parts) == pytest.approx(expected, rel=1e-12)
+    for factor in parts:
+        check_jacobians(factor, values, vectors=(A, A + 1))
 
 
 def test_joint_prior_of_independent_vectors_is_a_prior_of_each() -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -93,7 +94,8 @@ def state_of(t: Traverse, seed: int = 1) -> State:
 
 
 def free(quantity: Quantity, scope: Scope, *entries: str) -> Sharing:
-    return Sharing(**{quantity: Freedom(scope=scope, free=entries or None)})
+    freedom: dict[str, Any] = {quantity: Freedom(scope=scope, free=entries or None)}
+    return Sharing(**freedom)
 
 
 ALL = Sharing(calibration=Freedom(scope="eye"), mounts=Freedom(scope="eye"), pan_T_tilt=Freedom(scope="all"))

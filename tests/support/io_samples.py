@@ -1,5 +1,6 @@
 """Small traverses and solutions for the tests of files."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ from pancam_graph import Frame, Image, Observations, Stop, Traverse
 from pancam_graph.base.geometry import HEAD_R_FORWARD_CAMERA, FloatArray, rx, rz
 from pancam_graph.cameras import CAHV, CAHVOR, CAHVORE, Brown, Pinhole
 from pancam_graph.data import Solution, State
-from pancam_graph.rigs import Eye, Rig
+from pancam_graph.rigs import RIG_ENTRIES, Eye, Rig, RigCovariance, RigEntry
 
 SIZE: dict[str, Any] = {"width_px": 64, "height_px": 48}
 MOUNT = gtsam.Pose3(gtsam.Rot3(rz(0.1) @ HEAD_R_FORWARD_CAMERA), np.array([0.1, 0.2, -0.03]))
@@ -88,6 +89,22 @@ def covariances(n: int) -> FloatArray:
     root = np.random.default_rng(1).normal(0, 0.3, (n, 2, 2))
     covariance = root @ root.transpose(0, 2, 1) + 0.01 * np.eye(2)
     return np.asarray((covariance + covariance.transpose(0, 2, 1)) / 2)
+
+
+def with_covariance(rig: Rig, pictures: tuple[str, ...] = ()) -> Rig:
+    """A rig with a covariance of all numbers of its eyes' calibrations and mounts, each with each."""
+    entries = tuple(
+        RigEntry(quantity, eye.name, entry)
+        for eye in rig.eyes
+        for quantity in ("calibration", "mounts")
+        for entry in RIG_ENTRIES[quantity]
+    )
+    n = len(entries)
+    size = np.array([rig.uncertainty.sigma_of(e.quantity, e.entry) for e in entries])
+    root = np.eye(n) + np.random.default_rng(2).normal(0, 0.1, (n, n))
+    matrix = 0.1 * np.outer(size, size) * (root @ root.T)
+    covariance = RigCovariance(entries=entries, matrix=(matrix + matrix.T) / 2, pictures=pictures)
+    return replace(rig, uncertainty=replace(rig.uncertainty, covariance=covariance))
 
 
 def solution(**changes: Any) -> Solution:

@@ -1,0 +1,104 @@
+"""A rig with its covariance as a file of its own: calibrated once, used for other pictures."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+from pancam_graph.base.errors import InputError
+from pancam_graph.data import Traverse
+from pancam_graph.io._entries import RIG_FORMAT, VERSION, Entry, Text
+from pancam_graph.io._json import prefixed, read_json, validated
+from pancam_graph.io._schema import OwnRigEntry, rig_entry
+from pancam_graph.io._seen_pictures import require_other_pictures
+from pancam_graph.rigs import Eye, Rig
+
+__all__ = ["read_rig", "rig_json", "use_rig"]
+
+
+class RigFile(Entry):
+    """`rig.json`."""
+
+    format: Literal["pancam-graph/rig"] = "pancam-graph/rig"
+    version: Literal[1] = 1
+    name: Text
+    """Name of the traverse that the rig was calibrated with."""
+    passed: bool
+    """Whether that solution passed its tests."""
+    rig: OwnRigEntry
+    """As the rig of a `traverse.json`."""
+
+
+def rig_json(rig: Rig, *, name: str, passed: bool) -> bytes:
+    """A rig as the content of `rig.json`: calibrated in the traverse `name`, whose solution `passed`."""
+    content = RigFile(name=name, passed=passed, rig=rig_entry(rig)).model_dump()
+    return f"{json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)}\n".encode()
+
+
+def read_rig(path: Path | str) -> Rig:
+    """The rig of a `rig.json`, with its covariance.
+
+    Raises InputError naming file and entry for what is malformed, and for a rig of a solution that failed its
+    tests.
+    """
+    path = Path(path)
+    entries = validated(RigFile, read_json(path, RIG_FORMAT, VERSION), path)
+    with prefixed(path):
+        if not entries.passed:
+            raise InputError(
+                f"passed: expected the rig of a solution that passed its tests, found that of "
+                f"{entries.name}, which did not"
+            )
+        return entries.rig.rig()
+
+
+def use_rig(traverse: Traverse, path: Path | str) -> Traverse:
+    """A traverse with the rig of a `rig.json` in place of its own.
+
+    Stops keep where the rover stood: where both rigs know the mast on it, the masts are put there by the
+    rig of the file. Cameras go by their names. Telemetry's accuracy stays that of the traverse.
+
+    Raises InputError naming the file where it lacks a camera of the traverse, for a camera of another size,
+    for one that is another unit by its labels, and where the rig was calibrated with pictures of the
+    traverse.
+    """
+    path, own = Path(path), traverse.rig
+    rig = read_rig(path)
+    with prefixed(path):
+        for row in sorted(set(traverse.image_eye.tolist())):
+            _require_same(own.eyes[row], rig)
+        require_other_pictures(traverse, rig)
+    rig = replace(
+        rig,
+        pointing_sigma=own.pointing_sigma,
+        mast_height_m=own.mast_height_m,
+        turns=own.turns,
+        rover_T_mast=rig.rover_T_mast or own.rover_T_mast,
+    )
+    stops = traverse.stops
+    if own.rover_T_mast is not None and rig.rover_T_mast is not None:
+        moved = own.rover_T_mast.inverse() * rig.rover_T_mast
+        stops = tuple(replace(stop, world_T_mast=stop.world_T_mast * moved) for stop in stops)
+    return replace(traverse, rig=rig, stops=stops)
+
+
+def _require_same(eye: Eye, rig: Rig) -> None:
+    """Raise InputError unless a rig has an eye of this name, size and unit."""
+    other = next((e for e in rig.eyes if e.name == eye.name), None)
+    if other is None:
+        raise InputError(
+            f"rig.cameras: expected {eye.name}, which the traverse has images of; "
+            f"found {', '.join(e.name for e in rig.eyes)}"
+        )
+    sizes = [(e.camera.width_px, e.camera.height_px) for e in (eye, other)]
+    if sizes[0] != sizes[1]:
+        (width, height), (found_width, found_height) = sizes
+        raise InputError(
+            f"rig.cameras: {eye.name}: expected images of {width} x {height} px as in the traverse, "
+            f"found {found_width} x {found_height}"
+        )
+    if eye.unit and other.unit and eye.unit != other.unit:
+        raise InputError(
+            f"rig.cameras: {eye.name}: expected the unit {eye.unit} as in the traverse's labels, "
+            f"found {other.unit}"
+        )
