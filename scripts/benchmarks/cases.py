@@ -9,7 +9,8 @@ from benchmarks.peer import write_peer
 from pancam_graph import SimulationOptions, simulate, write_traverse
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import IntArray
-from pancam_graph.rigs import mer_navcam
+from pancam_graph.data import RigTreatment
+from pancam_graph.rigs import RigUncertainty, mer_navcam
 
 __all__ = ["CASES", "DEFAULT_CASES", "GROWTH", "Case", "Files", "Size", "chosen_cases", "make"]
 
@@ -32,6 +33,9 @@ class Case:
     repeats: int
     """Warm solves, of which the fastest counts."""
     seed: int = 0
+    rig: RigTreatment = "held"
+    """What every engine does with the rig; an estimated one has the uncertainty that the Ceres program
+    knows."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +60,8 @@ class Files:
     """(tracks, 3) landmarks near the truth, for engines that cannot triangulate; a row per track number."""
     peer: Path
     """The same problem as text, for the Ceres program."""
+    rig: RigTreatment
+    """What every engine does with the rig."""
 
 
 def _degrees(*tilts: float) -> tuple[float, ...]:
@@ -79,6 +85,17 @@ _MID = replace(
 )
 _LONG = replace(_MID, stops=40, spacing_m=8.0, points_per_image=41, detection=0.08, link_stops=5)
 _PEERS = ("eliminated", "ceres", "pycolmap")
+_ESTIMATING = ("eliminated", "ceres")
+_PEERS_RIG = replace(
+    RigUncertainty.exact(),
+    focal=2e-3,
+    principal_point_px=5.0,
+    mount_rad=5e-4,
+    mount_m=1e-3,
+    tilt_axis_rad=5e-4,
+    tilt_axis_m=1e-3,
+    source="priors of the Ceres program",
+)
 
 CASES = {
     case.name: case
@@ -88,6 +105,8 @@ CASES = {
         ),
         Case(name="mid", options=_MID, engines=_PEERS, repeats=3),
         Case(name="long", options=_LONG, engines=_PEERS, repeats=3),
+        Case(name="small-rig", options=_SMALL, engines=_ESTIMATING, repeats=5, rig="estimated"),
+        Case(name="mid-rig", options=_MID, engines=_ESTIMATING, repeats=3, rig="estimated"),
         Case(name="long10", options=replace(_LONG, stops=10), engines=("eliminated",), repeats=3),
         Case(name="long80", options=replace(_LONG, stops=80), engines=("eliminated",), repeats=3),
         Case(name="drive300", options=replace(_LONG, stops=300), engines=("eliminated",), repeats=1),
@@ -116,11 +135,17 @@ def chosen_cases(
 
 def make(case: Case, folder: Path) -> tuple[Files, Size]:
     """Simulate a case and write it into a new folder: the traverse, and beside it what the peers read."""
-    simulation = simulate(mer_navcam(), case.options, seed=case.seed)
+    rig = replace(mer_navcam(), uncertainty=_PEERS_RIG)
+    simulation = simulate(rig, case.options, seed=case.seed)
     traverse, landmarks_m = simulation.traverse, simulation.truth.landmarks_m
     observations = traverse.observations
     assert observations is not None  # simulated traverses have them
-    files = Files(traverse=folder / "traverse", start_m=folder / "start_m.npy", peer=folder / "peer.txt")
+    files = Files(
+        traverse=folder / "traverse",
+        start_m=folder / "start_m.npy",
+        peer=folder / "peer.txt",
+        rig=case.rig,
+    )
     folder.mkdir(parents=True)
     write_traverse(traverse, files.traverse)
     start_m = landmarks_m + np.random.default_rng(case.seed).normal(0, _START_ERROR_M, landmarks_m.shape)

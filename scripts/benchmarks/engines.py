@@ -118,6 +118,7 @@ def _ours(landmarks: str) -> Callable[[Files, Setting, int], list[str] | NotRun]
             "benchmarks.solve_with_us",
             str(files.traverse),
             f"--landmarks={landmarks}",
+            f"--rig={files.rig}",
             f"--repeats={repeats}",
         ]
 
@@ -128,6 +129,7 @@ def _ceres(files: Files, setting: Setting, repeats: int) -> list[str] | NotRun:
     if isinstance(setting.ceres, NotRun):
         return setting.ceres
     options = ["--solvers", "dense", "sparse", "iterative", f"--threads={THREADS}", f"--repeats={repeats}"]
+    options += [f"--rig={files.rig}"]
     return ["benchmarks.solve_with_ceres", str(setting.ceres), str(files.peer), *options]
 
 

@@ -10,11 +10,14 @@ import os
 import sys
 import tempfile
 
+_FUNCTION_TOLERANCE = "1e-6"
+"""The program's own default, which its next argument needs before it."""
 
-def solve(program: str, peer: str, solver: str, threads: int) -> tuple[dict[str, float], float]:
+
+def solve(program: str, peer: str, solver: str, threads: int, rig: str) -> tuple[dict[str, float], float]:
     """Run the program once: what it printed, and the most memory it took in megabytes."""
     with tempfile.TemporaryFile() as output:
-        command = [program, peer, solver, str(threads)]
+        command = [program, peer, solver, str(threads), _FUNCTION_TOLERANCE, rig]
         out = [(os.POSIX_SPAWN_DUP2, output.fileno(), 1)]
         child = os.posix_spawn(program, command, os.environ, file_actions=out)
         _, status, usage = os.wait4(child, 0)
@@ -33,15 +36,20 @@ def main() -> None:
     parser.add_argument("peer")
     parser.add_argument("--solvers", nargs="+", required=True)
     parser.add_argument("--threads", type=int, required=True)
+    parser.add_argument("--rig", choices=("held", "estimated"), required=True)
     parser.add_argument(
         "--repeats", type=int, required=True, help="solves with the fastest solver, first one included"
     )
     arguments = parser.parse_args()
     program = os.path.abspath(arguments.program)  # noqa: PTH100  pathlib would enlarge this process
-    tried = {s: solve(program, arguments.peer, s, arguments.threads) for s in arguments.solvers}
+
+    def run(solver: str) -> tuple[dict[str, float], float]:
+        return solve(program, arguments.peer, solver, arguments.threads, arguments.rig)
+
+    tried = {s: run(s) for s in arguments.solvers}
     best = min(tried, key=lambda s: tried[s][0]["seconds"])
     fastest, memory_mb = tried[best]
-    again = [solve(program, arguments.peer, best, arguments.threads)[0] for _ in range(arguments.repeats - 1)]
+    again = [run(best)[0] for _ in range(arguments.repeats - 1)]
     others = ", ".join(f"{s} {r['seconds']:.3g} s" for s, (r, _) in tried.items() if s != best)
     measured = {
         "seconds": [fastest["seconds"], *(r["seconds"] for r in again)],

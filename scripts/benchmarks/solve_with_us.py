@@ -15,13 +15,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("traverse", type=Path)
     parser.add_argument("--landmarks", required=True)
+    parser.add_argument("--rig", required=True)
     parser.add_argument("--repeats", type=int, required=True, help="warm solves after the first one")
     arguments = parser.parse_args()
     begin = time.perf_counter()
     traverse = read_traverse(arguments.traverse)
     read_s = time.perf_counter() - begin
-    # The other programs hold the rig too.
-    options = SolveOptions(rig="held", landmarks=arguments.landmarks, loss="none")
+    options = SolveOptions(rig=arguments.rig, landmarks=arguments.landmarks, loss="none")
     begin = time.perf_counter()
     solution = solve(traverse, options)
     first_s = time.perf_counter() - begin

@@ -54,6 +54,8 @@ def test_cases_are_of_the_agreed_sizes() -> None:
         "small": 108,
         "mid": 720,
         "long": 2880,
+        "small-rig": 108,
+        "mid-rig": 720,
         "long10": 720,
         "long80": 5760,
         "drive300": 21600,
@@ -73,6 +75,7 @@ def test_small_case_as_files(tmp_path: Path) -> None:
     assert traverse.observations is not None
     assert size.observations == len(traverse.observations) == pytest.approx(15_500, rel=0.05)
     assert size.images == len(traverse.images) == 108
+    assert (files.rig, traverse.rig.uncertainty.focal) == ("held", 2e-3)  # as the Ceres program has it
     assert 2.3 < size.stops_per_track <= 3
     assert np.load(files.start_m).shape == (size.tracks, 3)
     with files.peer.open() as peer:
