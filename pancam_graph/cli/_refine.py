@@ -108,7 +108,7 @@ def _add_options(parser: CommandParser) -> None:
     add(
         "--cross-validate",
         action=Flag,
-        help="solve halves of the terrain points too, and show honest sigmas beside the formal ones",
+        help="check the formal sigmas: solve halves of the terrain points too, and say how far they differ",
     )
     add(
         "--export",

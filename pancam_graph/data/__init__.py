@@ -5,6 +5,8 @@ from pancam_graph.data._cross_validation import HalfScore as HalfScore
 from pancam_graph.data._cross_validation import Sigmas as Sigmas
 from pancam_graph.data._cross_validation import Splitting as Splitting
 from pancam_graph.data._cross_validation import Spread as Spread
+from pancam_graph.data._flex import Flex as Flex
+from pancam_graph.data._flex import flex_of as flex_of
 from pancam_graph.data._matching import Matching as Matching
 from pancam_graph.data._matching import PairMatching as PairMatching
 from pancam_graph.data._matching import Refusal as Refusal

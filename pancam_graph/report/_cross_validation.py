@@ -13,10 +13,11 @@ __all__ = ["cross_validation_section"]
 
 _SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 _MEANING = (
-    "Formal sigmas trust the camera model. Here halves of the points were solved alone, and where two halves "
-    "differ by more than noise explains, the honest sigma is larger: halves drawn by lot show noise that is "
-    "larger than was thought, upper and lower image halves also errors of focal lengths, distortion and "
-    "mounts, which all points share."
+    "A check of the formal sigmas, no cure for them: where the rig was estimated they should hold, and "
+    "the ratios be near 1. Halves of the points were solved alone, and where two halves differ by more "
+    "than noise explains, the honest sigma is larger: halves drawn by lot show noise that is larger "
+    "than was thought, upper and lower image halves also errors of lenses that no number of the rig "
+    "describes, and of a rig that was held."
 )
 _CAPTION = (
     "All in mrad and mm. Relative angles are those of the second frame less those of the first, "

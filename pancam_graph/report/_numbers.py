@@ -71,7 +71,10 @@ def lengths(residuals_px: FloatArray) -> FloatArray:
 
 def fixed(value: float, decimals: int) -> str:
     """A number with a fixed count of decimals, for columns; a dash where not finite."""
-    return f"{value + 0.0:.{decimals}f}" if np.isfinite(value) else _ABSENT
+    if not np.isfinite(value):
+        return _ABSENT
+    text = f"{value:.{decimals}f}"
+    return text.lstrip("-") if not text.strip("-0.") else text  # no negative zeros
 
 
 def short(value: float) -> str:

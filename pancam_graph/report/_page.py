@@ -14,12 +14,13 @@ from pancam_graph.report._matching import matching_section
 from pancam_graph.report._mosaics import mosaic_section
 from pancam_graph.report._numbers import Json, fixed, short
 from pancam_graph.report._packed import packed, packed_plotly
+from pancam_graph.report._rig import rig_section
 from pancam_graph.report._scene import make_masts, scene_figure
 from pancam_graph.report._script import SCRIPT
 from pancam_graph.report._shown_terrain import shown_terrain
 from pancam_graph.report._style import STYLE
-from pancam_graph.report._tables import image_table, observation_table, rig_table, stop_table
-from pancam_graph.report._template import NO_VECTORS, PAGE, RIG, SCENE_CONTROLS, VECTOR_CONTROLS
+from pancam_graph.report._tables import image_table, observation_table, stop_table
+from pancam_graph.report._template import NO_VECTORS, PAGE, SCENE_CONTROLS, VECTOR_CONTROLS
 from pancam_graph.report._verdict import verdict_section
 
 __all__ = ["headline", "lead", "make_page"]
@@ -47,7 +48,8 @@ def make_page(solution: Solution, mosaics: WrittenMosaics | None = None) -> str:
     corrections = make_corrections(solution)
     panels = vector_panels(solution, table, rows_of)
     vectors = _vector_figure(len(panels), seen=sum(e.used + e.rejected > 0 for e in table))
-    figures = [scene, map_figure, histogram, corrections, *([vectors] if panels else [])]
+    rig, rig_figures = rig_section(solution)
+    figures = [scene, map_figure, histogram, corrections, *rig_figures, *([vectors] if panels else [])]
     data = {
         "figures": [figure.json() for figure in figures],
         "views": views,
@@ -73,7 +75,7 @@ def make_page(solution: Solution, mosaics: WrittenMosaics | None = None) -> str:
         matching=matching_section(solution.traverse),
         images=image_table(solution, table),
         stops=stop_table(solution),
-        rig=RIG.format(table=rig_table(solution)) if solution.refined else "",
+        rig=rig,
         plotly=packed_plotly(),
         figures=packed(json.dumps(data, separators=(",", ":"), allow_nan=False)),
         script=SCRIPT,

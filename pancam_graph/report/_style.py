@@ -42,6 +42,14 @@ section { margin-top: 30px; }
 #scene { height: 600px; }
 #map, #histogram { height: 540px; }
 #corrections { height: 520px; }
+.panels { display: grid; grid-template-columns: repeat(4, minmax(0, 1fr)); gap: 8px 18px; }
+@media (max-width: 1250px) { .panels { grid-template-columns: repeat(2, minmax(0, 1fr)); } }
+@media (max-width: 640px) { .panels { grid-template-columns: minmax(0, 1fr); } }
+.panels > div { min-width: 0; break-inside: avoid; }
+.over-image .modebar { display: none; }
+h3 { font-size: 16px; margin: 16px 0 6px; overflow-wrap: anywhere; }
+tr.quiet td { color: #8b98a5; }
+tr.beaten td { background: #fdeee6; color: #b54300; font-weight: 600; }
 .controls { display: flex; flex-wrap: wrap; gap: 8px 18px; align-items: center; margin: 6px 0 8px; }
 .controls select { font: inherit; max-width: 640px; padding: 3px 6px; }
 .scroll { max-height: 440px; overflow: auto; border: 1px solid var(--line); border-radius: 6px; }
@@ -68,6 +76,7 @@ code { font-size: 14px; }
   th { position: static; }
   th button { font-size: 9px; text-align: inherit; }
   th button::after { content: none !important; }
+  .panels { grid-template-columns: repeat(2, minmax(0, 1fr)); }
   tr, .plot, .figures div { break-inside: avoid; }
   h2 { break-after: avoid; }
   .modebar, .controls span:not([id]) { display: none !important; }

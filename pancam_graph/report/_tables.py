@@ -12,16 +12,23 @@ from pancam_graph.report._images import ImageResiduals
 from pancam_graph.report._map import translation_covariance_in_world
 from pancam_graph.report._numbers import fixed
 
-__all__ = ["image_table", "observation_table", "rig_table", "stop_table", "table"]
+__all__ = ["image_table", "observation_table", "stop_table", "table"]
 
 _SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 
 
-def table(name: str, columns: Sequence[tuple[str, str]], rows: Sequence[Sequence[str]], texts: int) -> str:
+def table(
+    name: str,
+    columns: Sequence[tuple[str, str]],
+    rows: Sequence[Sequence[str]],
+    texts: int,
+    *,
+    marks: Sequence[str] | None = None,
+) -> str:
     """A scrollable table whose columns are sorted when their heads are pressed.
 
     `columns` are heads and their explanations; the first `texts` columns hold text, the others numbers.
-    Everything is escaped here.
+    `marks` are classes of the rows, "" for none. Everything is escaped here.
     """
     kinds = ["text" if i < texts else "number" for i in range(len(columns))]
     heads = "".join(
@@ -30,10 +37,10 @@ def table(name: str, columns: Sequence[tuple[str, str]], rows: Sequence[Sequence
         for (head, why), kind in zip(columns, kinds, strict=True)
     )
     body = "\n".join(
-        "<tr>"
+        (f'<tr class="{mark}">' if mark else "<tr>")
         + "".join(f'<td class="{k}">{escape(c)}</td>' for c, k in zip(row, kinds, strict=True))
         + "</tr>"
-        for row in rows
+        for row, mark in zip(rows, marks or [""] * len(rows), strict=True)
     )
     return (
         f'<div class="scroll" tabindex="0" role="region" aria-label="{escape(name)}">\n'
@@ -152,40 +159,3 @@ def stop_table(solution: Solution) -> str:
             )
         )
     return table("Stops", columns, rows, texts=1)
-
-
-_UNITS = {"px": ("px", 1.0, 3), "rad": ("°", float(np.rad2deg(1.0)), 4), "m": ("mm", 1e3, 2)}
-"""By the end of an entry's name: the unit that is shown, the factor to it from the entry's unit, decimals."""
-
-
-def rig_table(solution: Solution) -> str:
-    """One row per entry of the rig that was free: value of the input, change, sigma, sigma of the prior."""
-    columns = (
-        ("quantity", "what of the rig"),
-        ("of", "camera, stop or image that has the number; all: one for the whole traverse"),
-        ("entry", "turns and shifts are in the frame of the camera, or of the tilt axis"),
-        ("unit", "of all numbers in this row"),
-        ("input", "as the input has it"),
-        ("change", "adjusted minus input"),
-        (f"{_SIGMA}", "formal standard deviation"),
-        (f"prior {_SIGMA}", "standard deviation of the prior about the input"),
-    )
-    rows = []
-    for r in solution.refined:
-        name, _, ending = r.entry.rpartition("_")
-        unit, factor, decimals = _UNITS.get(ending, ("", 1.0, 6))
-        owners = (r.image,) if r.image is not None else (r.camera, r.stop)
-        prior = fixed(factor * r.prior_sigma, decimals) if np.isfinite(r.prior_sigma) else "none"
-        rows.append(
-            (
-                r.quantity,
-                ", ".join(owner for owner in owners if owner is not None) or "all",
-                name or r.entry,
-                unit,
-                "differs" if r.nominal is None else fixed(factor * r.nominal, decimals),
-                fixed(factor * r.change, decimals),
-                fixed(factor * r.sigma, decimals),
-                prior,
-            )
-        )
-    return table("Rig", columns, rows, texts=4)

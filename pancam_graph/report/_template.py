@@ -2,7 +2,7 @@
 
 from pancam_graph.report._packed import HEAD
 
-__all__ = ["NO_VECTORS", "PAGE", "RIG", "SCENE_CONTROLS", "VECTOR_CONTROLS"]
+__all__ = ["NO_VECTORS", "PAGE", "SCENE_CONTROLS", "VECTOR_CONTROLS"]
 
 SCENE_CONTROLS = (
     '<div class="controls"><label>View <select id="scene-view"></select></label>'
@@ -18,13 +18,6 @@ NO_VECTORS = (
     "<section>\n<h2>Residuals in single images</h2>\n"
     "<p>No image has observations, so there is nothing to draw.</p>\n</section>"
 )
-RIG = """<section>
-<h2>Rig</h2>
-{table}
-<p class="caption">Numbers of the rig that were estimated with all else. Where sigma is that of the prior, the
-images said nothing of the entry.</p>
-</section>
-"""
 PAGE = (
     HEAD
     + """{verdict}{warnings}
@@ -39,7 +32,7 @@ PAGE = (
 </div>
 {mosaics}{vectors}
 {corrections}
-{cross_validation}
+{rig}{cross_validation}
 <section>
 <h2>Observations</h2>
 {observations}
@@ -58,12 +51,13 @@ Those that came back were set aside while the geometry was still rough.</p>
 <p class="caption">Shift and turn count from the pose that the input gave; roll, pitch and heading are turns
 about the mast's x (forward), y (left) and z (up) axes.</p>
 </section>
-{rig}<section class="notes">
+<section class="notes">
 <h2>How to read this</h2>
 <ul>
 <li>Sigmas and ellipses are <em>formal</em>: they follow from the noise assumed for pixels, pointing and
-positions, with the terrain points free, and know nothing of errors in the camera calibration or of wrong
-matches. Real errors can be several times larger; a cross-validation shows how much larger.</li>
+positions, with the terrain points free. Where the rig was estimated they know how uncertain it is, as far as
+the prior says. Of wrong matches, and of errors of lenses that no number of the rig describes, they know
+nothing. A cross-validation checks them.</li>
 <li>“Before” is the state from which the adjustment started, with points triangulated there;
 “after” is its result, over the same observations.</li>
 <li>A residual is projected minus measured, in pixels of the raw image; u runs right, v down, and (0, 0) is

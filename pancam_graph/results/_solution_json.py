@@ -4,20 +4,22 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import gtsam
 import numpy as np
 from pydantic import Field
 
 from pancam_graph.base.geometry import FloatArray, IntArray
-from pancam_graph.data import Incremental, Solution, Verdict, VerdictTest
+from pancam_graph.data import ENTRIES, Flex, Incremental, Solution, Verdict, VerdictTest, flex_of
 from pancam_graph.io import (
     SOLUTION_FORMAT,
     VERSION,
     AnyCamera,
     Entry,
+    Label,
     PoseEntry,
+    SparseEntry,
     camera_entry,
     read_json,
     validated,
@@ -62,14 +64,37 @@ class SolvedStopEntry(Entry):
     """6 x 6, rotation first, body frame; 0 for a held stop, null where unknown."""
 
 
-class SolvedFrameEntry(Entry):
+class FlexEntry(Entry):
+    """An entry of the flex of all frames: as told, and as found."""
+
+    entry: str
+    sigma: float
+    rms: float
+    largest: float
+    frame: Label
+    """The frame with the largest value."""
+
+
+class RigTreatmentEntry(Entry):
+    """What became of the rig's uncertainty."""
+
+    treatment: Literal["estimated", "held", "considered"]
+    flex: list[FlexEntry]
+    """Empty where heads were taken to sit firmly."""
+
+
+class SolvedFrameEntry(SparseEntry):
     """Angles of a frame with their formal standard deviations; null where not finite."""
+
+    _OPTIONAL: ClassVar = frozenset({"flex"})
 
     id: str
     pan_rad: float | None
     tilt_rad: float | None
     sigma_pan_rad: float | None
     sigma_tilt_rad: float | None
+    flex: dict[str, float] | None = None
+    """How its head stands off the rigid mast, by entry; the key is missing where heads sit firmly."""
 
 
 class SolvedImageEntry(Entry):
@@ -169,6 +194,8 @@ class SolutionFile(Entry):
     """As the cameras of a rig in `traverse.json`, refined where an eye has one correction for all images."""
     method: str = "joint"
     """The key is missing where it was joint."""
+    rig: RigTreatmentEntry | None = None
+    """The key is missing in files of older versions."""
     refined: list[RefinedEntry] = Field(default_factory=list)
     """Entries of the rig that were free; no such key where none was."""
     warnings: list[str]
@@ -189,6 +216,7 @@ def solution_json(solution: Solution) -> bytes:
     missing = {
         "method": solution.method == "joint",
         "verdict": solution.verdict is None,
+        "rig": solution.treatment is None,
         "refined": not solution.refined,
         "cross_validation": solution.cross_validation is None,
         "incremental": solution.incremental is None,
@@ -206,6 +234,7 @@ def solution_file(solution: Solution) -> SolutionFile:
             traverse.stops, final.world_T_mast, solution.stop_covariance, strict=True
         )
     ]
+    flex = flex_of(solution)
     frames = [
         SolvedFrameEntry(
             id=frame.id,
@@ -213,9 +242,10 @@ def solution_file(solution: Solution) -> SolutionFile:
             tilt_rad=_number(angles[1]),
             sigma_pan_rad=_number(sigmas[0]),
             sigma_tilt_rad=_number(sigmas[1]),
+            flex=_flex_of_frame(solution, row, flex),
         )
-        for frame, angles, sigmas in zip(
-            traverse.frames, final.pan_tilt_rad, solution.angle_sigma_rad, strict=True
+        for row, (frame, angles, sigmas) in enumerate(
+            zip(traverse.frames, final.pan_tilt_rad, solution.angle_sigma_rad, strict=True)
         )
     ]
     seconds, validation = solution.seconds, solution.cross_validation
@@ -243,6 +273,15 @@ def solution_file(solution: Solution) -> SolutionFile:
         frames=frames,
         images=_images(solution),
         cameras=[camera_entry(e) for e in solution.rig.eyes],
+        rig=None
+        if solution.treatment is None
+        else RigTreatmentEntry(
+            treatment=solution.treatment,
+            flex=[
+                FlexEntry(entry=f.entry, sigma=f.sigma, rms=f.rms, largest=f.largest, frame=f.frame)
+                for f in flex
+            ],
+        ),
         refined=[
             RefinedEntry(
                 quantity=r.quantity,
@@ -263,6 +302,14 @@ def solution_file(solution: Solution) -> SolutionFile:
         cross_validation=None if validation is None else CrossValidationEntry.of(validation, traverse),
         incremental=None if solution.incremental is None else IncrementalEntry.of(solution.incremental),
     )
+
+
+def _flex_of_frame(solution: Solution, row: int, flex: tuple[Flex, ...]) -> dict[str, float] | None:
+    """The flex of one frame by entry; None where heads sit firmly."""
+    rig = solution.final.rig
+    if not flex or rig is None or rig.flex is None:
+        return None
+    return {f.entry: float(rig.flex[row, ENTRIES["flex"].index(f.entry)]) for f in flex}
 
 
 def _images(solution: Solution) -> list[SolvedImageEntry]:

@@ -7,6 +7,7 @@ from pancam_graph.solve._fit import fit as fit
 from pancam_graph.solve._fit import fitted_elsewhere as fitted_elsewhere
 from pancam_graph.solve._graph import build_graph as build_graph
 from pancam_graph.solve._graph import graph_keys as graph_keys
+from pancam_graph.solve._held_rig import residuals_with_rig_held as residuals_with_rig_held
 from pancam_graph.solve._judge import Judged as Judged
 from pancam_graph.solve._judge import judge as judge
 from pancam_graph.solve._judge import reduced_of as reduced_of

@@ -115,10 +115,11 @@ def test_program_prints_what_was_thrown_away_and_why(
 
 
 def test_rig_table_says_what_was_free(solution: Solution, page: str) -> None:
-    assert "<h2>Rig</h2>" not in page
+    head = "What the pictures say of the camera"
+    assert head not in page
     common: dict[str, Any] = {"stop": None, "image": None, "sigma": 1e-3, "prior_sigma": np.inf}
     entries = (
-        Refined(quantity="calibration", entry="focal", camera="<left>", nominal=1.0, change=2e-3, **common),
+        Refined(quantity="calibration", entry="focal", camera="left", nominal=1.0, change=2e-3, **common),
         Refined(quantity="mounts", entry="rx_rad", camera="<left>", nominal=0.0, change=0.1, **common),
         Refined(
             quantity="radius",
@@ -135,12 +136,34 @@ def test_rig_table_says_what_was_free(solution: Solution, page: str) -> None:
     )
     page = make_page(replace(solution, refined=entries))
     text = parsed(page).text
-    assert "Rig" in text
-    rows = re.findall(r"<tr>(.*?)</tr>", page[page.index("<h2>Rig</h2>") :])[1:5]
+    assert head in text
+    rows = re.findall(r"<tr[^>]*>(.*?)</tr>", page[page.index(f"<h2>{head}</h2>") :])[1:5]
     found = [[unescape(cell) for cell in re.findall(r"<td[^>]*>(.*?)</td>", row)] for row in rows]
+    fx = solution.traverse.rig.pinholes[0].fx_px
+    dash = "\N{EN DASH}"
+    none = [dash, dash]
     assert found == [
-        ["calibration", "<left>", "focal", "", "1.000000", "0.002000", "0.001000", "none"],
-        ["mounts", "<left>", "rx", "°", "0.0000", "5.7296", "0.0573", "none"],
-        ["radius", "im1", "radius", "mm", "250.00", "-2.00", "\N{EN DASH}", "5.00"],
-        ["calibration", "all", "cx", "px", "differs", "1.500", "0.001", "none"],
+        [
+            "left lens",
+            "focal length",
+            "px",
+            f"{fx:.3f}",
+            "none",
+            f"{1.002 * fx:.3f}",
+            f"{1e-3 * fx:.3f}",
+            *none,
+        ],
+        ["<left> mount", "turn about x", "mrad", "0.0000", "none", "100.0000", "1.0000", *none],
+        [
+            "im1 circle",
+            "radius of its circle",
+            "mm",
+            "250.000",
+            "5.000",
+            "248.000",
+            none[0],
+            "-0.40",
+            none[0],
+        ],
+        ["lens", "principal point u", "px", "differs", "none", "1.500", "0.001", *none],
     ]
