@@ -2,7 +2,8 @@
 
 One module a factor: `mast` (pan-tilt chain, 6 rows), `mast_projection` (a point seen from a rigid mast, 2
 rows), `camera_projection` (a point seen by a camera that is no pinhole, 2 rows), `circle` (thesis eq. 4.8, 3
-rows), `projective` (projection matrix, 12 rows), `joint_prior` (vectors with correlated errors). Factors that
+rows), `projective` (projection matrix, 12 rows), `joint_prior` (vectors with correlated errors), `encoder`
+(angles and their readings). Factors that
 GTSAM has (priors of one variable, projections of a pinhole) are taken from GTSAM.
 """
 
@@ -16,6 +17,8 @@ from pancam_graph.factors.camera_projection import camera_projection_residual as
 from pancam_graph.factors.circle import CircleOffset as CircleOffset
 from pancam_graph.factors.circle import circle_factor as circle_factor
 from pancam_graph.factors.circle import circle_residual as circle_residual
+from pancam_graph.factors.encoder import encoder_factor as encoder_factor
+from pancam_graph.factors.encoder import encoder_residual as encoder_residual
 from pancam_graph.factors.joint_prior import conditional_prior_factor as conditional_prior_factor
 from pancam_graph.factors.joint_prior import conditional_prior_residual as conditional_prior_residual
 from pancam_graph.factors.joint_prior import joint_prior_factor as joint_prior_factor

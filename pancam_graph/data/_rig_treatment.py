@@ -13,7 +13,7 @@ RigTreatment = Literal["estimated", "held", "considered"]
 counts as exact; "considered": the rig is not moved, but its uncertainty is in every sigma. A frame's flex is
 no number of the rig: it is estimated with the frame's pan and tilt, unless the rig is held."""
 
-_SCOPE: Mapping[Quantity, Scope] = {"pan_T_tilt": "all", "flex": "frame"}
+_SCOPE: Mapping[Quantity, Scope] = {"pan_T_tilt": "all", "flex": "frame", "encoders": "all"}
 """Who shares a correction, where it is not the images of an eye."""
 
 
@@ -24,7 +24,9 @@ def sharing_within(uncertainty: RigUncertainty, model: str) -> Sharing:
     """
     u, mast = uncertainty, model == "mast"
     shifts = dict.fromkeys(ENTRIES["flex"][1:], u.flex_m)
+    scales = {"pan_scale": u.pan_scale, "tilt_scale": u.tilt_scale}
     return Sharing(
+        encoders=_freedom("encoders", scales) if mast else FIXED,
         flex=_freedom("flex", {"twist_rad": u.flex_rad} | shifts) if mast else FIXED,
         calibration=FIXED if model == "projective" else _of_rig("calibration", u),
         mounts=_of_rig("mounts", u) if mast else FIXED,

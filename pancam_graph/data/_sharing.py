@@ -28,7 +28,7 @@ Scope = Literal["fixed", "all", "eye", "stop", "image", "frame"]
 of an eye, "stop" the images of an eye at a stop, "image" each image alone. `pan_T_tilt` belongs to no eye:
 "all" is one for the traverse, "stop" one per stop. `flex` has one for each "frame"."""
 
-Quantity = Literal["calibration", "mounts", "pan_T_tilt", "radius", "flex"]
+Quantity = Literal["calibration", "mounts", "pan_T_tilt", "radius", "flex", "encoders"]
 
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 ENTRIES: Mapping[Quantity, tuple[str, ...]] = {
@@ -37,10 +37,12 @@ ENTRIES: Mapping[Quantity, tuple[str, ...]] = {
     "pan_T_tilt": POSE_ENTRIES,
     "radius": ("radius_m",),
     "flex": ("twist_rad", "forward_m", "left_m", "up_m"),
+    "encoders": ("pan_scale", "tilt_scale"),
 }
 """Names of the entries of each quantity. `calibration` has two more: `focal`, a common factor on fx and fy,
 and `aspect`, a factor on fy alone, so that priors of the two are independent. Entries of a pose are a
-rotation vector and a shift in the pose's own frame (geometry.corrected_poses)."""
+rotation vector and a shift in the pose's own frame (geometry.corrected_poses). Those of `encoders` are what
+angles exceed their readings by, as shares."""
 
 _SCOPES: Mapping[Quantity, tuple[Scope, ...]] = {
     "calibration": ("fixed", "all", "eye", "stop", "image"),
@@ -48,6 +50,7 @@ _SCOPES: Mapping[Quantity, tuple[Scope, ...]] = {
     "pan_T_tilt": ("fixed", "all", "stop"),
     "radius": ("fixed", "all", "eye", "stop", "image"),
     "flex": ("fixed", "frame"),
+    "encoders": ("fixed", "all"),
 }
 _JOINT: Mapping[Quantity, tuple[Scope, ...]] = {
     "calibration": ("fixed", "eye"),
@@ -55,6 +58,7 @@ _JOINT: Mapping[Quantity, tuple[Scope, ...]] = {
     "pan_T_tilt": ("fixed", "all"),
     "radius": _SCOPES["radius"],
     "flex": _SCOPES["flex"],
+    "encoders": _SCOPES["encoders"],
 }
 """Scopes with which a covariance of the rig says what its entries are about."""
 _WHY_NOT: Mapping[tuple[str, str], str] = {
@@ -68,12 +72,14 @@ _MODELS: Mapping[Quantity, tuple[str, ...]] = {
     "pan_T_tilt": ("mast",),
     "radius": ("circle",),
     "flex": ("mast",),
+    "encoders": ("mast",),
 }
 _OTHERWISE: Mapping[tuple[str, str], str] = {
     ("mounts", "circle"): "whose cameras turn freely and whose centres hang on circles",
     ("mounts", "free"): "whose cameras hang on no mount",
     ("pan_T_tilt", "circle"): "whose cameras turn freely and whose centres hang on circles",
     ("pan_T_tilt", "free"): "whose cameras hang on no axis",
+    **{("encoders", model): "whose cameras turn freely" for model in ("circle", "free", "projective")},
     ("radius", "mast"): "whose circles follow from its mounts",
     ("radius", "free"): "whose cameras run on no circle",
     ("flex", "circle"): "whose cameras turn freely",
@@ -104,6 +110,8 @@ _DEFAULT_SIGMA = {
     # Our stated assumption for a mast that stands on its rover.
     "twist_rad": 2e-4,
     **dict.fromkeys(("forward_m", "left_m", "up_m"), 1e-4),
+    # Our stated assumption for servos and potentiometers.
+    **dict.fromkeys(("pan_scale", "tilt_scale"), 1e-2),
 }
 """Standard deviations of the priors; entries in pixels as shares of the focal length, factors as shares."""
 
@@ -162,6 +170,8 @@ class Sharing:
     """How each frame's head stands off the rigid mast: turned about its forward axis (`twist_rad`), and
     shifted along its own axes; model `mast` with a hard tie. Its pan and tilt are those of the head as it
     stood, whose priors are widened by the sigma of the twist."""
+    encoders: Freedom = FIXED
+    """Scale of the pans and tilts that telemetry reads, one for the traverse; model `mast`."""
     covariance: RigCovariance | None = None
     """Joint covariance of the priors of those entries that it names, in place of their sigmas; then
     calibrations and mounts are of an eye, the tilt axis of all. None: all are independent."""
@@ -183,6 +193,7 @@ class Sharing:
             ("pan_T_tilt", self.pan_T_tilt),
             ("radius", self.radius),
             ("flex", self.flex),
+            ("encoders", self.encoders),
         ]
         return [(quantity, freedom) for quantity, freedom in freedoms if freedom is not None]
 

@@ -37,6 +37,8 @@ class RigCorrection:
     flex: FloatArray | None = None
     """(frames, 4) turn of each frame's head about its forward axis, radians, and shift along its own axes,
     metres; None where the mast is rigid."""
+    encoders: FloatArray | None = None
+    """(stops, 2) what pans and tilts exceed their readings by, as shares; None where these are exact."""
 
     @staticmethod
     def to_calibrations(traverse: Traverse, calibration: FloatArray) -> "RigCorrection":
@@ -57,6 +59,7 @@ class RigCorrection:
             pan_T_tilt=self.pan_T_tilt[stops],
             radius_m=self.radius_m[images],
             flex=None if self.flex is None else self.flex[frames],
+            encoders=None if self.encoders is None else self.encoders[stops],
         )
 
     def calibration(self, traverse: Traverse) -> FloatArray:

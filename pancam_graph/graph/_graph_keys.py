@@ -22,6 +22,7 @@ _CALLED: dict[Quantity, str] = {
     "mounts": "mount",
     "pan_T_tilt": "tilt axis",
     "radius": "radius",
+    "encoders": "encoders",
 }
 
 
@@ -92,6 +93,10 @@ class GraphKeys:
     def tilt_axis(self, *, stop: str | None = None) -> int:
         """Key of the free entries of the tilt axis (`pan_T_tilt`); see `calibration`."""
         return self._rig_key("pan_T_tilt", None, stop, None)
+
+    def encoders(self) -> int:
+        """Key of the free entries of the scale of pans and tilts. Raises InputError where it is fixed."""
+        return self._rig_key("encoders", None, None, None)
 
     def radius(self, camera: str | None = None, *, stop: str | None = None, image: str | None = None) -> int:
         """Key of the radius of a camera's circle (model `circle`); see `calibration`."""
@@ -164,9 +169,9 @@ class GraphKeys:
     def _sites(
         self, quantity: Quantity, camera: str | None, stop: str | None, image: str | None
     ) -> BoolArray:
-        """Mask of the images (of pan_T_tilt: stops) of a camera, of a stop, or of one image."""
+        """Mask of the images (of pan_T_tilt and encoders: stops) of a camera, of a stop, or of one image."""
         t = self._traverse
-        axis = quantity == "pan_T_tilt"
+        axis = quantity in {"pan_T_tilt", "encoders"}
         sites = np.ones(len(t.stops if axis else t.images), dtype=bool)
         for what, wanted, names, of_site in (
             ("camera", camera, [eye.name for eye in t.rig.eyes], t.image_eye),

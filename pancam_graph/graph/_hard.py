@@ -50,7 +50,7 @@ class HardTemplate(FactorTemplate):
     """The rigid mast: world_T_camera = world_T_mast . Rz(pan) . pan_T_tilt . Ry(-tilt) . head_T_camera."""
 
     def __init__(self, traverse: Traverse, sharing: Sharing | None = None) -> None:
-        """Of `sharing`, calibration, mounts, pan_T_tilt and flex count; circles follow from the mounts."""
+        """Of `sharing` all but the radius counts; circles follow from the mounts."""
         super().__init__(traverse, "mast", replace(sharing or Sharing(), radius=FIXED))
         sigmas = np.array([[f.sigma_pan_rad, f.sigma_tilt_rad] for f in traverse.frames]).reshape(-1, 2)
         self._sigmas = sigmas
@@ -261,8 +261,7 @@ class HardTemplate(FactorTemplate):
         frames = self._frames[stop]
         if not len(frames):
             return []
-        measured = self.traverse.pan_tilt_rad[frames].ravel()
-        return [gtsam.PriorFactorVector(self.angles_key(stop), measured, self.angle_noise(stop, frames))]
+        return [self.angle_prior(frames, self.angle_noise(stop, frames), [self.angles_key(stop)])]
 
     def values(self, state: State) -> gtsam.Values:
         """The variables at a state."""

@@ -29,6 +29,8 @@ class Kind(Enum):
     """Free entries of a correction of a mount, `head_T_camera` (vector)."""
     TILT_AXIS = "T"
     """Free entries of a correction of a tilt axis, `pan_T_tilt` (vector)."""
+    ENCODERS = "S"
+    """Free entries of the scale of pans and tilts over their readings (vector)."""
     RADIUS = "R"
     """Radius of an eye's circle, metres (number)."""
     NATIVE_CALIBRATION = "C"

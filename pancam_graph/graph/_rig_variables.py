@@ -1,7 +1,8 @@
 """The free entries of a rig as variables: one vector for each owner (thesis 4.3, 5.4).
 
-Variables: `K` calibration, `E` mount (`head_T_camera`), `T` tilt axis (`pan_T_tilt`): vectors of corrections
-to the values of the rig, with free entries alone; `R` radius of a circle (double).
+Variables: `K` calibration, `E` mount (`head_T_camera`), `T` tilt axis (`pan_T_tilt`), `S` scale of pan and
+tilt: vectors of corrections to the values of the rig, with free entries alone; `R` radius of a circle
+(double).
 """
 
 from collections.abc import Mapping, Sequence
@@ -42,7 +43,12 @@ _KIND: Mapping[Quantity, Kind] = {
     "mounts": Kind.MOUNT,
     "pan_T_tilt": Kind.TILT_AXIS,
     "radius": Kind.RADIUS,
+    "encoders": Kind.ENCODERS,
 }
+_OF_STOPS: frozenset[Quantity] = frozenset({"pan_T_tilt", "encoders"})
+"""Quantities that belong to no eye: a stop, not an image, is a site of theirs."""
+_FACTORS = {FOCAL, ASPECT, *ENTRIES["encoders"]}
+"""Entries whose value in the rig is 1."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -61,7 +67,7 @@ class RigVariable:
     stop: int | None
     image: int | None
     first: int
-    """Row of the first image (of pan_T_tilt: stop) that has it"""
+    """Row of the first image (of pan_T_tilt and encoders: stop) that has it"""
     nominal: tuple[float | None, ...]
     """(entries,) values of the rig; None where these differ among the images that share the variable"""
 
@@ -69,7 +75,7 @@ class RigVariable:
 class RigVariables:
     """The free entries of a traverse's rig as variables, and the cameras at their values.
 
-    Corrections of calibration, mounts and radius are per image, those of pan_T_tilt per stop.
+    Corrections of calibration, mounts and radius are per image, those of pan_T_tilt and encoders per stop.
     """
 
     def __init__(self, traverse: Traverse, sharing: Sharing) -> None:
@@ -93,8 +99,8 @@ class RigVariables:
         entries, scope, t = freedom.entries(quantity), freedom.scope, self.traverse
         if not entries:
             return ()
-        axis = quantity == "pan_T_tilt"
-        eye, stop = (None, np.arange(len(t.stops))) if axis else (t.image_eye, t.image_stop)
+        no_eye = quantity in _OF_STOPS
+        eye, stop = (None, np.arange(len(t.stops))) if no_eye else (t.image_eye, t.image_stop)
         n_sites = len(stop)
         owner = np.zeros(n_sites, dtype=np.int64)
         if scope == "image":
@@ -110,8 +116,8 @@ class RigVariables:
         out = []
         for i, (number, first) in enumerate(zip(numbers, firsts, strict=True)):
             of_owner = place == i
-            eye_of_all = None if axis or scope == "all" else int(t.image_eye[first])
-            focal = 1.0 if axis else self._focal_px(eye_of_all)
+            eye_of_all = None if no_eye or scope == "all" else int(t.image_eye[first])
+            focal = 1.0 if no_eye else self._focal_px(eye_of_all)
             key = key_of(_KIND[quantity], int(number))
             sigma = np.array([self._own_sigma(quantity, e, eye_of_all) for e in entries])
             if self.sharing.covariance is not None:
@@ -158,7 +164,7 @@ class RigVariables:
         """(sites, columns) values of the rig of the free entries; 0 for an entry that is a correction."""
         out: FloatArray = np.zeros((n_sites, len(free)))
         for j, entry in enumerate(free):
-            if entry in {FOCAL, ASPECT}:
+            if entry in _FACTORS:
                 out[:, j] = 1.0
             elif quantity == "calibration":
                 row, column = (at[ENTRIES[quantity].index(entry)] for at in CALIBRATION_ENTRIES)
@@ -196,7 +202,7 @@ class RigVariables:
         return self.of[quantity][int(self._place[quantity][site])] if self.of[quantity] else None
 
     def place(self, quantity: Quantity) -> IntArray:
-        """(images,), of pan_T_tilt (stops,): place of each one's variable among `of[quantity]`."""
+        """(images,), of what has no eye (stops,): place of each one's variable among `of[quantity]`."""
         return self._place[quantity]
 
     def basis(self, quantity: Quantity) -> FloatArray:
@@ -227,10 +233,8 @@ class RigVariables:
         """Corrections (images, entries), of pan_T_tilt (stops, entries); 0 for held entries."""
         variables = self.of[quantity]
         if not variables:
-            axis = quantity == "pan_T_tilt"
-            return np.zeros(
-                (len(self.traverse.stops if axis else self.traverse.images), len(ENTRIES[quantity]))
-            )
+            sites = self.traverse.stops if quantity in _OF_STOPS else self.traverse.images
+            return np.zeros((len(sites), len(ENTRIES[quantity])))
         if quantity == "radius":
             corrections = np.array([[values.atDouble(v.key) - self.reference_radius_m(v)] for v in variables])
         else:
@@ -246,6 +250,7 @@ class RigVariables:
             mount=self._read("mounts", values),
             pan_T_tilt=self._read("pan_T_tilt", values),
             radius_m=self._read("radius", values)[:, 0],
+            encoders=self._read("encoders", values) if self.of["encoders"] else None,
         )
 
     def insert(self, values: gtsam.Values, given: RigCorrection | None) -> None:
@@ -279,7 +284,7 @@ class RigVariables:
     def _entries_of(self, key: int) -> list[RigEntry]:
         """The numbers of the rig that a variable of an eye, or of the tilt axis, corrects."""
         quantity = next(q for q, kind in _KIND.items() if kind is kind_of(key))
-        camera = None if quantity == "pan_T_tilt" else self.traverse.rig.eyes[index_of(key)].name
+        camera = None if quantity in _OF_STOPS else self.traverse.rig.eyes[index_of(key)].name
         freedom: Freedom = getattr(self.sharing, quantity)
         return [RigEntry(quantity, camera, entry) for entry in freedom.entries(quantity)]
 
@@ -295,7 +300,7 @@ class RigVariables:
     def _own_sigma(self, quantity: str, entry: str, eye: int | None) -> float:
         """Sigma of the prior of an entry by itself, whatever the covariance says."""
         freedom: Freedom = getattr(self.sharing, quantity)
-        focal = 1.0 if quantity == "pan_T_tilt" else self._focal_px(eye)
+        focal = 1.0 if quantity in _OF_STOPS else self._focal_px(eye)
         return float(freedom.sigma.get(entry, default_sigma(entry, focal)))
 
     def joint_priors(self, new: Sequence[int], known: Sequence[int]) -> list[gtsam.NonlinearFactor]:
@@ -458,21 +463,22 @@ class RigVariables:
     def start_error(self) -> tuple[FloatArray, FloatArray]:
         """Initial error of each image's camera, one sigma: pixels (images,), metres (images,).
 
-        It follows from the priors of calibration, mounts and pan_T_tilt; an entry without a prior counts with
-        the default sigma.
+        It follows from the priors of calibration, mounts, pan_T_tilt and encoders; an entry without a prior
+        counts with the default sigma.
         """
         t, focal = self.traverse, self._K[:, 0, 0]
         half = np.array([max(e.camera.width_px, e.camera.height_px) / 2 for e in t.rig.eyes])[t.image_eye]
         one = np.ones(len(focal))
         # Motion of pixels by a unit of an entry; by one of a calibration, at the edge of the image.
-        weight = {"cx_px": one, "cy_px": one, FOCAL: half, ASPECT: half} | dict.fromkeys(
-            ENTRIES["mounts"][:3], focal
-        )
+        farthest = np.abs(t.pan_tilt_rad).max(axis=0, initial=0.0)
+        weight = {"cx_px": one, "cy_px": one, FOCAL: half, ASPECT: half}
+        weight |= {"pan_scale": focal * farthest[0], "tilt_scale": focal * farthest[1]}
+        weight |= dict.fromkeys(ENTRIES["mounts"][:3], focal)
         square_px, square_m = np.zeros(len(t.images)), np.zeros(len(t.images))
         for v in self.variables:
-            if v.quantity == "radius":  # calibration, mounts and pan_T_tilt alone count
+            if v.quantity == "radius":  # calibration, mounts, axes and encoders alone count
                 continue
-            place = self._place[v.quantity][t.image_stop if v.quantity == "pan_T_tilt" else slice(None)]
+            place = self._place[v.quantity][t.image_stop if v.quantity in _OF_STOPS else slice(None)]
             of_variable = np.array([other is v for other in self.of[v.quantity]])[place]
             for entry, known in zip(v.entries, np.where(np.isfinite(v.sigma), v.sigma, v.usual), strict=True):
                 if entry.endswith("_m"):
@@ -488,6 +494,9 @@ def _of(correction: RigCorrection, quantity: Quantity) -> FloatArray:
         "mounts": correction.mount,
         "pan_T_tilt": correction.pan_T_tilt,
         "radius": correction.radius_m[:, None],
+        "encoders": np.zeros((len(correction.pan_T_tilt), 2))
+        if correction.encoders is None
+        else correction.encoders,
     }[quantity]
 
 

@@ -27,7 +27,6 @@ from pancam_graph.factors import (
     Key,
     Slot,
     circle_factor,
-    joint_prior_factor,
     mast_factor,
 )
 from pancam_graph.graph._factors import FactorList
@@ -139,15 +138,10 @@ class SoftTemplate(FactorTemplate):
         t = self.traverse
         free = [f for f in np.flatnonzero(t.frame_stop == stop) if isinstance(self.pan_tilt(int(f)), Key)]
         frames = np.array(free, dtype=np.int64)
-        if len(frames) and self.let_go.common_rad[stop].any():
-            keys = [Key(key_of(Kind.ANGLES, int(f))) for f in frames]
-            measured = t.pan_tilt_rad[frames].ravel()
-            return [joint_prior_factor(self.angle_noise(stop, frames), keys, measured)]
+        common = bool(self.let_go.common_rad[stop].any())
         return [
-            gtsam.PriorFactorVector(
-                key_of(Kind.ANGLES, int(f)), t.pan_tilt_rad[f], self.angle_noise(stop, np.array([f]))
-            )
-            for f in frames
+            self.angle_prior(some, self.angle_noise(stop, some), [key_of(Kind.ANGLES, int(f)) for f in some])
+            for some in ([frames] if common and len(frames) else frames[:, None])
         ]
 
     def flex_factors(self, stop: int) -> FactorList:

@@ -13,7 +13,7 @@ from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.cameras import LensTable
 from pancam_graph.data import Refined, RigCorrection, Sharing, State, Traverse
 from pancam_graph.elimination import Covariance, JointCovariance, Linkage, PosePlace, Posture, Root
-from pancam_graph.factors import Fixed, Key, Slot
+from pancam_graph.factors import Fixed, Key, Slot, encoder_factor, joint_prior_factor
 from pancam_graph.graph._factors import FactorList, Factors
 from pancam_graph.graph._given import GivenFactor, Seat, seated
 from pancam_graph.graph._graph_keys import GraphKeys
@@ -220,6 +220,34 @@ class FactorTemplate(ABC):
         if covariance is None:
             return diagonal_noise(self.let_go.widened(stated, extra).ravel())
         return gtsam.noiseModel.Gaussian.Covariance(covariance)
+
+    def angle_prior(
+        self,
+        frames: IntArray,
+        noise: gtsam.noiseModel.Base,
+        angles: Sequence[int],
+        encoders: Slot | None = None,
+    ) -> gtsam.NonlinearFactor:
+        """What telemetry reads of the pan and tilt of frames, which variables have one after the other.
+
+        `encoders` is the slot of the scale of readings, where it is free; default: this template's variable.
+        """
+        reading = self.traverse.pan_tilt_rad[frames].ravel()
+        if not self.rig_variables.of["encoders"]:
+            if len(angles) == 1:
+                return gtsam.PriorFactorVector(angles[0], reading, noise)
+            return joint_prior_factor(noise, [Key(key) for key in angles], reading)
+        (scale,) = self.rig_variables.of["encoders"]
+        joint = np.tile(np.arange(2), len(frames))
+        moved = np.where(self.angle_sigmas_rad[frames].ravel() > 0, reading, 0.0)  # a held angle is exact
+        by_joint = moved[:, None] * np.eye(2)[joint]
+        return encoder_factor(
+            noise,
+            encoders or Key(scale.key),
+            [Key(key) for key in angles],
+            reading=reading,
+            by_scale=by_joint @ self.rig_variables.basis("encoders")[0],
+        )
 
     def flex_factors(self, stop: int) -> FactorList:
         """The prior of how a stop's heads stand off the rigid mast; none here."""

@@ -90,6 +90,8 @@ class UncertaintyEntry(SparseEntry):
     tilt_axis_m: float | None = None
     flex_rad: float | None = None
     flex_m: float | None = None
+    pan_scale: float | None = None
+    tilt_scale: float | None = None
     source: Text | None = None
     covariance: CovarianceEntry | None = None
 
@@ -217,6 +219,7 @@ class SharingEntry(Entry):
     pan_T_tilt: FreedomEntry | None = None
     radius: FreedomEntry | None = None
     flex: FreedomEntry | None = None
+    encoders: FreedomEntry | None = None
 
     def sharing(self) -> Sharing:
         """The sharing. Raises InputError for entries that contradict each other."""

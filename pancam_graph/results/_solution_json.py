@@ -110,7 +110,7 @@ class SolvedImageEntry(Entry):
 class RefinedEntry(Entry):
     """An entry of the rig that was free. Null: the entry has no such owner, or the number is not finite."""
 
-    quantity: Literal["calibration", "mounts", "pan_T_tilt", "radius", "flex"]
+    quantity: Literal["calibration", "mounts", "pan_T_tilt", "radius", "flex", "encoders"]
     entry: str
     camera: str | None
     stop: str | None

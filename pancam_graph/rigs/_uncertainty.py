@@ -50,6 +50,12 @@ class RigUncertainty:
     the tilt axis and its forward axis."""
     flex_m: float = 0.0
     """Of each frame: how far the head stands shifted, along each of its own axes."""
+    pan_scale: float = 0.0
+    """Of the pan that the head turns over the pan that is read, as a share. Gears and encoders that count
+    whole turns have none; a servo or a potentiometer may be off by a percent. An offset of the readings is
+    a turn of the tilt axis (`tilt_axis_rad`): about z that of pans, about y that of tilts."""
+    tilt_scale: float = 0.0
+    """Of the tilt, likewise; tilts count from the horizon of the mast."""
     source: str = "our stated assumption for a calibrated rig"
     """Where the numbers come from."""
     covariance: RigCovariance | None = None

@@ -11,7 +11,7 @@ from pancam_graph.cameras import Camera
 from pancam_graph.data import Frame, Image, Observations, Stop, Traverse
 from pancam_graph.rigs import Rig
 from pancam_graph.simulate._simulation_options import DriveOptions
-from pancam_graph.simulate._wrong_rig import drawn_flex, drawn_rig, wrong_rig
+from pancam_graph.simulate._wrong_rig import drawn_encoders, drawn_flex, drawn_rig, wrong_rig
 
 __all__ = [
     "TelemetryStart",
@@ -162,7 +162,10 @@ def telemetry(
     pan_tilt_rad: FloatArray,
     rng: np.random.Generator,
 ) -> TelemetryStart:
-    """Truth with errors: gaussian in the tangent at each mast but the first, and in each angle."""
+    """Truth with errors: gaussian in the tangent at each mast but the first, and in each angle.
+
+    Where rigs are drawn with errors, so is the scale of what encoders read.
+    """
     sigmas = np.repeat([options.sigma_stop_rad, options.sigma_stop_m], 3)
     errors = sigmas * rng.standard_normal((len(world_T_mast), 6))
     errors[0] = 0.0
@@ -172,10 +175,10 @@ def telemetry(
         for i in range(1, len(said)):
             rounded = (said[i - 1] * world_T_mast[i - 1].between(said[i])).matrix()
             said[i] = gtsam.Pose3(gtsam.Rot3.ClosestTo(rounded[:3, :3]), rounded[:3, 3])
-    return TelemetryStart(
-        world_T_mast=tuple(said),
-        pan_tilt_rad=pan_tilt_rad + pointing * rng.standard_normal(pan_tilt_rad.shape),
-    )
+    read = pan_tilt_rad + pointing * rng.standard_normal(pan_tilt_rad.shape)
+    if options.rig_error == "drawn":
+        read = read / (1 + drawn_encoders(rig, rng))
+    return TelemetryStart(world_T_mast=tuple(said), pan_tilt_rad=read)
 
 
 def _pointing_sigma_rad(rig: Rig, options: DriveOptions) -> FloatArray:

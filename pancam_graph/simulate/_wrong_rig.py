@@ -8,7 +8,7 @@ import numpy as np
 from pancam_graph.base.geometry import FloatArray, corrected_poses, rz
 from pancam_graph.rigs import RIG_ENTRIES, Rig, RigEntry
 
-__all__ = ["drawn_flex", "drawn_rig", "wrong_rig"]
+__all__ = ["drawn_encoders", "drawn_flex", "drawn_rig", "wrong_rig"]
 
 
 def wrong_rig(
@@ -79,6 +79,12 @@ def drawn_flex(rig: Rig, n_frames: int, rng: np.random.Generator) -> FloatArray:
     """
     sigmas = np.repeat([rig.uncertainty.flex_rad, rig.uncertainty.flex_m], 3)
     return np.asarray(sigmas * rng.standard_normal((n_frames, 6)))
+
+
+def drawn_encoders(rig: Rig, rng: np.random.Generator) -> FloatArray:
+    """What pan and tilt (2,) exceed their readings by, as shares, as far as the rig's uncertainty says."""
+    sigmas = np.array([rig.uncertainty.pan_scale, rig.uncertainty.tilt_scale])
+    return np.asarray(sigmas * rng.standard_normal(2)) if sigmas.any() else sigmas
 
 
 def _corrected(pose: gtsam.Pose3, correction: FloatArray) -> gtsam.Pose3:

@@ -43,7 +43,7 @@ def local_priors(
     """Priors of a station's own variables while the others are held."""
     between = station.motion
     if previous is None or previous.mast is None or not isinstance(between, gtsam.BetweenFactorPose3):
-        return station.factors(firm=True)
+        return station.factors(firm=True, at=values)
     assert station.mast is not None  # `join` gives odometry to free masts only
     previous_mast = copied(values, [previous.mast])
     held = gtsam.PriorFactorPose3(
@@ -51,4 +51,4 @@ def local_priors(
         orthonormal(previous_mast.atPose3(previous.mast) * between.measured()),
         between.noiseModel(),
     )
-    return [held, *station.other_priors(firm=True)]
+    return [held, *station.other_priors(firm=True, at=values)]

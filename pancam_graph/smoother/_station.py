@@ -9,7 +9,7 @@ import numpy as np
 from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.data import Sharing, State, Traverse
 from pancam_graph.elimination import Linkage, Posture
-from pancam_graph.factors import Key
+from pancam_graph.factors import Fixed, Key
 from pancam_graph.graph import HardTemplate, Kind, diagonal_noise, index_of, key_of, kind_of, read_variable
 from pancam_graph.landmarks import CameraViews
 
@@ -106,11 +106,12 @@ class Station:
         local = self.local(values)
         return self.template.state(local, np.zeros((0, 3))).pan_tilt_rad
 
-    def factors(self, *, firm: bool) -> list[gtsam.NonlinearFactor]:
+    def factors(self, *, firm: bool, at: gtsam.Values | None = None) -> list[gtsam.NonlinearFactor]:
         """Priors of its own variables; odometry, if any, takes the place of the mast's prior.
 
         `firm`: components that telemetry holds (sigma 0) are constraints of the prior. Else their sigma in
-        the prior is 1, for callers who hold these components themselves.
+        the prior is 1, for callers who hold these components themselves. `at`: values of the whole drive at
+        which a scale of readings, which stops share, is held; None: it is a variable.
         """
         t, out = self.traverse, list[gtsam.NonlinearFactor]()
 
@@ -119,16 +120,19 @@ class Station:
         elif self.mast is not None:
             stop = t.stops[0]
             out.append(gtsam.PriorFactorPose3(self.mast, stop.world_T_mast, _noise(stop.sigmas, firm=firm)))
-        return out + self.other_priors(firm=firm)
+        return out + self.other_priors(firm=firm, at=at)
 
-    def other_priors(self, *, firm: bool) -> list[gtsam.NonlinearFactor]:
+    def other_priors(self, *, firm: bool, at: gtsam.Values | None = None) -> list[gtsam.NonlinearFactor]:
         """The priors of `factors` that are not on the mast."""
-        t, out = self.traverse, list[gtsam.NonlinearFactor]()
+        out = list[gtsam.NonlinearFactor]()
         sigmas = self.template.angle_sigmas_rad
         free = sigmas.any(axis=1)
         if free.any():
             noise = _noise(sigmas[free].ravel(), firm=firm)
-            out.append(gtsam.PriorFactorVector(self.angles, t.pan_tilt_rad[free].ravel(), noise))
+            scales = [self.global_key[v.key] for v in self.template.rig_variables.of["encoders"]]
+            slots = [Key(key) if at is None else Fixed(at.atVector(key)) for key in scales]
+            frames = np.flatnonzero(free)
+            out.append(self.template.angle_prior(frames, noise, [self.angles], *slots))
         for factor in self.template.flex_factors(0):
             out.append(factor.rekey([self.global_key[key] for key in factor.keys()]))  # noqa: SIM118  a gtsam factor
         return out + self._rig_priors(0)

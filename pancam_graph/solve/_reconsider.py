@@ -120,8 +120,9 @@ def _response(c: Correction, telemetry: Sequence[StopTelemetry], root: Root) -> 
         first, last = int(columns.min()), int(columns.max()) + 1
         inverse = root.inverse_columns(stop, slice(first, last))
         x += inverse[:, columns - first] @ right[rows]
+        if (by_shared := of[stop].by_shared) is not None:
+            x += root.inverse_columns(len(begin) - 2, slice(0, by_shared.shape[1])) @ (by_shared.T @ right)
     nothing = {one.stop: np.zeros(len(one.entry)) for one in telemetry}
     return {
-        one.stop: told.get(one.stop, nothing[one.stop]) - one.told(x[begin[one.stop] + one.column])
-        for one in telemetry
+        one.stop: told.get(one.stop, nothing[one.stop]) - one.told(one.moved(x, begin)) for one in telemetry
     }

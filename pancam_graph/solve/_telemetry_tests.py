@@ -60,8 +60,10 @@ class StopTelemetry:
     """(n,) of the prior, radians or metres."""
     whitening: FloatArray | None
     """(n, n) that turns errors of telemetry to unit variance; None where they are independent."""
+    by_shared: FloatArray | None
+    """(n, k) Jacobian of `correction` by all variables that stops share; None where it depends on none."""
     posterior: FloatArray
-    """(n, n) covariance of the solution."""
+    """(n, n) covariance of the solution, of the corrections."""
 
     @property
     def whitened(self) -> FloatArray:
@@ -90,6 +92,11 @@ class StopTelemetry:
         if self.whitening is None:
             return np.asarray((m.T / self.sigma).T)
         return np.asarray(self.whitening.T @ m)
+
+    def moved(self, x: FloatArray, begin: IntArray) -> FloatArray:
+        """(n,) changes of the corrections where all variables change by x; `begin` (groups + 1,)."""
+        own = x[begin[self.stop] + self.column]
+        return own if self.by_shared is None else np.asarray(own + self.by_shared @ x[begin[-2] : begin[-1]])
 
     def told(self, along: FloatArray) -> FloatArray:
         """S^-1 a of an error along a (n,), or of several (n, k)."""
@@ -198,24 +205,27 @@ def telemetry_of(problem: Problem, covariance: Covariance) -> list[StopTelemetry
     for factor in problem.factors.telemetry:
         keys = list(factor.keys())
         kinds = [kind_of(key) for key in keys]
-        if kinds != [Kind.MAST] and set(kinds) != {Kind.ANGLES}:
+        own = [key for key, kind in zip(keys, kinds, strict=True) if kind is not Kind.ENCODERS]
+        if kinds != [Kind.MAST] and set(map(kind_of, own)) != {Kind.ANGLES}:
             continue  # a motion between two stops
         assert isinstance(factor, gtsam.NoiseModelFactor)  # every prior is one
-        stop, entry, frame = _entries(template, keys)
+        stop, entry, frame = _entries(template, own)
         noise = factor.noiseModel()
         sigma = np.asarray(noise.sigmas())
         parts.setdefault(stop, []).append(
             _Prior(
                 entry=entry,
                 frame=frame,
-                column=np.concatenate([np.arange(c.start, c.stop) for c in map(link.columns_of, keys)]),
+                column=np.concatenate([np.arange(c.start, c.stop) for c in map(link.columns_of, own)]),
                 correction=np.asarray(factor.unwhitenedError(problem.values)),
                 sigma=sigma,
                 whitening=_correlated(noise),
+                by_shared=_by_shared(factor, problem) if len(own) < len(keys) else None,
             )
         )
     none = np.zeros(0, dtype=np.int64)
-    return [_of_stop(s, of_stop, held.get(s, none), covariance) for s, of_stop in sorted(parts.items())]
+    shared = link.n_groups - 1
+    return [_of_stop(s, of, held.get(s, none), covariance, shared) for s, of in sorted(parts.items())]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -228,7 +238,20 @@ class _Prior:
     correction: FloatArray
     sigma: FloatArray
     whitening: FloatArray | None
+    by_shared: FloatArray | None
     """As in `StopTelemetry`."""
+
+
+def _by_shared(factor: gtsam.NoiseModelFactor, problem: Problem) -> FloatArray:
+    """Jacobian (n, k) of a prior's residual by the k columns of what stops share."""
+    link, keys = problem.template.linkage, list(factor.keys())
+    jacobians = gtsam.JacobianVector([np.zeros((0, 0))] * len(keys))
+    residual = factor.unwhitenedError(problem.values, jacobians)
+    out = np.zeros((len(residual), int(link.dim[link.group == link.n_groups - 1].sum())))
+    for key, jacobian in zip(keys, jacobians, strict=True):
+        if kind_of(key) is Kind.ENCODERS:
+            out[:, link.columns_of(key)] = jacobian
+    return out
 
 
 def _correlated(noise: gtsam.noiseModel.Base) -> FloatArray | None:
@@ -238,8 +261,10 @@ def _correlated(noise: gtsam.noiseModel.Base) -> FloatArray | None:
     return np.asarray(noise.R())
 
 
-def _of_stop(stop: int, priors: Sequence[_Prior], held: IntArray, covariance: Covariance) -> StopTelemetry:
-    """All priors of a stop, without the `held` columns of its variables."""
+def _of_stop(
+    stop: int, priors: Sequence[_Prior], held: IntArray, covariance: Covariance, shared: int
+) -> StopTelemetry:
+    """All priors of a stop, without the `held` columns of its variables; `shared` is the last group."""
     column, sigma = (np.concatenate([getattr(p, name) for p in priors]) for name in ("column", "sigma"))
     free = np.flatnonzero(~np.isin(column, held))
     whitening = None
@@ -251,6 +276,13 @@ def _of_stop(stop: int, priors: Sequence[_Prior], held: IntArray, covariance: Co
         ]
         whitening = np.asarray(scipy.linalg.block_diag(*blocks)[np.ix_(free, free)])
     entry = [name for p in priors for name in p.entry]
+    posterior = covariance.block(stop, stop)[np.ix_(column[free], column[free])]
+    by_shared = None
+    if (k := max((p.by_shared.shape[1] for p in priors if p.by_shared is not None), default=0)) > 0:
+        parts = [np.zeros((len(p.entry), k)) if p.by_shared is None else p.by_shared for p in priors]
+        by_shared = np.concatenate(parts)[free]
+        cross = covariance.block(stop, shared)[column[free]] @ by_shared.T
+        posterior = posterior + cross + cross.T + by_shared @ covariance.block(shared, shared) @ by_shared.T
     return StopTelemetry(
         stop=stop,
         entry=tuple(entry[i] for i in free),
@@ -259,7 +291,8 @@ def _of_stop(stop: int, priors: Sequence[_Prior], held: IntArray, covariance: Co
         correction=np.concatenate([p.correction for p in priors])[free],
         sigma=sigma[free],
         whitening=whitening,
-        posterior=covariance.block(stop, stop)[np.ix_(column[free], column[free])],
+        by_shared=by_shared,
+        posterior=posterior,
     )
 
 
