@@ -68,7 +68,7 @@ def _rig_covariance(judged: Judged) -> RigCovariance | None:
     given = prepared.options.sharing or prepared.traverse.sharing
     if given is not None or prepared.options.rig != "estimated" or found is None:
         return None
-    if not template.rig_variables.variables:
+    if not template.rig_variables.keys:
         return None
     return template.rig_variables.rig_covariance(fitted.problem.values, found, template.linkage)
 
