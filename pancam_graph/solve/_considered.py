@@ -63,12 +63,13 @@ def with_rig(fitted: Fitted, problem: Problem) -> tuple[Problem, ReducedSystem] 
     rig, link = len(prepared.traverse.stops), wide.template.linkage
     spread = panels.copy().root().covariance().block(rig, rig)
     variables = wide.template.rig_variables
-    order = np.concatenate([np.arange(c.start, c.stop) for c in map(link.columns_of, variables.keys)])
     prior = np.zeros((len(spread), len(spread)))
     for v in variables.of_stop(None):
         columns = link.columns_of(v.key)
         prior[columns, columns] = np.diag(v.sigma**-2.0)
-    prior[np.ix_(order, order)] = variables.prior_information()
+    if variables.keys:  # which may hang together
+        order = np.concatenate([np.arange(c.start, c.stop) for c in map(link.columns_of, variables.keys)])
+        prior[np.ix_(order, order)] = variables.prior_information()
     own = panels.panel[rig][:, : len(spread)]
     upper = np.triu(own)
     # What is left of the rig's own block once all else is eliminated is the inverse of its covariance.
