@@ -4,7 +4,7 @@ A variable `K` of free entries becomes one `C` for each eye that shares it. A fa
 over and constrains the changes of `C` that `K` cannot make.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -77,13 +77,20 @@ class NativeCalibrations:
         """A template's factors, with those on `K` replaced by equivalent ones on `C`."""
         if not self.any:
             return gtsam.NonlinearFactorGraph(factors)
-        known = {n.variable.key for n in self._native}
-        graph = gtsam.NonlinearFactorGraph()
+        known = {n.variable.key: n for n in self._native}
+        graph, joint = gtsam.NonlinearFactorGraph(), set[int]()
         for i in range(factors.size()):
-            if known.isdisjoint(factors.at(i).keys()):
-                graph.push_back(factors.at(i))
+            factor = factors.at(i)
+            keys = list(factor.keys())
+            if known.keys().isdisjoint(keys):
+                graph.push_back(factor)
+            elif len(keys) > 1:  # a prior of several variables of the rig
+                graph.push_back(_through(factor, keys, known))
+                joint.update(known.keys() & set(keys))
         for n in self._native:
-            graph.push_back(_hold(n))
+            held = _hold(n, has_prior=n.variable.key not in joint)
+            if held is not None:
+                graph.push_back(held)
         return graph
 
     def seats(self, seats: Mapping[int, Seat]) -> dict[int, Seat]:
@@ -169,10 +176,46 @@ def _numbers(calibration: FloatArray) -> tuple[float, float, float, float, float
     return float(k[0, 0]), float(k[1, 1]), float(k[0, 1]), float(k[0, 2]), float(k[1, 2])
 
 
-def _hold(native: _Native) -> gtsam.CustomFactor:
-    """The prior of `K`, expressed on `C`, and a constraint on the changes that `K` cannot make."""
-    rows = np.vstack([native.along, native.across])
-    sigmas = np.concatenate([native.variable.sigma, np.zeros(len(native.across))])
+def _through(
+    factor: gtsam.NoiseModelFactor, keys: Sequence[int], natives: Mapping[int, _Native]
+) -> gtsam.CustomFactor:
+    """A factor with unit noise on several vectors, with each `K` among them read from its `C`."""
+    of_key = [natives[key].keys if key in natives else (key,) for key in keys]
+
+    def evaluate(
+        _this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
+    ) -> FloatArray:
+        local = gtsam.Values()
+        for key in keys:
+            local.insert(key, _entries(natives[key], values) if key in natives else values.atVector(key))
+        if jacobians is not None:
+            whole = factor.linearize(local).jacobian()[0]
+            widths = [len(local.atVector(key)) for key in keys]
+            blocks = []
+            for key, block in zip(keys, np.split(whole, np.cumsum(widths)[:-1], axis=1), strict=True):
+                if key in natives:
+                    moved = block @ natives[key].along
+                    blocks += np.split(moved, len(natives[key].keys), axis=1)
+                else:
+                    blocks.append(block)
+            for i, block in enumerate(blocks):
+                jacobians[i] = np.asfortranarray(block)
+        return np.asarray(factor.unwhitenedError(local))
+
+    noise = gtsam.noiseModel.Unit.Create(factor.noiseModel().dim())
+    return gtsam.CustomFactor(noise, [key for own in of_key for key in own], evaluate)
+
+
+def _hold(native: _Native, *, has_prior: bool) -> gtsam.CustomFactor | None:
+    """The prior of `K`, expressed on `C`, if it has one, and a constraint on changes that `K` cannot make.
+
+    None without either.
+    """
+    own = slice(None) if has_prior else slice(0)
+    rows = np.vstack([native.along[own], native.across])
+    if not len(rows):
+        return None
+    sigmas = np.concatenate([native.variable.sigma[own], np.zeros(len(native.across))])
     noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
     if len(native.across):
         noise = gtsam.noiseModel.Constrained.MixedSigmas(np.full(len(sigmas), 1e3), sigmas)

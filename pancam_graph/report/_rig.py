@@ -157,7 +157,8 @@ def _part(r: Refined) -> str:
 def _beaten(solution: Solution) -> list[str]:
     """What the verdict suggests where the prior of an entry is beaten."""
     tests = () if solution.verdict is None else solution.verdict.tests
-    return [f"{test.says}." for test in tests if test.name == _BEATEN and test.is_note]
+    said = [test.says for test in tests if test.name == _BEATEN and test.is_note]
+    return [f"{says[:1].upper()}{says[1:]}." for says in said]
 
 
 def _flex(solution: Solution) -> list[str]:

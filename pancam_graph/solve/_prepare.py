@@ -191,10 +191,6 @@ def free_numbers(traverse: Traverse, options: SolveOptions) -> Sharing:
             "numbers that are not moved"
         )
     sharing = sharing_for(traverse.rig, options.model, options.rig, given)
-    if sharing.covariance is not None and options.landmarks == "explicit":
-        raise InputError(
-            "landmarks: expected eliminated with a rig whose uncertainty has a covariance, found explicit"
-        )
     if sharing.flex == FIXED or options.firm_tie == "hard":
         return sharing
     if given is not None:

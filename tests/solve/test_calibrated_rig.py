@@ -7,8 +7,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from pancam_graph import SimulationOptions, Solution, SolveOptions, Traverse, simulate, solve
-from pancam_graph.base.errors import InputError
+from pancam_graph import SimulationOptions, Solution, SolveOptions, Traverse, build_graph, simulate, solve
 from pancam_graph.base.geometry import FloatArray, corrected_poses
 from pancam_graph.data import Observations, RigTreatment, sharing_within
 from pancam_graph.graph import HardTemplate
@@ -16,7 +15,7 @@ from pancam_graph.results import calibrated_rig
 from pancam_graph.rigs import Rig, RigCovariance, mer_navcam
 from pancam_graph.simulate import Simulation
 from pancam_graph.smoother._incremental import solve_incrementally
-from pancam_graph.solve import prepare
+from support.small_drives import near_part
 
 TO_THE_END = SolveOptions(loss="none", relative_decrease=1e-12)
 
@@ -212,9 +211,20 @@ def test_stop_by_stop_a_covariance_counts_as_in_one_solve() -> None:
         np.testing.assert_allclose(stepwise.angle_sigma_rad, batch.angle_sigma_rad, rtol=0.02)
 
 
-def test_terrain_points_as_variables_are_refused() -> None:
-    with pytest.raises(InputError, match="landmarks: expected eliminated with a rig whose uncertainty has a"):
-        prepare(second(), SolveOptions(landmarks="explicit"))
+@pytest.mark.slow
+def test_terrain_points_as_variables_have_the_same_prior() -> None:
+    options = SimulationOptions(stops=1, pans=3, sweep_rad=1.2, points_per_image=8, noise_px=0.1)
+    drive = near_part(simulate(mer_navcam(), options, seed=6))
+    traverse = replace(drive, rig=calibrated_rig(calibrated()))
+    batch = solve(traverse, TO_THE_END)
+    explicit = solve(traverse, replace(TO_THE_END, landmarks="explicit"))
+    assert explicit.cost_final == pytest.approx(batch.cost_final, rel=1e-6)
+    sigma = np.array([r.sigma for r in batch.refined])
+    apart = [a.change - b.change for a, b in zip(batch.refined, explicit.refined, strict=True)]
+    assert np.abs(apart / sigma).max() < 1e-3
+    graph, values = build_graph(traverse, TO_THE_END)
+    ours = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    assert graph.error(ours) == pytest.approx(batch.cost_final, rel=1e-6)
 
 
 def test_an_eye_without_images_keeps_its_covariance() -> None:
