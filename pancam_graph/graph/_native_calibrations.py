@@ -85,6 +85,7 @@ class NativeCalibrations:
             if known.keys().isdisjoint(keys):
                 graph.push_back(factor)
             elif len(keys) > 1:  # a prior of several variables of the rig
+                assert isinstance(factor, gtsam.NoiseModelFactor)
                 graph.push_back(_through(factor, keys, known))
                 joint.update(known.keys() & set(keys))
         for n in self._native:

@@ -53,6 +53,8 @@ _NAMES = {
     "cx_px": "principal point u",
     "cy_px": "principal point v",
     "radius_m": "radius of its circle",
+    "pan_scale": "pan turned per pan read",
+    "tilt_scale": "tilt turned per tilt read",
     **{f"r{axis}_rad": f"turn about {axis}" for axis in "xyz"},
     **{f"{axis}_m": f"shift along {axis}" for axis in "xyz"},
 }
@@ -147,6 +149,7 @@ def _scale(r: Refined, solution: Solution) -> tuple[str, float, int, float | Non
 
 
 def _part(r: Refined) -> str:
+    """Part of the rig, with the stop or the image that it is of."""
     owner = r.image if r.image is not None else r.camera
     parts = {"calibration": "lens", "mounts": "mount", "pan_T_tilt": "tilt axis", "radius": "circle"}
     words = [owner, parts.get(r.quantity, r.quantity)]
