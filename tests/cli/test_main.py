@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from pancam_graph import RenderOptions, SimulationOptions, __version__
+from pancam_graph import RenderOptions, SimulationOptions, __version__, write_traverse
 from pancam_graph.base.errors import InputError
 from pancam_graph.cli import Progress, main
 from pancam_graph.cli._drive_options import drive_options
@@ -24,6 +24,8 @@ from pancam_graph.cli._main import parse
 from pancam_graph.cli._parser import degrees
 from pancam_graph.cli._progress import Event, JsonLines, PlainLines
 from pancam_graph.cli._registry import COMMANDS
+from pancam_graph.io import rig_json
+from support import io_samples
 
 Captured = pytest.CaptureFixture[str]
 
@@ -423,3 +425,15 @@ def test_short_work_has_no_plain_lines(capsys: Captured) -> None:
     with Progress(PlainLines(period_s=600)).shown("compiling"):
         pass
     assert capsys.readouterr().err == ""
+
+
+def test_a_rig_of_another_run_is_read_before_anything_is_solved(tmp_path: Path, capsys: Captured) -> None:
+    write_traverse(io_samples.traverse(), tmp_path / "in")
+    words = ["refine", str(tmp_path / "in"), "--out", str(tmp_path / "out"), "--use-rig"]
+    assert main([*words, str(tmp_path / "rig.json")]) == 2
+    assert "rig.json: expected a file, found nothing there" in capsys.readouterr().err
+    failed = rig_json(io_samples.traverse().rig, name="first", passed=False)
+    (tmp_path / "rig.json").write_bytes(failed)
+    assert main([*words, str(tmp_path / "rig.json")]) == 2
+    assert "expected the rig of a solution that passed its tests" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
