@@ -223,6 +223,11 @@ def main() -> int:
     )
     add("--errors", nargs="+", choices=tuple(ERRORS), default=["drawn"], metavar="ERROR")
     add("--treatment", choices=("estimated", "held", "considered"), default="estimated")
+    add(
+        "--field",
+        action="store_true",
+        help="images have smooth distortion fields, drawn too, and solves estimate them",
+    )
     a = parser.parse_args()
     if a.draws < 1:
         raise InputError(f"--draws: expected 1 or more, found {a.draws}")
@@ -231,11 +236,12 @@ def main() -> int:
         pans=a.pans,
         points_per_image=a.points_per_image,
         sweep_rad=None if a.pans else 2 * np.pi,
+        field_error="drawn" if a.field else "none",
     )
     calibration = None
     if a.calibrated:
         calibration = SimulationOptions(stops=1, points_per_image=a.calibrated, sweep_rad=2 * np.pi)
-    solving = SolveOptions(rig=a.treatment, landmark_covariances=True)
+    solving = SolveOptions(rig=a.treatment, field=a.field, landmark_covariances=True)
     progress = Progress()
     heads = [("draws", 5), ("failed", 6), *((kind, 13) for kind in KINDS[:3]), ("point", 6), ("worst", 6)]
     heads += [("pan urad", 9), ("tilt urad", 9), ("stop mm", 8), ("point mm", 9)]

@@ -8,6 +8,10 @@ from pancam_graph.cameras._camera import Camera as Camera
 from pancam_graph.cameras._camera import Pinhole as Pinhole
 from pancam_graph.cameras._camera import Rays as Rays
 from pancam_graph.cameras._conditioning import Conditioning as Conditioning
+from pancam_graph.cameras._field import FIELD_COEFFICIENTS as FIELD_COEFFICIENTS
+from pancam_graph.cameras._field import FIELD_PER_COEFFICIENT as FIELD_PER_COEFFICIENT
+from pancam_graph.cameras._field import FIELD_SHAPE as FIELD_SHAPE
+from pancam_graph.cameras._field import Fields as Fields
 from pancam_graph.cameras._lens import MOUNT as MOUNT
 from pancam_graph.cameras._lens import Distorted as Distorted
 from pancam_graph.cameras._lens import Distortion as Distortion

@@ -42,6 +42,12 @@ def _add_options(parser: CommandParser) -> None:
     add("--noise-px", type=float, default=0.3, help="sigma of the pixels, per coordinate (%(default)s)")
     add("--noise-stretch", type=float, default=1.0, help="length over width of error ellipses (1: round)")
     add(
+        "--field-error",
+        choices=("none", "drawn"),
+        default="none",
+        help="drawn: images have a smooth distortion field, as large as the rig's uncertainty says (none)",
+    )
+    add(
         "--outliers",
         type=float,
         default=0.0,

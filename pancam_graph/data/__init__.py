@@ -14,6 +14,7 @@ from pancam_graph.data._matching import StopMatching as StopMatching
 from pancam_graph.data._noise import PixelNoise as PixelNoise
 from pancam_graph.data._noise import mean_sigma_px as mean_sigma_px
 from pancam_graph.data._rig_treatment import RigTreatment as RigTreatment
+from pancam_graph.data._rig_treatment import field_within as field_within
 from pancam_graph.data._rig_treatment import sharing_for as sharing_for
 from pancam_graph.data._rig_treatment import sharing_within as sharing_within
 from pancam_graph.data._sharing import ENTRIES as ENTRIES

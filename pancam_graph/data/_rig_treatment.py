@@ -6,7 +6,7 @@ from typing import Literal
 from pancam_graph.data._sharing import ENTRIES, FIXED, Freedom, Quantity, Scope, Sharing
 from pancam_graph.rigs import RIG_ENTRIES, Rig, RigUncertainty
 
-__all__ = ["RigTreatment", "sharing_for", "sharing_within"]
+__all__ = ["RigTreatment", "field_within", "sharing_for", "sharing_within"]
 
 RigTreatment = Literal["estimated", "held", "considered"]
 """What becomes of a rig's uncertainty: "estimated": it is the prior of what is estimated; "held": the rig
@@ -20,7 +20,8 @@ _SCOPE: Mapping[Quantity, Scope] = {"pan_T_tilt": "all", "flex": "frame", "encod
 def sharing_within(uncertainty: RigUncertainty, model: str) -> Sharing:
     """All numbers of a rig that a model has, free about their values with the rig's own uncertainty.
 
-    An entry whose sigma is 0 is held. The model `projective` has no number of the rig.
+    Fields of eyes are not among them (`field_within`). An entry whose sigma is 0 is held. The model
+    `projective` has no number of the rig.
     """
     u, mast = uncertainty, model == "mast"
     shifts = dict.fromkeys(ENTRIES["flex"][1:], u.flex_m)
@@ -33,6 +34,11 @@ def sharing_within(uncertainty: RigUncertainty, model: str) -> Sharing:
         pan_T_tilt=_of_rig("pan_T_tilt", u) if mast else FIXED,
         covariance=u.covariance,
     )
+
+
+def field_within(uncertainty: RigUncertainty) -> Freedom:
+    """The freedom of the smooth distortion field of each eye, with the rig's own uncertainty."""
+    return _freedom("field", {"field_px": uncertainty.field_px})
 
 
 def sharing_for(rig: Rig, model: str, treatment: RigTreatment, given: Sharing | None) -> Sharing:

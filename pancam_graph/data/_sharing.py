@@ -28,7 +28,7 @@ Scope = Literal["fixed", "all", "eye", "stop", "image", "frame"]
 of an eye, "stop" the images of an eye at a stop, "image" each image alone. `pan_T_tilt` belongs to no eye:
 "all" is one for the traverse, "stop" one per stop. `flex` has one for each "frame"."""
 
-Quantity = Literal["calibration", "mounts", "pan_T_tilt", "radius", "flex", "encoders"]
+Quantity = Literal["calibration", "mounts", "pan_T_tilt", "radius", "flex", "encoders", "field"]
 
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 ENTRIES: Mapping[Quantity, tuple[str, ...]] = {
@@ -38,11 +38,13 @@ ENTRIES: Mapping[Quantity, tuple[str, ...]] = {
     "radius": ("radius_m",),
     "flex": ("twist_rad", "forward_m", "left_m", "up_m"),
     "encoders": ("pan_scale", "tilt_scale"),
+    "field": ("field_px",),
 }
 """Names of the entries of each quantity. `calibration` has two more: `focal`, a common factor on fx and fy,
 and `aspect`, a factor on fy alone, so that priors of the two are independent. Entries of a pose are a
 rotation vector and a shift in the pose's own frame (geometry.corrected_poses). Those of `encoders` are what
-angles exceed their readings by, as shares."""
+angles exceed their readings by, as shares. `field_px` is what a whole field of coefficients is at a pixel
+(cameras.Fields)."""
 
 _SCOPES: Mapping[Quantity, tuple[Scope, ...]] = {
     "calibration": ("fixed", "all", "eye", "stop", "image"),
@@ -51,6 +53,7 @@ _SCOPES: Mapping[Quantity, tuple[Scope, ...]] = {
     "radius": ("fixed", "all", "eye", "stop", "image"),
     "flex": ("fixed", "frame"),
     "encoders": ("fixed", "all"),
+    "field": ("fixed", "eye"),
 }
 _JOINT: Mapping[Quantity, tuple[Scope, ...]] = {
     "calibration": ("fixed", "eye"),
@@ -59,6 +62,7 @@ _JOINT: Mapping[Quantity, tuple[Scope, ...]] = {
     "radius": _SCOPES["radius"],
     "flex": _SCOPES["flex"],
     "encoders": _SCOPES["encoders"],
+    "field": _SCOPES["field"],
 }
 """Scopes with which a covariance of the rig says what its entries are about."""
 _WHY_NOT: Mapping[tuple[str, str], str] = {
@@ -73,6 +77,7 @@ _MODELS: Mapping[Quantity, tuple[str, ...]] = {
     "radius": ("circle",),
     "flex": ("mast",),
     "encoders": ("mast",),
+    "field": ("mast",),
 }
 _OTHERWISE: Mapping[tuple[str, str], str] = {
     ("mounts", "circle"): "whose cameras turn freely and whose centres hang on circles",
@@ -85,6 +90,9 @@ _OTHERWISE: Mapping[tuple[str, str], str] = {
     ("flex", "circle"): "whose cameras turn freely",
     ("flex", "free"): "whose cameras turn freely",
     ("flex", "projective"): "whose cameras turn freely",
+    ("field", "circle"): "whose cameras turn freely",
+    ("field", "free"): "whose cameras turn freely",
+    ("field", "projective"): "whose cameras turn freely",
     ("calibration", "projective"): "whose matrices have calibrations of their own",
     ("mounts", "projective"): "whose cameras hang on no mount",
     ("pan_T_tilt", "projective"): "whose cameras hang on no axis",
@@ -112,6 +120,8 @@ _DEFAULT_SIGMA = {
     **dict.fromkeys(("forward_m", "left_m", "up_m"), 1e-4),
     # Our stated assumption for servos and potentiometers.
     **dict.fromkeys(("pan_scale", "tilt_scale"), 1e-2),
+    # The fields of Navcams of Opportunity and Curiosity: docs/accuracy.md.
+    "field_px": 4e-5,
 }
 """Standard deviations of the priors; entries in pixels as shares of the focal length, factors as shares."""
 
@@ -172,6 +182,8 @@ class Sharing:
     stood, whose priors are widened by the sigma of the twist."""
     encoders: Freedom = FIXED
     """Scale of the pans and tilts that telemetry reads, one for the traverse; model `mast`."""
+    field: Freedom = FIXED
+    """Smooth distortion field of each eye (cameras.Fields), beside its lens; model `mast` with a hard tie."""
     covariance: RigCovariance | None = None
     """Joint covariance of the priors of those entries that it names, in place of their sigmas; then
     calibrations and mounts are of an eye, the tilt axis of all. None: all are independent."""
@@ -194,6 +206,7 @@ class Sharing:
             ("radius", self.radius),
             ("flex", self.flex),
             ("encoders", self.encoders),
+            ("field", self.field),
         ]
         return [(quantity, freedom) for quantity, freedom in freedoms if freedom is not None]
 

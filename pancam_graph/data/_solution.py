@@ -39,6 +39,9 @@ class RigCorrection:
     metres; None where the mast is rigid."""
     encoders: FloatArray | None = None
     """(stops, 2) what pans and tilts exceed their readings by, as shares; None where these are exact."""
+    field_px: FloatArray | None = None
+    """(eyes, *cameras.FIELD_SHAPE) coefficients of each eye's smooth distortion field; None where there is
+    none."""
 
     @staticmethod
     def to_calibrations(traverse: Traverse, calibration: FloatArray) -> "RigCorrection":
@@ -60,6 +63,7 @@ class RigCorrection:
             radius_m=self.radius_m[images],
             flex=None if self.flex is None else self.flex[frames],
             encoders=None if self.encoders is None else self.encoders[stops],
+            field_px=self.field_px,
         )
 
     def calibration(self, traverse: Traverse) -> FloatArray:

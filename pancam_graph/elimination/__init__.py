@@ -3,6 +3,7 @@
 from pancam_graph.elimination._joint_covariance import JointCovariance as JointCovariance
 from pancam_graph.elimination._joint_covariance import PosePlace as PosePlace
 from pancam_graph.elimination._joint_covariance import relative_pose_covariance as relative_pose_covariance
+from pancam_graph.elimination._linkage import FieldColumns as FieldColumns
 from pancam_graph.elimination._linkage import Linkage as Linkage
 from pancam_graph.elimination._linkage import Posture as Posture
 from pancam_graph.elimination._panels import Covariance as Covariance

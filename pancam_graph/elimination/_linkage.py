@@ -9,7 +9,25 @@ import numpy as np
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.landmarks import CameraViews
 
-__all__ = ["Linkage", "Posture"]
+__all__ = ["FieldColumns", "Linkage", "Posture"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FieldColumns:
+    """The columns of smooth distortion fields: adjoining ones of one group."""
+
+    group: int
+    first: int
+    """First of them among the columns of the group"""
+    n: int
+    """Their number."""
+    image_column: IntArray
+    """(images,) first column of each image's field among them"""
+
+    @property
+    def columns(self) -> slice:
+        """The columns among those of the group."""
+        return slice(self.first, self.first + self.n)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -41,6 +59,8 @@ class Linkage:
     segment_plain: BoolArray
     """(segments,) whether the tangent of the variable is the twist of the base of the unit itself: the
     segment has 6 columns, and its matrix is the identity at all values"""
+    fields: FieldColumns | None = None
+    """Columns of variables that are the coefficients of fields, in no segment; None: there are none"""
 
     @property
     def n_groups(self) -> int:
@@ -101,8 +121,10 @@ class Linkage:
         """Groups of the variables of each unit."""
         group = self.group[self.segment_variable]
         begin = self.segment_begin
+        of_field = set() if self.fields is None else {self.fields.group}
         return tuple(
-            tuple(sorted(set(group[begin[u] : begin[u + 1]].tolist()))) for u in range(len(begin) - 1)
+            tuple(sorted(of_field.union(group[begin[u] : begin[u + 1]].tolist())))
+            for u in range(len(begin) - 1)
         )
 
 

@@ -1,8 +1,8 @@
 """All landmarks of a problem, in blocks, and their Schur complement on the variables of cameras."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from threading import local
 from typing import TypeVar
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.base.threads import in_parallel
 from pancam_graph.elimination._blocks import Block, Layout, blocks_of
+from pancam_graph.elimination._fields import FieldPart, FieldSystem
 from pancam_graph.elimination._linkage import Linkage, Posture
 from pancam_graph.elimination._panels import Covariance, Panels, pattern
 from pancam_graph.landmarks import (
@@ -138,6 +139,9 @@ class LandmarkSystem:
         )
         self.regained = 0.0
         """Decrease of the cost by placing strays anew after the last step tried."""
+        self._fields: FieldSystem | None = None
+        if linkage.fields is not None:
+            self._fields = FieldSystem(linkage.fields, self.sights.image, self.sights.uv_px, self._begin)
         self._memory = room or Room()
         self._moved, self._moved_cost = np.empty_like(self.vector), np.zeros(n)
         self._has_moved = False
@@ -232,19 +236,26 @@ class LandmarkSystem:
 
         The panels are this object's own and are filled anew by the next call.
         """
-        bearings = self.bearings(posture)
+        bearings, sights = self.bearings(posture), self._sights_at(posture.views)
         eliminate = kernel.eliminate_poses if bearings.chain.shape[1] == 6 else kernel.eliminate_calibrations
         self._panels.clear()
         for wave in self._waves:
             systems = self._room(wave)
+            parts = self._field_parts(wave, posture.views)
 
-            def eliminated(first: int, last: int, wave: _Wave = wave, systems: _Systems = systems) -> None:
+            def eliminated(
+                first: int,
+                last: int,
+                wave: _Wave = wave,
+                systems: _Systems = systems,
+                parts: Sequence[tuple[kernel.FieldSights, FieldPart]] = parts,
+            ) -> None:
                 for chunk, (S, s) in zip(wave[first:last], systems[first:last], strict=True):
                     S.fill(0.0)
                     s.fill(0.0)
                     block = self.blocks[chunk.block]
                     eliminate(
-                        self.sights,
+                        sights,
                         bearings,
                         self.vector,
                         self.origin_m,
@@ -257,6 +268,23 @@ class LandmarkSystem:
                         self.reduced,
                         S,
                         s,
+                    )
+                for chunk, (seen, part) in zip(wave[first:last], parts[first:last], strict=False):
+                    block = self.blocks[chunk.block]
+                    kernel.eliminate_fields(
+                        sights,
+                        bearings,
+                        seen,
+                        self.vector,
+                        self.origin_m,
+                        self.loss.kind,
+                        self.loss.width,
+                        chunk.begin,
+                        chunk.end,
+                        block.segment_column,
+                        block.n_units,
+                        self.reduced,
+                        *part,
                     )
 
             def summed(first: int, last: int, wave: _Wave = wave, systems: _Systems = systems) -> None:
@@ -273,7 +301,22 @@ class LandmarkSystem:
             n_groups, n_entries = self.linkage.n_groups, sum(len(S) for S, _ in systems)
             grain = max(n_groups, 1) if n_entries < _SMALLEST_SUM else 1 + n_groups // 8
             in_parallel(summed, n_groups, grain=grain)
+            for chunk, (_, part) in zip(wave, parts, strict=False):
+                assert self._fields is not None
+                self._fields.add(part, self.blocks[chunk.block], self._panels)
         return self._panels
+
+    def _field_parts(self, wave: _Wave, views: CameraViews) -> Sequence[tuple[kernel.FieldSights, FieldPart]]:
+        """Room for what each chunk of a wave tells about fields; empty where there are none."""
+        fields = self._fields
+        if fields is None:
+            return ()
+        seen = fields.linearise_at(views)
+        return [(seen, fields.room(self.blocks[chunk.block])) for chunk in wave]
+
+    def _sights_at(self, views: CameraViews) -> kernel.Sights:
+        """Observations without the fields of these cameras."""
+        return self.sights if self._fields is None else self.sights._replace(uv_px=self._fields.pixels(views))
 
     def put_back(self, panels: Panels, g: int) -> tuple[FloatArray, FloatArray]:
         """The system (n, n), (n,) in the columns of one group, landmarks and other variables held.
@@ -284,26 +327,28 @@ class LandmarkSystem:
         n = int(self.linkage.group_dim[g])
         upper = np.triu(panels.panel[g][:, :n])
         S, s = upper + np.triu(upper, 1).T, panels.panel[g][:, -1].copy()
-        arms = self.reduced.arms.reshape(-1, 3, 2)
         for chunk in self.chunks:
             block = self.blocks[chunk.block]
             if g not in block.groups:
                 continue
             i = block.groups.index(g)
-            first, last = self.sights.pair_begin[chunk.begin], self.sights.pair_begin[chunk.end]
-            counts = np.diff(self.sights.pair_begin[chunk.begin : chunk.end + 1])
-            landmark, pair = np.repeat(np.arange(len(counts)), counts), self.sights.pair[first:last]
-            of_group = (2 * pair >= block.begin[i]) & (2 * pair < block.begin[i + 1])
-            # One more column takes the padding of pairs, and is dropped.
-            W = np.zeros((len(counts), 3, n + 1))
-            for half in range(2):
-                W[landmark[of_group], :, block.row[2 * pair[of_group] + half]] = arms[first:last][
-                    of_group, :, half
-                ]
+            W = np.zeros((chunk.end - chunk.begin, 3, n + 1))
+            W[:, :, block.row[block.begin[i] : block.begin[i + 1]]] = self._dense_arms(chunk)[
+                :, :, block.begin[i] : block.begin[i + 1]
+            ]
             W = W.reshape(-1, n + 1)[:, :n]
             S += W.T @ W
             s += W.T @ self.reduced.gamma[chunk.begin : chunk.end].ravel()
         return S, s
+
+    def _dense_arms(self, chunk: _Chunk) -> FloatArray:
+        """W = L^-1 E' (landmarks, 3, columns of the block) of the landmarks of a chunk."""
+        counts = np.diff(self.sights.pair_begin[chunk.begin : chunk.end + 1])
+        first, last = self.sights.pair_begin[chunk.begin], self.sights.pair_begin[chunk.end]
+        landmark, pair = np.repeat(np.arange(len(counts)), counts), self.sights.pair[first:last]
+        out = np.zeros((len(counts), 3, len(self.blocks[chunk.block].row) // 2, 2))
+        out[landmark, :, pair] = self.reduced.arms.reshape(-1, 3, 2)[first:last]
+        return out.reshape(len(counts), 3, -1)
 
     @cached_property
     def _waves(self) -> list[list[_Chunk]]:
@@ -336,13 +381,15 @@ class LandmarkSystem:
         triangulated. `posture` is that after the step. A landmark that cannot be brought in front of its
         cameras costs kernel.BEHIND_COST.
         """
-        bearings = self.bearings(posture)
+        bearings, sights, reduced = self.bearings(posture), self._sights_at(posture.views), self.reduced
         steps = [np.append(step, 0.0)[block.source] for block in self.blocks]
+        if self._fields is not None:
+            reduced = reduced._replace(gamma=self._fields.following(reduced.gamma, posture.views))
 
         def work(begin: int, end: int) -> None:
             for chunk in self.chunks[begin:end]:
                 kernel.follow(
-                    self.sights,
+                    sights,
                     bearings,
                     self.vector,
                     self.origin_m,
@@ -350,7 +397,7 @@ class LandmarkSystem:
                     self.loss.width,
                     chunk.begin,
                     chunk.end,
-                    self.reduced,
+                    reduced,
                     steps[chunk.block],
                     self._moved,
                     self._moved_cost,
@@ -364,11 +411,12 @@ class LandmarkSystem:
     def cost_at(self, posture: Posture) -> float:
         """True cost with landmarks at the linearisation point and cameras in another posture."""
         bearings, cost, loss = self.bearings(posture), np.empty(len(self.vector)), self.loss
+        sights = self._sights_at(posture.views)
 
         def work(begin: int, end: int) -> None:
             which = np.arange(begin, end)
             kernel.landmark_costs(
-                self.sights,
+                sights,
                 bearings,
                 which,
                 self.vector[begin:end],
@@ -387,7 +435,8 @@ class LandmarkSystem:
         A stray is refined from its place after the step; if its cost remains large, it is triangulated from
         its rays. Halfway to the optimum all landmarks are refined.
         """
-        seen = self._seen_by(bearings.cameras)
+        sights = self._sights_at(views)
+        seen = self._seen_by(sights, bearings.cameras)
         counts = np.diff(seen.begin)
         before, after = self.reduced.cost, self._moved_cost
         # A landmark whose cost hardly changes is placed as well as before, however large its cost.
@@ -413,7 +462,7 @@ class LandmarkSystem:
             refined,
             grain=_STRAY_GRAIN,
         )
-        self._take_if_better(strays, refined[strays], bearings)
+        self._take_if_better(strays, refined[strays], sights, bearings)
 
         strays = strays[self._moved_cost[strays] > _LOST * counts[strays]]
         if len(strays) == 0:
@@ -425,11 +474,10 @@ class LandmarkSystem:
         placed = triangulate(*rays_of(part, views), part.landmark, weight)
         placed = placed.about(self._given(self.origin_m)[lost])
         placed = refine(placed, part, views, weight, self.loss, beyond_infinity=True)
-        self._take_if_better(strays, placed.vector[rows], bearings)
+        self._take_if_better(strays, placed.vector[rows], sights, bearings)
 
-    def _seen_by(self, cameras: kernel.Cameras) -> kernel.Seen:
+    def _seen_by(self, sights: kernel.Sights, cameras: kernel.Cameras) -> kernel.Seen:
         """Observations for loops over landmarks, in the order of elimination."""
-        sights = self.sights
         return kernel.Seen(
             begin=self._begin,
             image=sights.image,
@@ -443,11 +491,11 @@ class LandmarkSystem:
         """(landmarks + 1,) first observation of each landmark in the order of elimination, and n."""
         return self.sights.occurrence_begin[self.sights.landmark_begin]
 
-    def _take_if_better(self, strays: IntArray, vector: FloatArray, bearings: kernel.Bearings) -> None:
+    def _take_if_better(
+        self, strays: IntArray, vector: FloatArray, sights: kernel.Sights, bearings: kernel.Bearings
+    ) -> None:
         cost, loss = np.empty(len(strays)), self.loss
-        kernel.landmark_costs(
-            self.sights, bearings, strays, vector, self.origin_m, loss.kind, loss.width, cost
-        )
+        kernel.landmark_costs(sights, bearings, strays, vector, self.origin_m, loss.kind, loss.width, cost)
         better = cost < self._moved_cost[strays]
         self.regained += float(np.sum((self._moved_cost[strays] - cost)[better]))
         self._moved[strays[better]], self._moved_cost[strays[better]] = vector[better], cost[better]
@@ -492,11 +540,11 @@ class LandmarkSystem:
         """Landmarks at the point of linearisation, in the order they were given in."""
         return Landmarks(vector=self._given(self.vector), origin_m=self._given(self.origin_m))
 
-    def landmark_covariance_m2(self, covariance: Covariance) -> FloatArray:
+    def landmark_covariance_m2(self, covariance: Covariance | None) -> FloatArray:
         """Covariance (landmarks, 3, 3) of world points X / w, cameras marginalised, in the order given.
 
         It is V^-1 + V^-1 E' C E V^-1 at the last linearisation, with C the covariance of the variables of a
-        landmark's cameras. Infinite for landmarks at infinity.
+        landmark's cameras; None: cameras are exact. Infinite for landmarks at infinity.
         """
         out = np.empty((len(self.landmark_row), 3, 3))
         for chunk in self.chunks:
@@ -504,11 +552,17 @@ class LandmarkSystem:
             joint = np.zeros((len(block.row), len(block.row)))
             filled = [np.flatnonzero(block.row[a:b] >= 0) for a, b in pairwise(block.begin)]
             for g, a, rows in zip(block.groups, block.begin, filled, strict=False):
+                if covariance is None:
+                    break
                 for h, b, columns in zip(block.groups, block.begin, filled, strict=False):
                     wanted = np.ix_(block.row[a + rows], block.row[b + columns])
                     joint[np.ix_(a + rows, b + columns)] = covariance.block(g, h)[wanted]
+            more = np.zeros((chunk.end - chunk.begin, 3, 3))
+            if self._fields is not None and covariance is not None:
+                first, last, arms_of = chunk.begin, chunk.end, partial(self._dense_arms, chunk)
+                more = self._fields.spread(first, last, block, covariance, arms_of)
             kernel.point_covariances(
-                self.sights, self.reduced, self.vector, joint, chunk.begin, chunk.end, out
+                self.sights, self.reduced, self.vector, joint, more, chunk.begin, chunk.end, out
             )
         return self._given(out)
 

@@ -31,6 +31,8 @@ class Kind(Enum):
     """Free entries of a correction of a tilt axis, `pan_T_tilt` (vector)."""
     ENCODERS = "S"
     """Free entries of the scale of pans and tilts over their readings (vector)."""
+    FIELD = "D"
+    """Coefficients of the smooth distortion field of an eye, pixels (vector)."""
     RADIUS = "R"
     """Radius of an eye's circle, metres (number)."""
     NATIVE_CALIBRATION = "C"

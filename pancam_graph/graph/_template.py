@@ -95,6 +95,7 @@ class FactorTemplate(ABC):
             rig=(
                 *(factor for owner in (*stops, None) for factor in self.rig_variables.prior_factors(owner)),
                 *(factor for stop in stops for factor in self.flex_factors(stop)),
+                *self.field_factors(),
             ),
             given=tuple(given),
             seated=tuple(factor for factor in placed if factor is not None),
@@ -251,6 +252,10 @@ class FactorTemplate(ABC):
 
     def flex_factors(self, stop: int) -> FactorList:
         """The prior of how a stop's heads stand off the rigid mast; none here."""
+        return []
+
+    def field_factors(self) -> FactorList:
+        """The priors of the smooth distortion fields of eyes; none here."""
         return []
 
     @cached_property

@@ -92,6 +92,7 @@ class UncertaintyEntry(SparseEntry):
     flex_m: float | None = None
     pan_scale: float | None = None
     tilt_scale: float | None = None
+    field_px: float | None = None
     source: Text | None = None
     covariance: CovarianceEntry | None = None
 

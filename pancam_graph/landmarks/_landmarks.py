@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.base.threads import in_parallel
-from pancam_graph.cameras import Camera, LensTable
+from pancam_graph.cameras import Camera, Fields, LensTable
 from pancam_graph.landmarks import kernel
 from pancam_graph.landmarks._losses import SQUARED, Loss
 
@@ -53,6 +53,8 @@ class CameraViews:
     """(images, 3, 3) calibration matrix K, upper triangular"""
     lenses: LensTable | None = None
     """What their lenses do to rays before K; None: nothing, they are pinholes"""
+    fields: Fields | None = None
+    """What is added to pixels after K; None: nothing"""
 
     @cached_property
     def in_kernel(self) -> kernel.Cameras:
@@ -70,6 +72,10 @@ class CameraViews:
             lens_kind=lenses.kind,
             lens_parameters=lenses.parameters,
         )
+
+    def without_field(self, image: IntArray, uv_px: FloatArray) -> FloatArray:
+        """Where pixels (n, 2), as measured in images (n,), would be if there were no fields."""
+        return uv_px if self.fields is None else uv_px - self.fields.at(image, uv_px)
 
     def after(self, rotation: FloatArray, shift_m: FloatArray) -> "CameraViews":
         """The cameras after a rigid motion of the world: x becomes rotation (3, 3) x + shift (3,)."""
@@ -92,7 +98,7 @@ class CameraViews:
 
     @staticmethod
     def joined(parts: "Sequence[CameraViews]") -> "CameraViews":
-        """The cameras of several sets of images, one after the other."""
+        """The cameras of several sets of images, one after the other; none of them has fields."""
         lenses = [v.lenses or LensTable.without(len(v.world_t_camera)) for v in parts]
         return CameraViews(
             world_R_camera=np.concatenate([v.world_R_camera for v in parts]),
@@ -234,7 +240,8 @@ def lines_of_sight(
     pinhole instead. Raises IndexError for an image (n,) without a camera.
     """
     n = len(image)
-    images, pixels, cameras = _images(image, views), as_floats(uv_px, (n, 2)), views.in_kernel
+    images, cameras = _images(image, views), views.in_kernel
+    pixels = as_floats(views.without_field(images, as_floats(uv_px, (n, 2))), (n, 2))
     centre, direction, seen = np.empty((n, 3)), np.empty((n, 3)), np.empty(n, dtype=bool)
     in_parallel(
         lambda first, last: kernel.lines_of_sight(
@@ -364,10 +371,11 @@ def as_floats(array: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
 def seen_by(measurements: Measurements, views: CameraViews) -> kernel.Seen:
     """Measurements with the cameras that made them. Raises IndexError for an image without a camera."""
     n = len(measurements.image)
+    image = _images(measurements.image, views)
     return kernel.Seen(
         begin=measurements.begin,
-        image=_images(measurements.image, views),
-        uv_px=as_floats(measurements.uv_px, (n, 2)),
+        image=image,
+        uv_px=as_floats(views.without_field(image, measurements.uv_px), (n, 2)),
         whitening=as_floats(measurements.whitening, (n, 2, 2)),
         cameras=views.in_kernel,
     )

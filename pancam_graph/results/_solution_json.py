@@ -110,7 +110,7 @@ class SolvedImageEntry(Entry):
 class RefinedEntry(Entry):
     """An entry of the rig that was free. Null: the entry has no such owner, or the number is not finite."""
 
-    quantity: Literal["calibration", "mounts", "pan_T_tilt", "radius", "flex", "encoders"]
+    quantity: Literal["calibration", "mounts", "pan_T_tilt", "radius", "flex", "encoders", "field"]
     entry: str
     camera: str | None
     stop: str | None
@@ -119,6 +119,14 @@ class RefinedEntry(Entry):
     change: float | None
     sigma: float | None
     prior_sigma: float | None
+
+
+class FieldEntry(Entry):
+    """Coefficients of the smooth distortion field of a camera, by rows of the image (`cameras.Fields`)."""
+
+    camera: str
+    u_px: list[list[float]]
+    v_px: list[list[float]]
 
 
 class IncrementalEntry(Entry):
@@ -198,6 +206,8 @@ class SolutionFile(Entry):
     """The key is missing in files of older versions."""
     refined: list[RefinedEntry] = Field(default_factory=list)
     """Entries of the rig that were free; no such key where none was."""
+    fields: list[FieldEntry] = Field(default_factory=list)
+    """Of each eye of the rig; no such key where none was free."""
     warnings: list[str]
     cross_validation: CrossValidationEntry | None = None
     """Where it was asked for; else the key is missing."""
@@ -218,6 +228,7 @@ def solution_json(solution: Solution) -> bytes:
         "verdict": solution.verdict is None,
         "rig": solution.treatment is None,
         "refined": not solution.refined,
+        "fields": solution.final.rig is None or solution.final.rig.field_px is None,
         "cross_validation": solution.cross_validation is None,
         "incremental": solution.incremental is None,
     }
@@ -296,6 +307,7 @@ def solution_file(solution: Solution) -> SolutionFile:
             )
             for r in solution.refined
         ],
+        fields=_fields(solution),
         # Warnings of the reader come first, and once, also where the solver passed them on.
         warnings=list(dict.fromkeys([*traverse.warnings, *solution.warnings])),
         method=solution.method,
@@ -310,6 +322,14 @@ def _flex_of_frame(solution: Solution, row: int, flex: tuple[Flex, ...]) -> dict
     if not flex or rig is None or rig.flex is None:
         return None
     return {f.entry: float(rig.flex[row, ENTRIES["flex"].index(f.entry)]) for f in flex}
+
+
+def _fields(solution: Solution) -> list[FieldEntry]:
+    rig = solution.final.rig
+    if rig is None or rig.field_px is None:
+        return []
+    named = zip(solution.traverse.rig.eyes, rig.field_px.tolist(), strict=True)
+    return [FieldEntry(camera=eye.name, u_px=u, v_px=v) for eye, (u, v) in named]
 
 
 def _images(solution: Solution) -> list[SolvedImageEntry]:

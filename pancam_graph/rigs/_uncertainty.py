@@ -14,7 +14,8 @@ __all__ = ["RigUncertainty"]
 
 _PRINCIPAL_POINT = 5e-3
 _SKEW = 2e-4
-"""Usual sigmas of principal point and skew, as shares of the image's longer side."""
+_FIELD = 5e-5
+"""Usual sigmas of principal point, skew and smooth field, as shares of the image's longer side."""
 _NO_SIGMA = ("source", "covariance")
 """Fields that are no standard deviations."""
 
@@ -56,6 +57,8 @@ class RigUncertainty:
     a turn of the tilt axis (`tilt_axis_rad`): about z that of pans, about y that of tilts."""
     tilt_scale: float = 0.0
     """Of the tilt, likewise; tilts count from the horizon of the mast."""
+    field_px: float = _FIELD * 1024
+    """Of each component of each eye's smooth distortion field, at a pixel: what its lens leaves."""
     source: str = "our stated assumption for a calibrated rig"
     """Where the numbers come from."""
     covariance: RigCovariance | None = None
@@ -108,9 +111,14 @@ class RigUncertainty:
 
         Principal point: 0.5 % of that side (the principal points of the two Mars 2020 Navcams differ by
         0.35 % of it, that of Opportunity's left Navcam is 1 % off its label). Skew: 0.02 % (image axes of
-        CAHV labels are off a right angle by up to 0.012 degrees).
+        CAHV labels are off a right angle by up to 0.012 degrees). Smooth field: 0.005 %, with which images of
+        Navcams of Opportunity and Curiosity are likeliest (docs/accuracy.md).
         """
-        return RigUncertainty(principal_point_px=_PRINCIPAL_POINT * side_px, skew_px=_SKEW * side_px)
+        return RigUncertainty(
+            principal_point_px=_PRINCIPAL_POINT * side_px,
+            skew_px=_SKEW * side_px,
+            field_px=_FIELD * side_px,
+        )
 
     @staticmethod
     def of_unit(side_px: int) -> "RigUncertainty":

@@ -46,6 +46,8 @@ class Truth:
     flex: FloatArray | None = None
     """(frames, 4) how heads stood off the mast (`Rig.mast_T_camera`); pan and tilt are theirs. None: not at
     all."""
+    field_px: FloatArray | None = None
+    """(eyes, *cameras.FIELD_SHAPE) coefficients of each eye's smooth distortion field; None: none has one."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

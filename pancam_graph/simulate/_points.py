@@ -11,7 +11,7 @@ import numpy as np
 
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, compose, pose_arrays
-from pancam_graph.cameras import Camera
+from pancam_graph.cameras import Camera, Fields
 from pancam_graph.data import Observations, Traverse
 from pancam_graph.rigs import Rig
 from pancam_graph.simulate._drive import (
@@ -27,12 +27,14 @@ from pancam_graph.simulate._drive import (
 )
 from pancam_graph.simulate._simulation_options import SimulationOptions
 from pancam_graph.simulate._terrain import GroundModel
+from pancam_graph.simulate._wrong_rig import drawn_fields
 
 __all__ = ["PointsTruth", "Simulation", "simulate"]
 
 _OVERLAP = 0.28  # of neighbouring frames, as a share of the widest eye's field
 _HORIZON = 0.2  # how far the upper row looks below the horizon, as a share of the field
 _BORDER_PX = 5.0  # nothing is matched nearer to an image's edge than this, or 2 % of a small image
+_ROUNDS_OF_FIELD = 4  # each leaves a thousandth of what the one before left
 _ROUNDS = 3  # lines of sight that end in the sky are drawn anew so often
 _NOMINAL_SIGMA_PX = 0.3  # what observations without noise are said to have
 
@@ -67,9 +69,9 @@ def simulate(rig: Rig, options: SimulationOptions | None = None, *, seed: int = 
     options = options if options is not None else SimulationOptions()
     if seed < 0:
         raise InputError(f"simulation: seed: expected 0 or more, found {seed}")
-    streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(10)]
+    streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(11)]
     rng_terrain, rng_drive, rng_sight, rng_detection, rng_noise, rng_outlier, *streams = streams
-    rng_telemetry, rng_ellipse, rng_rig, rng_flex = streams
+    rng_telemetry, rng_ellipse, rng_rig, rng_flex, rng_field = streams
 
     terrain, world_T_mast = _drive(rig, options, rng_terrain, rng_drive)
     angles = panorama(
@@ -105,6 +107,10 @@ def simulate(rig: Rig, options: SimulationOptions | None = None, *, seed: int = 
     track = (np.cumsum(kept) - 1)[point[rows]]
 
     size = np.array([[e.camera.width_px, e.camera.height_px] for e in rig.eyes])[image_eye[image]]
+    field_px = drawn_fields(rig, rng_field) if options.field_error == "drawn" else None
+    if field_px is not None:
+        fields = Fields(coefficients_px=field_px, row=image_eye[image], size_px=size.astype(float))
+        uv = _displaced(fields, uv)
     outlier = rng_outlier.random(len(uv)) < options.outliers
     anywhere = rng_outlier.random(uv.shape) * size - 0.5
     observations = Observations(
@@ -129,12 +135,21 @@ def simulate(rig: Rig, options: SimulationOptions | None = None, *, seed: int = 
         uv_px=uv,
         outlier=outlier,
         flex=flex,
+        field_px=field_px,
         terrain=terrain,
     )
     centre = truth if options.prior == "truth" else start
     claimed = claimed_rig(rig, options, angles, rng_rig)
     traverse = make_traverse(claimed, options, centre.world_T_mast, centre.pan_tilt_rad, observations, seed)
     return Simulation(traverse=traverse, truth=truth, telemetry_start=start)
+
+
+def _displaced(fields: Fields, uv_px: FloatArray) -> FloatArray:
+    """Where pixels (n, 2) of the images of n fields appear with these: u = uv + field(u)."""
+    out, image = uv_px, np.arange(len(uv_px))
+    for _ in range(_ROUNDS_OF_FIELD):
+        out = uv_px + fields.at(image, out)
+    return out
 
 
 def _ellipses(options: SimulationOptions, sigma_px: FloatArray, rng: np.random.Generator) -> FloatArray:

@@ -161,6 +161,9 @@ class SimulationOptions(DriveOptions):
     """How many times longer than wide an observation's error ellipse is; its direction is drawn at random.
 
     Above 1 observations get covariances. Their mean variance is that of `noise_px`."""
+    field_error: Literal["none", "drawn"] = "none"
+    """Smooth distortion field of each eye, of which the traverse does not know: "none", or "drawn" from the
+    rig's uncertainty (`RigUncertainty.field_px`)."""
     outliers: float = 0.0
     """Share of observations that are a random pixel of their image instead."""
     prior: Literal["telemetry", "truth"] = "telemetry"
@@ -172,6 +175,7 @@ class SimulationOptions(DriveOptions):
     def __post_init__(self) -> None:
         """Check ranges."""
         super().__post_init__()
+        self._require("field_error", self.field_error in {"none", "drawn"}, "'none' or 'drawn'")
         for name, low in (("points_per_image", 1), ("link_stops", 0), ("min_views", 2)):
             self._require_whole(name, low)
         self._require("noise_px", 0 <= self.noise_px < np.inf, "a number of 0 or above")

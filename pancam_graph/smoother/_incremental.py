@@ -11,6 +11,7 @@ from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import IntArray
 from pancam_graph.base.threads import blas_on_one_thread
 from pancam_graph.data import (
+    FIXED,
     Frame,
     Image,
     Incremental,
@@ -105,7 +106,8 @@ def solve_incrementally(
         if on_stop is not None:
             on_stop(updates[-1])
     if factors is not None:
-        smoother.add_factors_of(HardTemplate(traverse, free_numbers(traverse, options)), factors)
+        sharing = replace(free_numbers(traverse, options), field=FIXED)
+        smoother.add_factors_of(HardTemplate(traverse, sharing), factors)
     solved = time.perf_counter()
     solution = _as_solution(traverse, options, smoother, [i for i, _ in order], updates, factors)
     done = time.perf_counter()

@@ -1,6 +1,6 @@
 """Options of a smoother, and the results of its updates."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import gtsam
@@ -8,7 +8,7 @@ import numpy as np
 
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray
-from pancam_graph.data import Sharing, sharing_for
+from pancam_graph.data import FIXED, Sharing, sharing_for
 from pancam_graph.rigs import Rig
 
 __all__ = ["Closure", "Estimate", "SmootherOptions", "Update"]
@@ -65,8 +65,8 @@ class SmootherOptions:
             self.sharing.for_model("mast")
 
     def sharing_of(self, rig: Rig) -> Sharing:
-        """Free entries of a drive's rig, as `Sharing.for_model` returns them."""
-        return sharing_for(rig, "mast", self.rig, self.sharing)
+        """Free entries of a drive's rig, as `Sharing.for_model` returns them; fields of eyes are held."""
+        return replace(sharing_for(rig, "mast", self.rig, self.sharing), field=FIXED)
 
 
 @dataclass(frozen=True, kw_only=True)

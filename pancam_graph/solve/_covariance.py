@@ -144,6 +144,8 @@ def _name(template: FactorTemplate, free: FreeDirectionError) -> str:
             if v.key == key:
                 name = template.rig_variables.name(v, v.entries[component])
                 return f"{name} of the rig, with what moves along"
+        if kind is Kind.FIELD:
+            return f"the smooth field of {t.rig.eyes[index_of(key)].name}"
         if kind is Kind.FLEX:
             return f"the flex of a frame at {t.stops[free.group].id}"
         return f"pan or tilt at {t.stops[free.group].id}"

@@ -86,7 +86,8 @@ class EliminatedSolver(Solver):
         system, rows = system_of(problem, loss)
         # Images alone leave directions of a free rig next to undetermined, and rounding in their square root
         # exceeds what priors say of these: such a system is eliminated with its priors in it.
-        alone = not (template.has_cameras or template.rig_variables.variables)
+        is_free = template.rig_variables.variables or template.linkage.fields is not None
+        alone = not (template.has_cameras or is_free)
         minimise = self._by_blocks if alone else self._by_groups
         outcome, joint = minimise(problem, system, rule, stage, left_sigmas)
         return self._ended(problem, outcome, system, rows, joint), outcome

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pancam_graph.base.geometry import BoolArray, FloatArray
-from pancam_graph.data import PixelNoise
+from pancam_graph.data import FIXED, PixelNoise
 from pancam_graph.graph import HardTemplate
 from pancam_graph.landmarks import Landmarks
 from pancam_graph.solve._eliminated import EliminatedSolver, Ended
@@ -45,24 +45,30 @@ class Fitted:
 def fit(screened: Screened) -> Fitted:
     """Least squares over what is accepted, until the noise scale does not move any more.
 
-    Raises SolveError where the system has a direction that nothing holds however much it is damped.
+    Where smooth distortion fields are free, once without them and from there once with them. Raises
+    SolveError where the system has a direction that nothing holds however much it is damped.
     """
     prepared, problem = screened.prepared, screened.problem
     solver = solver_for(prepared.options, prepared.on_iteration, is_near=screened.is_near)
     noise, behind = prepared.noise, np.zeros(len(prepared.observations), dtype=bool)
     costs: list[float] = []
-    for _ in range(_ROUNDS):
-        before = problem.accepted
-        problem, outcome = solver.adjust(problem, prepared.options)
-        behind[problem.measurements.row[before & ~problem.accepted]] = True
-        costs += outcome.costs[1:] if costs else outcome.costs
-        if not prepared.rescales_noise:
-            break
-        factor = noise_factor(problem)
-        noise = noise.scaled(factor)
-        problem = replace(problem, measurements=problem.measurements.scaled(factor))
-        if not (abs(factor - 1) > 1e-3 and outcome.converged):
-            break
+    templates = [problem.template]
+    if prepared.sharing.field != FIXED:
+        templates.append(HardTemplate(prepared.traverse, prepared.sharing))
+    for template in templates:
+        problem = problem if template is problem.template else problem.on(template)
+        for _ in range(_ROUNDS):
+            before = problem.accepted
+            problem, outcome = solver.adjust(problem, prepared.options)
+            behind[problem.measurements.row[before & ~problem.accepted]] = True
+            costs += outcome.costs[1:] if costs else outcome.costs
+            if not prepared.rescales_noise:
+                break
+            factor = noise_factor(problem)
+            noise = noise.scaled(factor)
+            problem = replace(problem, measurements=problem.measurements.scaled(factor))
+            if not (abs(factor - 1) > 1e-3 and outcome.converged):
+                break
     return _without_range_bias(
         Fitted(
             screened=screened,
@@ -80,11 +86,11 @@ def fitted_elsewhere(
 ) -> Fitted:
     """A problem that was fitted elsewhere, over what it accepts: `costs` on the way, and why that ended.
 
-    Where it is not the optimum of what it accepts, or residuals decide how large the noise is, the rounds of
-    `fit` follow.
+    Where it is not the optimum of what it accepts, residuals decide how large the noise is, or fields are
+    free, the rounds of `fit` follow.
     """
     prepared, problem = screened.prepared, screened.problem
-    if not is_optimum or prepared.rescales_noise:
+    if not is_optimum or prepared.rescales_noise or prepared.sharing.field != FIXED:
         fitted = fit(screened)
         outcome = fitted.outcome
         return replace(

@@ -5,8 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pancam_graph.base.errors import SolveError
-from pancam_graph.base.geometry import BoolArray
+from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.data import State, Verdict
+from pancam_graph.elimination import Covariance
 from pancam_graph.landmarks import refine
 from pancam_graph.solve._considered import considered
 from pancam_graph.solve._covariance import Uncertainty, uncertainty
@@ -80,7 +81,7 @@ def judge(fitted: Fitted) -> Judged:
             *prepared.warnings,
             *(f"{sentence(part)}: let go" for part in let_go),
             *warnings,
-            *_fit_warnings(fitted, used),
+            *_fit_warnings(fitted, used, reduced, covariances),
             *connection_warnings(prepared.traverse, m.image[problem.kept], m.landmark[problem.kept]),
         ),
     )
@@ -142,7 +143,7 @@ def _first(fitted: Fitted) -> Problem:
     prepared, problem = fitted.screened.prepared, fitted.problem
     first, m = prepared.problem, problem.measurements
     if problem.template.let_go:
-        first = replace(first, template=problem.template, factors=problem.factors)
+        first = first.letting_go(problem.template.let_go)
     if m is first.measurements and problem.accepted.all():
         return first
     return triangulated(replace(first, measurements=m, accepted=problem.accepted)).placed()
@@ -161,13 +162,16 @@ def _unknown(fitted: Fitted) -> Uncertainty:
     )
 
 
-def _fit_warnings(fitted: Fitted, used: BoolArray) -> list[str]:
+def _fit_warnings(
+    fitted: Fitted, used: BoolArray, reduced: ReducedSystem | None, covariances: Uncertainty
+) -> list[str]:
     """Warnings of observations that a fit gave up, or keeps against the odds."""
     prepared, warnings = fitted.screened.prepared, []
     n_behind = int(fitted.behind.sum())
     if n_behind:
         warnings.append(f"{n_behind} observations of landmarks behind a camera: left out")
-    diverging = [str(track) for track in prepared.landmark_track[_diverging(fitted.problem)]]
+    beyond = _diverging(fitted.problem, reduced, covariances.variables)
+    diverging = [str(track) for track in prepared.landmark_track[beyond]]
     if diverging:
         warnings.append(
             f"{listed(diverging, 'track')}: rays diverge by more than noise, as wrong matches do; "
@@ -181,8 +185,11 @@ def _fit_warnings(fitted: Fitted, used: BoolArray) -> list[str]:
     return warnings
 
 
-def _diverging(problem: Problem) -> BoolArray:
-    """Landmarks (landmarks,) that would fit worse by 3 sigma if they were no further than infinity."""
+def _diverging(problem: Problem, reduced: ReducedSystem | None, variables: Covariance | None) -> BoolArray:
+    """Landmarks (landmarks,) that would fit worse by 3 sigma if they were no further than infinity.
+
+    Sigmas are those of noise and cameras together, where the covariance of the cameras' variables is known.
+    """
     beyond = problem.present & (problem.landmarks.vector[:, 3] < 0)
     if beyond.any():
         m, rows = problem.measurements, np.flatnonzero(beyond)
@@ -191,5 +198,21 @@ def _diverging(problem: Problem) -> BoolArray:
             problem, landmarks=refine(problem.landmarks, m, problem.views, weight, only=rows)
         ).residuals[0]
         excess = weight * np.sum(bound**2 - problem.residuals[0] ** 2, axis=1)
-        beyond &= np.bincount(m.landmark, excess, minlength=m.n_landmarks) > 9.0
+        square = np.bincount(m.landmark, excess, minlength=m.n_landmarks)
+        beyond &= square > 9.0
+        if beyond.any() and reduced is not None and variables is not None:
+            beyond &= square > 9.0 * _by_cameras(problem, reduced, variables)
     return beyond
+
+
+def _by_cameras(problem: Problem, reduced: ReducedSystem, variables: Covariance) -> FloatArray:
+    """Variance (landmarks,) of each landmark's range, over what it would be if cameras were exact."""
+    along = problem.landmarks.vector[reduced.rows, :3]
+    with_cameras, alone = (
+        np.einsum("ni,nij,nj->n", along, reduced.system.landmark_covariance_m2(c), along)
+        for c in (variables, None)
+    )
+    out = np.ones(len(problem.landmarks.vector))
+    known = np.isfinite(with_cameras) & (alone > 0) & np.isfinite(alone)
+    out[reduced.rows[known]] = with_cameras[known] / alone[known]
+    return out

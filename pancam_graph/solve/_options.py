@@ -42,6 +42,10 @@ class SolveOptions(StopRule):
     numbers is estimated, with these sigmas as priors; "held": the rig counts as exact; "considered": it is
     not moved, but its uncertainty is in every sigma of the solution (model "mast" only). A frame's flex is
     estimated with its pan and tilt where the rig is estimated or considered."""
+    field: bool | None = None
+    """Whether the final least squares also estimates a smooth distortion field of each eye, beside its lens
+    (model "mast" with a hard tie); default: where the rig is estimated, no sharing is given, and this package
+    measured the observations. Its prior is `RigUncertainty.field_px`."""
     sharing: Sharing | None = None
     """Free numbers of the rig, and images that share them, in place of those that `rig` makes free; default:
     the traverse's own."""
@@ -94,6 +98,11 @@ class SolveOptions(StopRule):
             )
         if self.flex is not None and self.firm_tie == "hard":
             raise InputError("flex: expected none with a hard tie, which has no sigma")
+        if self.field and not self.takes_field:
+            raise InputError(
+                "field: expected none but with the model mast, a hard tie, eliminated landmarks, the joint "
+                "method and a rig that is not considered"
+            )
         if not self.outlier_sigma > 0:
             raise InputError(f"outlier_sigma: expected a number above 0, found {self.outlier_sigma}")
 
@@ -101,6 +110,12 @@ class SolveOptions(StopRule):
     def firm_tie(self) -> Tie:
         """The tie that is used: the given one, or the model's own."""
         return self.tie or ("hard" if self.model == "mast" else "soft")
+
+    @property
+    def takes_field(self) -> bool:
+        """Whether such a solve can estimate smooth distortion fields."""
+        is_usual = (self.model, self.landmarks, self.method) == ("mast", "eliminated", "joint")
+        return is_usual and self.firm_tie == "hard" and self.rig != "considered"
 
     @property
     def firm_flex(self) -> Flex:

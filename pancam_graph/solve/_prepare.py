@@ -11,12 +11,14 @@ from pancam_graph.base.errors import InputError, SolveError
 from pancam_graph.base.geometry import BoolArray, IntArray
 from pancam_graph.data import (
     FIXED,
+    Freedom,
     Observations,
     PixelNoise,
     RigCorrection,
     Sharing,
     State,
     Traverse,
+    field_within,
     sharing_for,
 )
 from pancam_graph.graph import (
@@ -73,7 +75,7 @@ class Prepared:
     """The input; it has observations."""
     options: SolveOptions
     sharing: Sharing
-    """Which numbers of the rig are free, as the model takes them."""
+    """Which numbers of the rig are free, as the model takes them; fields in the final least squares alone."""
     problem: Problem
     """Cameras at the start, each landmark where it fits them best, every measurement accepted."""
     landmark_track: IntArray
@@ -123,7 +125,8 @@ def prepare(
     start = in_turns_of_telemetry(start, traverse) if start else start_from_telemetry(traverse)
     cameras = start.cameras if options.model in {"free", "projective"} else None
     sharing = free_numbers(traverse, options)
-    template = template_for(traverse, options, sharing)
+    # Fields are far below what outliers are judged by, and have many columns: `fit` adds them at its end.
+    template = template_for(traverse, options, replace(sharing, field=FIXED))
     solver_for(options).require(template)
     values = template.values(_first_state(traverse, start, cameras))
     measurements, track, reason = _measure(traverse.observations, template, values)
@@ -179,7 +182,7 @@ def triangulated(problem: Problem) -> Problem:
 
 
 def free_numbers(traverse: Traverse, options: SolveOptions) -> Sharing:
-    """Which numbers of the rig are free, as the model takes them.
+    """Which numbers of the rig are free in the final least squares, as the model takes them.
 
     Raises InputError for a sharing that the model does not take, and for a rig that is to be considered where
     numbers of it are free.
@@ -191,6 +194,7 @@ def free_numbers(traverse: Traverse, options: SolveOptions) -> Sharing:
             "numbers that are not moved"
         )
     sharing = sharing_for(traverse.rig, options.model, options.rig, given)
+    sharing = replace(sharing, field=_field(traverse, options, given))
     if sharing.flex == FIXED or options.firm_tie == "hard":
         return sharing
     if given is not None:
@@ -199,6 +203,25 @@ def free_numbers(traverse: Traverse, options: SolveOptions) -> Sharing:
             f"found {sharing.flex.scope}"
         )
     return replace(sharing, flex=FIXED)
+
+
+def _field(traverse: Traverse, options: SolveOptions, given: Sharing | None) -> Freedom:
+    """The freedom of smooth distortion fields. Raises InputError where the options cannot have one."""
+    stated = FIXED if given is None else given.field
+    if stated != FIXED and not options.takes_field:
+        raise InputError(
+            "sharing: field: expected fixed but with the model mast, a hard tie, eliminated landmarks and "
+            f"the joint method; found {stated.scope}"
+        )
+    wanted = options.field
+    if wanted is None:
+        measured = traverse.observations is not None and traverse.observations.origin == "images"
+        wanted = stated != FIXED or (
+            given is None and options.rig == "estimated" and measured and options.takes_field
+        )
+    if not wanted:
+        return FIXED
+    return field_within(traverse.rig.uncertainty) if stated == FIXED else stated
 
 
 def template_for(traverse: Traverse, options: SolveOptions, sharing: Sharing) -> FactorTemplate:

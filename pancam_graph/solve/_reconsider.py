@@ -75,8 +75,9 @@ def _is_of_rig(error: Correction, judged: Judged) -> bool:
 def _fitted_again(fitted: Fitted, let_go: LetGo) -> Fitted:
     """The observations judged anew and fitted, from where a fit ended, with telemetry let go."""
     screened = fitted.screened
+    problem = fitted.problem.on(screened.problem.template)  # without the fields that `fit` adds
     problem = replace(
-        screened.problem.letting_go(let_go), values=fitted.problem.values, landmarks=fitted.problem.landmarks
+        screened.problem.letting_go(let_go), values=problem.values, landmarks=fitted.problem.landmarks
     )
     excluded = screened.excluded | screened.by_chance
     again = screened_again(replace(screened, problem=problem, excluded=excluded))

@@ -10,7 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.cameras import FIELD_PER_COEFFICIENT
 from pancam_graph.data import Refined, Traverse, Verdict, VerdictTest
+from pancam_graph.graph import HardTemplate
 from pancam_graph.solve._chances import CHANCE, rms_limit, two_sided_limit
 from pancam_graph.solve._covariance import Uncertainty
 from pancam_graph.solve._fit import Fitted
@@ -37,6 +39,9 @@ _NAMED = 6
 """Parts of telemetry let go that are named."""
 _BEATEN = 3.0
 """Change of an entry of the rig in sigmas of its prior from which it is said."""
+_FIELD_BEATEN = 2.0
+"""Size of a smooth distortion field in sigmas of its prior from which it is said: that of some hundred
+coefficients drawn from the prior is within 0.8 and 1.2."""
 _HELD_GAIN = 25.0
 """Decrease of the cost from which a held number of the rig is named, if it is also this ..."""
 _HELD_SHARE = 0.02
@@ -78,6 +83,7 @@ def verdict(at: Optimum) -> Verdict:
         _let_go(at),
         *let_go_links(at.fitted.problem),
         *_freed(at),
+        *_fields(at),
         *_held(at),
     ]
     return Verdict(tests=tuple(tests))
@@ -328,6 +334,27 @@ def _freed(at: Optimum) -> Iterator[VerdictTest]:
             f"{says}, {worst:.3g} times what its prior allows: the rig is probably another one, or needs "
             "more of its numbers free",
         )
+
+
+def _fields(at: Optimum) -> Iterator[VerdictTest]:
+    """Smooth distortion fields that were free, against their priors."""
+    template = at.problem.template
+    rig = template.correction(at.problem.values)
+    if rig is None or rig.field_px is None or not isinstance(template, HardTemplate):
+        return
+    size_px = FIELD_PER_COEFFICIENT * np.sqrt(np.mean(rig.field_px**2, axis=(1, 2, 3)))
+    share = size_px / template.field_sigma_px
+    eye = int(np.argmax(share))
+    name = at.traverse.rig.eyes[eye].name
+    says = f"smooth field of {name}: {size_px[eye]:.2g} px, {share[eye]:.2g} times its "
+    yield VerdictTest.note(
+        "field",
+        float(share[eye]),
+        _FIELD_BEATEN,
+        f"{says}sigma at most",
+        f"{says}uncertainty: the lens is another one than the rig says; look for a better calibration, or "
+        "state a larger field_px (rig: uncertainty in traverse.json)",
+    )
 
 
 def _against_uncertainty(refined: Sequence[Refined]) -> VerdictTest:

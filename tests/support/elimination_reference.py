@@ -22,7 +22,10 @@ def whitened(
     h = np.einsum("nij,nj->ni", projection, landmarks.vector[j])
     uv = h[:, :2] / h[:, 2:]
     d_vector = (projection[:, :2] - uv[:, :, None] * projection[:, 2:]) / h[:, 2:, None]
-    return np.einsum("nij,nj->ni", m.whitening, uv - m.uv_px), m.whitening @ d_vector, h[:, 2] > 0
+    off = uv - m.uv_px
+    if views.fields is not None:
+        off = off + views.fields.at(i, m.uv_px)
+    return np.einsum("nij,nj->ni", m.whitening, off), m.whitening @ d_vector, h[:, 2] > 0
 
 
 @dataclass(frozen=True)

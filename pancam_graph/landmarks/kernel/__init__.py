@@ -6,6 +6,8 @@ Everything else of the package works on whole arrays, or once per image, frame o
 from pancam_graph.landmarks.kernel._eliminate import eliminate_calibrations as eliminate_calibrations
 from pancam_graph.landmarks.kernel._eliminate import eliminate_poses as eliminate_poses
 from pancam_graph.landmarks.kernel._eliminate import must_compile as must_compile
+from pancam_graph.landmarks.kernel._fields import FieldSights as FieldSights
+from pancam_graph.landmarks.kernel._fields import eliminate_fields as eliminate_fields
 from pancam_graph.landmarks.kernel._follow import follow as follow
 from pancam_graph.landmarks.kernel._follow import landmark_costs as landmark_costs
 from pancam_graph.landmarks.kernel._follow import point_covariances as point_covariances

@@ -22,7 +22,15 @@ from pancam_graph.landmarks.kernel._sphere import by_tangents, tangents
 from pancam_graph.landmarks.kernel._symmetric import UNDETERMINED
 from pancam_graph.landmarks.kernel._tiles import subtract_row, tile_entry
 
-__all__ = ["WEAK_PRIOR", "eliminate_calibrations", "eliminate_poses", "must_compile"]
+__all__ = [
+    "WEAK_PRIOR",
+    "by_calibration",
+    "cross",
+    "eliminate_calibrations",
+    "eliminate_poses",
+    "in_base",
+    "must_compile",
+]
 
 WEAK_PRIOR = 1e-12
 """Information of a landmark's weak prior, as a share of the trace of its information V."""
@@ -79,7 +87,7 @@ def _add_units(
 
 
 @part
-def _by_calibration(
+def by_calibration(
     calibration: FloatArray,
     image: int,
     u: float,
@@ -148,7 +156,7 @@ def _plus_outer(row: Three, p: float, a: Three, q: float, b: Three) -> Three:
 
 
 @inlined
-def _in_base(unit_R: FloatArray, unit: int, d: Three) -> Three:
+def in_base(unit_R: FloatArray, unit: int, d: Three) -> Three:
     """A direction (3,) in the world, or a derivative by one, taken to the frame of a unit's base."""
     return (
         d[0] * unit_R[unit, 0, 0] + d[1] * unit_R[unit, 1, 0] + d[2] * unit_R[unit, 2, 0],
@@ -158,7 +166,7 @@ def _in_base(unit_R: FloatArray, unit: int, d: Three) -> Three:
 
 
 @inlined
-def _cross(a: Three, x: Three) -> Three:
+def cross(a: Three, x: Three) -> Three:
     """Cross product of a and x."""
     return a[1] * x[2] - a[2] * x[1], a[2] * x[0] - a[0] * x[2], a[0] * x[1] - a[1] * x[0]
 
@@ -196,7 +204,7 @@ def _add_calibration(
     """
     b0, b1, e0, e1 = derivatives
     jac, by_landmark, by_base = sums.jacobian, sums.by_landmark, sums.by_base
-    _by_calibration(bearings.cameras.calibration, sights.image[i], u, v, sights.whitening, i, root, jac)
+    by_calibration(bearings.cameras.calibration, sights.image[i], u, v, sights.whitening, i, root, jac)
     for p in range(5):
         ja, jb = jac[0, p], jac[1, p]
         by_landmark[p, 0] += ja * b0[0] + jb * b1[0]
@@ -220,10 +228,10 @@ def _add_twist(
     and e'r. A twist moves the ray by [x]_x times its rotation and by -w times its translation.
     """
     m00, m01, m02, m11, m12, m22 = m
-    q0, q1, q2 = _cross((m00, m01, m02), x), _cross((m01, m11, m12), x), _cross((m02, m12, m22), x)
-    h0 = _cross((q0[0], q1[0], q2[0]), x)
-    h1 = _cross((q0[1], q1[1], q2[1]), x)
-    h2 = _cross((q0[2], q1[2], q2[2]), x)
+    q0, q1, q2 = cross((m00, m01, m02), x), cross((m01, m11, m12), x), cross((m02, m12, m22), x)
+    h0 = cross((q0[0], q1[0], q2[0]), x)
+    h1 = cross((q0[1], q1[1], q2[1]), x)
+    h2 = cross((q0[2], q1[2], q2[2]), x)
     unit_H[row, 0, 0] += h0[0]
     unit_H[row, 0, 1] += h1[0]
     unit_H[row, 0, 2] += h2[0]
@@ -240,7 +248,7 @@ def _add_twist(
     unit_H[row, 4, 4] += w * w * m11
     unit_H[row, 4, 5] += w * w * m12
     unit_H[row, 5, 5] += w * w * m22
-    turning = _cross(k, x)
+    turning = cross(k, x)
     for p in range(3):
         unit_s[row, p] += turning[p]
         unit_s[row, 3 + p] -= w * k[p]
@@ -251,7 +259,7 @@ def _add_twist_by_calibration(unit_H: FloatArray, row: int, w: float, x: Three, 
     """Add the products of twist and calibration of one occurrence to the information about its base."""
     for p in range(5):
         f = by_base[0, p], by_base[1, p], by_base[2, p]
-        turning = _cross(f, x)
+        turning = cross(f, x)
         for q in range(3):
             unit_H[row, q, 6 + p] += turning[q]
             unit_H[row, 3 + q, 6 + p] -= w * f[q]
@@ -416,8 +424,8 @@ def _eliminating(rows: int) -> Callable[..., None]:
                     )
                     b0 = by_tangents(t, d00, d01, d02, w0 - (d00 * c0 + d01 * c1 + d02 * c2))
                     b1 = by_tangents(t, d10, d11, d12, w1 - (d10 * c0 + d11 * c1 + d12 * c2))
-                    e0 = _in_base(bearings.unit_R, unit, (d00, d01, d02))
-                    e1 = _in_base(bearings.unit_R, unit, (d10, d11, d12))
+                    e0 = in_base(bearings.unit_R, unit, (d00, d01, d02))
+                    e1 = in_base(bearings.unit_R, unit, (d10, d11, d12))
                     v, g = _plus_gram(v, b0, b1), _plus_product(g, b0, b1, r0, r1)
                     m, k = _plus_gram(m, e0, e1), _plus_product(k, e0, e1, r0, r1)
                     n0 = _plus_outer(n0, e0[0], b0, e1[0], b1)
@@ -443,13 +451,13 @@ def _eliminating(rows: int) -> Callable[..., None]:
                 y0 = X0 - w * (bearings.unit_t[unit, 0] - O0)
                 y1 = X1 - w * (bearings.unit_t[unit, 1] - O1)
                 y2 = X2 - w * (bearings.unit_t[unit, 2] - O2)
-                x = _in_base(bearings.unit_R, unit, (y0, y1, y2))
+                x = in_base(bearings.unit_R, unit, (y0, y1, y2))
                 _add_twist(unit_H, unit_s, row, w, x, m, k)
                 if more:
                     _add_twist_by_calibration(unit_H, row, w, x, sums.by_base)
-                z0 = _cross((n0[0], n1[0], n2[0]), x)
-                z1 = _cross((n0[1], n1[1], n2[1]), x)
-                z2 = _cross((n0[2], n1[2], n2[2]), x)
+                z0 = cross((n0[0], n1[0], n2[0]), x)
+                z1 = cross((n0[1], n1[1], n2[1]), x)
+                z2 = cross((n0[2], n1[2], n2[2]), x)
                 twist_by_landmark = (
                     (z0[0], z1[0], z2[0]),
                     (z0[1], z1[1], z2[1]),

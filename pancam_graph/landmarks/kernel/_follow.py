@@ -118,6 +118,7 @@ def point_covariances(
     reduced: Reduced,
     vector: FloatArray,
     joint: FloatArray,
+    more: FloatArray,
     begin: int,
     end: int,
     covariance_m2: FloatArray,
@@ -125,7 +126,8 @@ def point_covariances(
     """Covariances (landmarks, 3, 3) of the points X / w of landmarks begin to end.
 
     `joint` is the covariance C of the variables of their block. In the tangent space a landmark's covariance
-    is L^-T (I + W C W') L^-1, W being its `arms`; the derivative of X / w takes it to the point.
+    is L^-T (I + W C W' + more) L^-1, W being its `arms`; the derivative of X / w takes it to the point.
+    `more` (end - begin, 3, 3) is what variables outside the block add.
     """
     arms, pair = reduced.arms, sights.pair
     tangent, half, point = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
@@ -133,7 +135,7 @@ def point_covariances(
         first, last = sights.pair_begin[j], sights.pair_begin[j + 1]
         for a in range(3):
             for b in range(3):
-                tangent[a, b] = 1.0 if a == b else 0.0
+                tangent[a, b] = more[j - begin, a, b] + (1.0 if a == b else 0.0)
         for p in range(2 * first, 2 * last):
             row, i = 2 * pair[p >> 1] + (p & 1), 6 * (p >> 1) + (p & 1)
             for q in range(2 * first, 2 * last):

@@ -163,6 +163,7 @@ class _Whole:
             loss="none",
             rescale_noise=False,
             landmark_covariances=False,
+            field=final.rig is not None and final.rig.field_px is not None,
             relative_decrease=min(options.relative_decrease, _RELATIVE_DECREASE),
         )
         start = Start(world_T_mast=final.world_T_mast, pan_tilt_rad=final.pan_tilt_rad)
