@@ -9,7 +9,7 @@ import pytest
 
 from pancam_graph import SimulationOptions, Solution, SolveOptions, simulate, solve
 from pancam_graph.base.geometry import FloatArray
-from pancam_graph.cameras import Camera, Pinhole
+from pancam_graph.cameras import FIELD_SHAPE, Camera, Pinhole
 from pancam_graph.data import RigTreatment
 from pancam_graph.report._lens_figures import displacement_px, mean_residuals
 from pancam_graph.report._look import Figure
@@ -79,6 +79,24 @@ def test_each_eye_has_its_figures() -> None:
         for when in ("with the rig held as told", "as refined")
     )
     assert before > 3 * after
+
+
+def test_a_smooth_field_is_drawn_beside_the_lens() -> None:
+    solution = solved()
+    assert solution.final.rig is not None
+    field_px = np.zeros((2, *FIELD_SHAPE))
+    field_px[1, 0] = 0.05  # of a constant field all coefficients are alike
+    state = replace(solution.final, rig=replace(solution.final.rig, field_px=field_px))
+    with_field = {f.id: f for f in rig_section(replace(solution, final=state))[1]}
+    assert "field-0" not in with_field
+    assert set(with_field["field-1"].traces[1]["text"]) == {"0.0500 px (0.0500, 0)"}
+    without = {figure.id: figure for figure in section()[1]}
+    for kind in ("lens-1", "bent-1"):
+        words = [
+            re.findall(r"\((\S+), \S+\)", t)[0]
+            for t in (with_field[kind].traces[1]["text"][0], without[kind].traces[1]["text"][0])
+        ]
+        assert float(words[0]) - float(words[1]) == pytest.approx(0.05, abs=0.02)
 
 
 def test_flex_is_said_in_short() -> None:
