@@ -42,10 +42,10 @@ _BEATEN = 3.0
 _FIELD_BEATEN = 2.0
 """Size of a smooth distortion field in sigmas of its prior from which it is said: that of some hundred
 coefficients drawn from the prior is within 0.8 and 1.2."""
-_HELD_GAIN = 25.0
-"""Decrease of the cost from which a held number of the rig is named, if it is also this ..."""
 _HELD_SHARE = 0.02
-"""... share of the cost."""
+"""Share of the cost by which a held number of the rig must lower it too, beside what chance explains.
+
+Gains of large problems are raised from a part."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -386,7 +386,7 @@ def _held(at: Optimum) -> Iterator[VerdictTest]:
         yield (VerdictTest.note if is_considered else VerdictTest.of)(
             "held rig",
             best.gain,
-            max(_HELD_GAIN, _HELD_SHARE * cost),
+            max(0.5 * two_sided_limit(len(held), CHANCE) ** 2, _HELD_SHARE * cost),
             "no held number of the rig would lower the cost by much",
             _advice(best, cost),
         )

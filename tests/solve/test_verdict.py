@@ -14,6 +14,7 @@ from pancam_graph.solve import _rig_score, judge
 from pancam_graph.solve._rig_score import held_entries
 from pancam_graph.solve._telemetry_tests import entry_errors, leg_errors, telemetry_of, total
 from support.solving import fitted
+from support.truth import errors_in_sigmas
 
 SMALL = SimulationOptions(stops=2, pans=9, points_per_image=20)
 
@@ -157,6 +158,17 @@ def test_a_held_rig_that_is_wrong_fails_with_advice() -> None:
     assert not test.passed
     assert "--rig estimated" in test.says
     assert "--sharing calibration=eye:focal" in test.says
+
+
+def test_a_held_rig_that_is_wrong_by_little_fails_where_little_is_seen() -> None:
+    """One eye, part of a panorama: it was 8.9 sigmas off where no test but the score of the rig says so."""
+    rig = TEMPLATES["mer-navcam"]()
+    options = SimulationOptions(stops=2, pans=9, points_per_image=25, rig_error="drawn")
+    made = simulate(replace(rig, eyes=rig.eyes[:1]), options, seed=8507)
+    solution = solve(made.traverse, SolveOptions(rig="held"))
+    angles, stops = errors_in_sigmas(made, solution)
+    assert max(np.abs(angles).max(), stops.max()) > 3
+    assert [name for name, test in named(solution).items() if not test.passed] == ["held rig"]
 
 
 def test_a_considered_rig_that_is_wrong_is_advised_of() -> None:
