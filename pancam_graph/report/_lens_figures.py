@@ -206,7 +206,7 @@ def _arrows(
             "hovertemplate": "pixel (%{x}, %{y})<br>%{text}<extra></extra>",
         },
     )
-    enlarged = "at true length" if factor == 1 else f"{factor:,.3g} times enlarged"
+    enlarged = "at true length" if factor == 1 else f"{factor:,.{0 if factor >= 1 else 3}f} times enlarged"
     longest_px = short(float(length.max()) if len(length) else float("nan"))
     frame: Json = {
         "type": "rect",

@@ -42,9 +42,7 @@ section { margin-top: 30px; }
 #scene { height: 600px; }
 #map, #histogram { height: 540px; }
 #corrections { height: 520px; }
-.panels { display: grid; grid-template-columns: repeat(4, minmax(0, 1fr)); gap: 8px 18px; }
-@media (max-width: 1250px) { .panels { grid-template-columns: repeat(2, minmax(0, 1fr)); } }
-@media (max-width: 640px) { .panels { grid-template-columns: minmax(0, 1fr); } }
+.panels { display: grid; grid-template-columns: repeat(auto-fit, minmax(240px, 1fr)); gap: 8px 18px; }
 .panels > div { min-width: 0; break-inside: avoid; }
 .over-image .modebar { display: none; }
 h3 { font-size: 16px; margin: 16px 0 6px; overflow-wrap: anywhere; }
