@@ -217,7 +217,7 @@ def _arrows(
         "line": {"color": INK, "width": 1},
         "layer": "below",
     }
-    across: Json = {"zeroline": False, "showgrid": False, "constrain": "domain", "nticks": 6}
+    across: Json = {"zeroline": False, "showgrid": False, "constrain": "domain", "nticks": 4}
     room = 0.03 * side
     reach = np.concatenate([tip, [[0.0, 0.0], [camera.width_px, camera.height_px]]])
     low, high = (reach.min(axis=0) - room).tolist(), (reach.max(axis=0) + room).tolist()
