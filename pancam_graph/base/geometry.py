@@ -9,7 +9,6 @@ from collections.abc import Sequence
 
 import gtsam
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from pancam_graph.base.errors import GeometryError
@@ -189,9 +188,11 @@ def rotation_from_wxyz(wxyz: Sequence[float] | FloatArray) -> FloatArray:
 
 
 def wxyz_from_rotation(rotation: FloatArray) -> FloatArray:
-    """Unit quaternion (w, x, y, z) with w >= 0 of a rotation matrix."""
-    xyzw = scipy.spatial.transform.Rotation.from_matrix(rotation).as_quat(canonical=True)
-    return np.roll(xyzw, 1)
+    """Unit quaternion (w, x, y, z) of a rotation matrix; its first component that is not 0 is positive."""
+    # SciPy's rotations load its constants, which take a twentieth of a short run.
+    q = gtsam.Rot3(rotation).toQuaternion()
+    wxyz = np.array([q.w(), q.x(), q.y(), q.z()]) / np.linalg.norm(q.coeffs())
+    return np.where(wxyz[np.flatnonzero(wxyz)[0]] > 0, wxyz, -wxyz)
 
 
 def pose_from_wxyz(wxyz: Sequence[float], translation_m: Sequence[float]) -> gtsam.Pose3:
