@@ -86,15 +86,6 @@ class LandmarkBlocks:
             self._panels, self._root = None, None
         return moved
 
-    def panels(self, values: gtsam.Values) -> Panels:
-        """The Schur complement (S, s) of all landmarks at these values, to which the landmarks move."""
-        self._evaluate(values, self._touched)
-        self._adopt()
-        if self._panels is None:
-            self._linearise()
-        assert self._panels is not None
-        return self._panels.copy()
-
     def _factor(self, group: int) -> gtsam.CustomFactor:
         link, structure = self.system.linkage, self.system.structure
         members = [

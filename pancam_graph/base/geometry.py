@@ -6,6 +6,7 @@ seen from above, tilt is positive upwards.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -190,8 +191,9 @@ def rotation_from_wxyz(wxyz: Sequence[float] | FloatArray) -> FloatArray:
 def wxyz_from_rotation(rotation: FloatArray) -> FloatArray:
     """Unit quaternion (w, x, y, z) of a rotation matrix; its first component that is not 0 is positive."""
     # SciPy's rotations load its constants, which take a twentieth of a short run.
-    q = gtsam.Rot3(rotation).toQuaternion()
-    wxyz = np.array([q.w(), q.x(), q.y(), q.z()]) / np.linalg.norm(q.coeffs())
+    q: Any = gtsam.Rot3(rotation).toQuaternion()  # GTSAM's stubs do not know its class
+    wxyz: FloatArray = np.array([q.w(), q.x(), q.y(), q.z()])
+    wxyz /= np.linalg.norm(wxyz)
     return np.where(wxyz[np.flatnonzero(wxyz)[0]] > 0, wxyz, -wxyz)
 
 

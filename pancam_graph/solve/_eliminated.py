@@ -3,18 +3,16 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import gtsam
 import numpy as np
 
 from pancam_graph.base.geometry import IntArray
 from pancam_graph.elimination import LandmarkSystem, Root
-from pancam_graph.factors import LandmarkBlocks
-from pancam_graph.graph import HardTemplate, read_variable
+from pancam_graph.graph import HardTemplate
 from pancam_graph.landmarks import SQUARED, Loss
 from pancam_graph.solve._joint import JointSystem, OnLastGroup
-from pancam_graph.solve._optimise import InOrder, Iteration, OnGraph, Outcome, optimise
+from pancam_graph.solve._optimise import Iteration, Outcome, optimise
 from pancam_graph.solve._problem import Problem, Solver, system_of
-from pancam_graph.solve._reduced import ReducedSystem, joint_root
+from pancam_graph.solve._reduced import ReducedSystem
 from pancam_graph.solve._stopping import LEFT_SIGMAS, StopRule
 
 __all__ = ["EliminatedSolver", "Ended"]
@@ -85,22 +83,8 @@ class EliminatedSolver(Solver):
             return _only_landmarks(problem, loss)
         system, rows = system_of(problem, loss)
         # Images alone leave directions of a free rig next to undetermined, and rounding in their square root
-        # exceeds what priors say of these: such a system is eliminated with its priors in it.
-        is_free = template.rig_variables.variables or template.linkage.fields is not None
-        alone = not (template.has_cameras or is_free)
-        minimise = self._by_blocks if alone else self._by_groups
-        outcome, joint = minimise(problem, system, rule, stage, left_sigmas)
-        return self._ended(problem, outcome, system, rows, joint), outcome
-
-    def _by_groups(
-        self, problem: Problem, system: LandmarkSystem, rule: StopRule, stage: str, left_sigmas: float
-    ) -> tuple[Outcome, Root | None]:
-        """Minimise on the last group, others eliminated with all priors in the system.
-
-        For models with a variable per image, and where the rig is free.
-        """
+        # exceeds what priors say of these: stops are eliminated with all priors in the system.
         joint = JointSystem(problem, system)
-
         outcome = optimise(
             lambda: OnLastGroup(joint, rule),
             rule,
@@ -110,36 +94,7 @@ class EliminatedSolver(Solver):
             gain_ahead=lambda _values: _gain_ahead(system, joint.root),
             left_sigmas=left_sigmas,
         )
-        return outcome, joint.known_root
-
-    def _by_blocks(
-        self, problem: Problem, system: LandmarkSystem, rule: StopRule, stage: str, left_sigmas: float
-    ) -> tuple[Outcome, Root | None]:
-        """Minimise by GTSAM on landmark blocks: for variables that each move many images, the rig held."""
-        template = problem.template
-        blocks = LandmarkBlocks(system, read_variable, template.posture)
-        graph = gtsam.NonlinearFactorGraph(problem.factors.graph)
-        for factor in blocks.factors():
-            graph.push_back(factor)
-        joint: Root | None = None
-
-        def root(values: gtsam.Values) -> Root:
-            nonlocal joint
-            joint = joint_root(template, problem.factors, values, blocks.panels(values))
-            return joint
-
-        outcome = optimise(
-            lambda: OnGraph(graph, problem.values, rule, InOrder(blocks.ordering()), template.held_columns()),
-            rule,
-            n_observations=int(problem.kept.sum()),
-            stage=stage,
-            on_iteration=self.on_iteration,
-            gain_ahead=lambda values: _gain_ahead(system, lambda: root(values)),
-            left_sigmas=left_sigmas,
-        )
-        if blocks.settle(outcome.values):
-            joint = None  # the landmarks have moved since
-        return outcome, joint
+        return self._ended(problem, outcome, system, rows, joint.known_root), outcome
 
     def _ended(
         self,

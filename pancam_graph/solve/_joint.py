@@ -1,20 +1,21 @@
 """A problem for GTSAM's Levenberg-Marquardt with all groups of variables but the last one eliminated.
 
-In models with variables per image, GTSAM's elimination takes ten times as long as all other work. So groups
-(stops) are eliminated here, as landmarks are, with the damping that GTSAM is about to use. GTSAM gets the
-square root of the Schur complement, in the columns of the last group, and decides on the damping and on
-whether to take a step. The other groups follow by back substitution. The result is the step of the whole
-system with the same damping of all variables. After each step the problem moves there, and GTSAM's vector
-begins at 0 again.
+GTSAM's elimination takes a tenth of a solve where stops are many, and ten times as long as all other work in
+models with variables per image. So groups (stops) are eliminated here, as landmarks are, with the damping
+that GTSAM is about to use. GTSAM gets the square root of the Schur complement, in the columns of the last
+group, and decides on the damping and on whether to take a step. The other groups follow by back
+substitution. The result is the step of the whole system with the same damping of all variables. After each
+step the problem moves there, and GTSAM's vector begins at 0 again.
 """
 
+from dataclasses import dataclass
 from typing import Any
 
 import gtsam
 import numpy as np
 
 from pancam_graph.base.geometry import FloatArray, IntArray
-from pancam_graph.elimination import LandmarkSystem, Linkage, Panels, Root
+from pancam_graph.elimination import LandmarkSystem, Linkage, Panels, Posture, Root
 from pancam_graph.solve._optimise import MOST_DAMPING, InOrder, parameters_of
 from pancam_graph.solve._problem import Problem
 from pancam_graph.solve._reduced import held_columns, joint_panels
@@ -47,6 +48,17 @@ def all_columns(linkage: Linkage, columns: dict[int, IntArray]) -> IntArray:
     )
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Trial:
+    """A step of all variables from the values of a joint system, and what it leads to."""
+
+    step: FloatArray
+    """(columns,)"""
+    values: gtsam.Values
+    posture: Posture
+    cost: float
+
+
 class JointSystem:
     """The values of a problem, its linearisation there, and its cost at other values.
 
@@ -61,8 +73,8 @@ class JointSystem:
         self.last = next(g for g in reversed(system.structure.order) if link.group_dim[g])
         """Index of the group that is not eliminated"""
         self._held = all_columns(link, held_columns(self.template))
-        posture = self.template.posture(self.values)
-        self.cost = system.cost_at(posture) + self.factors.error(self.values)
+        self._posture = self.template.posture(self.values)
+        self.cost = system.cost_at(self._posture) + self.factors.error(self.values)
         """Cost at these values"""
         self._forget()
 
@@ -70,12 +82,12 @@ class JointSystem:
         self._panels: Panels | None = None
         self._root: Root | None = None
         self._damped: tuple[float, Root] | None = None
-        self._tried: tuple[FloatArray, gtsam.Values, float] | None = None
+        self._tried: _Trial | None = None
 
     def panels(self) -> Panels:
         """The system (S, s) at these values, landmarks eliminated, all other factors included."""
         if self._panels is None:
-            panels = self.system.linearise(self.template.posture(self.values))
+            panels = self.system.linearise(self._posture)
             self._panels = joint_panels(self.template, self.factors, self.values, panels)
         return self._panels
 
@@ -109,17 +121,18 @@ class JointSystem:
         """True cost after a step of the last group (columns,); other groups and landmarks follow it."""
         step = self.damped_root(damping).step(known={self.last: last_step})
         step[self._held] = 0.0  # held values stay exactly the same
-        if self._tried is None or not np.array_equal(self._tried[0], step):
+        if self._tried is None or not np.array_equal(self._tried.step, step):
             values = retracted(self.template.linkage, self.values, step)
-            costs = self.system.try_step(self.template.posture(values), step)
-            self._tried = step, values, float(costs.sum()) + self.factors.error(values)
-        return self._tried[2]
+            posture = self.template.posture(values)
+            cost = float(self.system.try_step(posture, step).sum()) + self.factors.error(values)
+            self._tried = _Trial(step=step, values=values, posture=posture, cost=cost)
+        return self._tried.cost
 
     def move(self, last_step: FloatArray, damping: float) -> None:
         """Take the step of `cost_after`."""
         self.cost = self.cost_after(last_step, damping)
         assert self._tried is not None
-        self.values = self._tried[1]
+        self.values, self._posture = self._tried.values, self._tried.posture
         self.system.adopt()
         self._forget()
 

@@ -16,7 +16,6 @@ __all__ = [
     "add_factors",
     "held_columns",
     "joint_panels",
-    "joint_root",
     "landmark_panels",
     "loosened_root",
     "panels_of",
@@ -77,11 +76,6 @@ def landmark_panels(
     for group, information in (without or {}).items():
         panels.panel[group][: len(information), : len(information)] -= information
     return panels
-
-
-def joint_root(template: FactorTemplate, factors: Factors, values: gtsam.Values, panels: Panels) -> Root:
-    """Square root of `joint_panels`. Destroys the panels."""
-    return joint_panels(template, factors, values, panels).root()
 
 
 def joint_panels(template: FactorTemplate, factors: Factors, values: gtsam.Values, panels: Panels) -> Panels:

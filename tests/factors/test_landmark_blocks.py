@@ -12,12 +12,12 @@ from pancam_graph.base.geometry import FloatArray
 from pancam_graph.elimination import Posture
 from pancam_graph.factors import LandmarkBlocks
 from pancam_graph.graph import Flex, read_variable
-from pancam_graph.landmarks import SQUARED, CameraViews, Loss, LossName, loss_of
+from pancam_graph.landmarks import CameraViews, Loss, LossName, loss_of
 from pancam_graph.rigs import exomars_pancam
 from pancam_graph.simulate import Simulation
 from pancam_graph.solve import EliminatedSolver, Problem, StopRule, prepare
+from pancam_graph.solve._joint import JointSystem
 from pancam_graph.solve._problem import system_of
-from pancam_graph.solve._reduced import joint_root
 from support.elimination_reference import Dense, assert_systems_agree, dense_of, true_cost, whole
 
 TINY = SimulationOptions(stops=2, pans=2, sweep_rad=0.7, tilts_rad=(-0.2,), points_per_image=5)
@@ -279,8 +279,6 @@ def test_the_gain_ahead_is_what_the_iterations_to_come_gain(model: str) -> None:
     problem = EliminatedSolver(None).adjust(problem_of(model), RULE)[0]
     nudge = random_step(problem, np.random.default_rng(4), 1e-6)
     nudged = replace(problem, values=problem.values.retract(nudge))
-    blocks, _ = blocks_of(nudged, SQUARED)
-    panels = blocks.panels(nudged.values)
-    joint = joint_root(problem.template, problem.factors, nudged.values, panels)
-    ahead = joint.gain() + blocks.system.gain_alone
+    system, _ = system_of(nudged)
+    ahead = JointSystem(nudged, system).root().gain() + system.gain_alone
     assert ahead == pytest.approx(nudged.cost() - problem.cost(), rel=1e-3)
