@@ -1,12 +1,13 @@
 """A block of landmarks, eliminated: one factor of iSAM2 on the variables of the stops that observe them.
 
 The block is linearised at iSAM2's linearisation point of these variables. Its Schur complement there is one
-quadratic factor, which iSAM2 gets in a gtsam.LinearContainerFactor. The factor is removed and added again
+linear factor, which iSAM2 gets in a gtsam.LinearContainerFactor. The factor is removed and added again
 when the block's landmarks are observed again, and when iSAM2 moves the linearisation point of one of its
 variables.
 """
 
 from dataclasses import replace
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -54,10 +55,14 @@ class LandmarkBlock:
         """Keys of the variables that its observations depend on."""
         return self.system.linkage.key
 
-    def linearise(self, theta: Postures, estimate: gtsam.Values, unit: FloatArray) -> None:
+    def linearise(
+        self, theta: Postures, estimate: gtsam.Values, unit: FloatArray, *, by_rows: bool = False
+    ) -> None:
         """Make the factor at the linearisation point `theta`, with landmarks moved there from `estimate`.
 
         `unit` (6,) are rotations, radians, and shifts, metres, of a mast that count as equally large.
+        `by_rows`: a factor of rows, for QR, which takes the square root of a quadratic factor by a Cholesky
+        that fails where images leave a direction free.
         """
         link, stations, system = self.system.linkage, self.patch.stations, self.system
         there = [s.world_T_mast(theta.values) for s in stations]
@@ -75,7 +80,8 @@ class LandmarkBlock:
         self.cost = float(system.reduced.cost.sum())
         self._here = copied(theta.values, link.key)
         self._theta = there
-        self.factor = gtsam.LinearContainerFactor(_quadratic(panels, system), self._here)
+        linear = _rows(panels, system, self._here) if by_rows else _quadratic(panels, system)
+        self.factor = gtsam.LinearContainerFactor(linear, self._here)
 
     def apart(self, estimate: gtsam.Values) -> float:
         """Largest motion of a mast since its linearisation, less the common motion, in the given units."""
@@ -120,6 +126,44 @@ class LandmarkBlock:
         return 0.0 if self.factor is None else float(self.factor.error(values))
 
 
+def _cost_of_cameras(system: LandmarkSystem) -> float:
+    """The linearised cost with the cameras held and the landmarks at their optimum."""
+    return float(system.reduced.cost.sum()) - system.gain_alone
+
+
+def _rows(panels: Panels, system: LandmarkSystem, here: gtsam.Values) -> gtsam.JacobianFactor:
+    """The factor of `_quadratic` as rows of the square root of S, which may be singular. Destroys the panels.
+
+    A last row without variables has what the cost has beyond the squares of these rows.
+    """
+    link, structure, root = system.linkage, system.structure, panels.root()
+    first_row = np.cumsum([0, *(len(rows) for rows in root.rows)])
+    jacobian = [np.zeros((int(first_row[-1]) + 1, int(dim)), order="F") for dim in link.dim]
+    error = np.zeros(int(first_row[-1]) + 1)
+    for g, rows in enumerate(root.rows):
+        of_group = slice(first_row[g], first_row[g + 1])
+        error[of_group] = rows[:, -1]
+        for h, begin in zip(structure.after[g], structure.begin[g], strict=False):
+            for v in range(link.group_begin[h], link.group_begin[h + 1]):
+                first = int(begin) + int(link.variable_column[v])
+                jacobian[v][of_group] = rows[:, first : first + int(link.dim[v])]
+    error[-1] = np.sqrt(max(2 * (_cost_of_cameras(system) - root.gain()), 0.0))
+
+    def evaluate(
+        _this: gtsam.CustomFactor, _values: gtsam.Values, jacobians: list[FloatArray] | None
+    ) -> FloatArray:
+        if jacobians is not None:
+            for i, columns in enumerate(jacobian):
+                jacobians[i] = columns
+        return error
+
+    # GTSAM's constructors of linear factors take three variables at most; no noise model: rows are whitened.
+    no_noise: Any = None
+    linear = gtsam.CustomFactor(no_noise, list(link.key), evaluate).linearize(here)
+    assert isinstance(linear, gtsam.JacobianFactor)
+    return linear
+
+
 def _quadratic(panels: Panels, system: LandmarkSystem) -> gtsam.HessianFactor:
     """The Schur complement of the landmarks as one Hessian factor f + s'x + x'Sx / 2.
 
@@ -131,7 +175,7 @@ def _quadratic(panels: Panels, system: LandmarkSystem) -> gtsam.HessianFactor:
     dims = link.dim.tolist()
     zeros = {(a, b): np.zeros((a, b)) for a in set(dims) for b in set(dims)}
     zero = {a: np.zeros(a) for a in set(dims)}
-    constant = 2 * (float(system.reduced.cost.sum()) - system.gain_alone)
+    constant = 2 * _cost_of_cameras(system)
     members = [list(range(link.group_begin[g], link.group_begin[g + 1])) for g in range(link.n_groups)]
     column = link.variable_column
     for g, panel in enumerate(panels.panel):

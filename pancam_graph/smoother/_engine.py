@@ -171,7 +171,7 @@ class Engine:
         def linearise(b: int) -> None:
             if b not in touched:
                 blocks[b].settle(estimate)
-            blocks[b].linearise(at, values, self._unit)
+            blocks[b].linearise(at, values, self._unit, by_rows=self._by_qr)
 
         each(linearise, sorted(affected))
         return affected
@@ -232,7 +232,7 @@ class Engine:
         blocks = list(self._drive.blocks.values())
         for block in blocks:
             theta.of_all(block.patch.stations)
-        each(lambda block: block.linearise(theta, values, self._unit), blocks)
+        each(lambda block: block.linearise(theta, values, self._unit, by_rows=self._by_qr), blocks)
         factors = [*self._drive.factors(firm=False), *self._drive.seated]
         self._priors = gtsam.NonlinearFactorGraph()
         for factor in factors:
