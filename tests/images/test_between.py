@@ -504,7 +504,8 @@ def test_two_stereo_panoramas_reach_the_target(rig: Callable[[], Rig], seed: int
     """Two stops 7 m apart, ten azimuths, two eyes, 1024 x 1024, telemetry's errors; from files alone."""
     rendering = render(rig(), RenderOptions(), seed=seed)
     write_rendering(rendering, tmp_path / "traverse")
-    solution = solve(find_observations(read_traverse(tmp_path / "traverse")))
+    # The lens is perfect: a field that is estimated adds its own uncertainty to pans of a row that is open.
+    solution = solve(find_observations(read_traverse(tmp_path / "traverse")), SolveOptions(field=False))
     assert solution.converged
     assert relative_rms_rad(rendering, solution).max() < 0.15e-3
     assert place_error(rendering, solution) < 0.003
