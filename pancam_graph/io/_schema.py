@@ -221,6 +221,7 @@ class SharingEntry(Entry):
     radius: FreedomEntry | None = None
     flex: FreedomEntry | None = None
     encoders: FreedomEntry | None = None
+    field: FreedomEntry | None = None
 
     def sharing(self) -> Sharing:
         """The sharing. Raises InputError for entries that contradict each other."""

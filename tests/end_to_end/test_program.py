@@ -272,7 +272,7 @@ def test_the_command_line_goes_before_the_file(run: Run, traverse_folder: Path, 
     assert [r.entry for r in refined if r.quantity == "calibration"] == ["focal", "focal"]
     assert [r.prior_sigma for r in refined if r.quantity == "calibration"] == [0.01, 0.01]
     assert len([r for r in refined if r.quantity == "mounts"]) == 12
-    assert "<h2>Rig</h2>" in (tmp_path / "out" / "report.html").read_text()
+    assert "<h2>What the pictures say of the camera</h2>" in (tmp_path / "out" / "report.html").read_text()
 
 
 def test_no_observation_twice_is_bad_input(run: Run, tmp_path: Path) -> None:
