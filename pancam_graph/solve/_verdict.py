@@ -381,13 +381,14 @@ def _held(at: Optimum) -> Iterator[VerdictTest]:
     if held:
         cost = at.fitted.problem.cost()
         best = max(held, key=lambda e: e.gain)
+        treatment = at.fitted.screened.prepared.options.rig
+        exact = "; sigmas take it for exact (--rig considered counts its uncertainty)"
         # A considered rig may be off: its sigmas say so.
-        is_considered = at.fitted.screened.prepared.options.rig == "considered"
-        yield (VerdictTest.note if is_considered else VerdictTest.of)(
+        yield (VerdictTest.note if treatment == "considered" else VerdictTest.of)(
             "held rig",
             best.gain,
             max(0.5 * two_sided_limit(len(held), CHANCE) ** 2, _HELD_SHARE * cost),
-            "no held number of the rig would lower the cost by much",
+            f"no held number of the rig would lower the cost by much{exact if treatment == 'held' else ''}",
             _advice(best, cost),
         )
 
