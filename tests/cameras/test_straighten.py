@@ -85,6 +85,7 @@ def test_a_linear_camera_of_the_family_is_not_resampled_for_rounding() -> None:
     assert straightening_map(camera, straight, RANGE_M) is None
 
 
+@pytest.mark.slow
 def test_a_very_wide_lens_is_cropped_and_has_no_pixel_beyond_its_domain() -> None:
     """Pincushion of a fish-eye: the pinhole would have to be many times as large."""
     assert isinstance(CAHVORE_CAMERA, CAHVORE)

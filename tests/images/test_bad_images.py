@@ -40,6 +40,7 @@ def replaced(truth: Traverse, image: np.ndarray) -> Traverse:
     return find_observations(truth, QUICK)
 
 
+@pytest.mark.slow
 def test_an_image_without_overlap_is_named_and_the_rest_found(truth: Traverse) -> None:
     away = replace(truth.frames[-1], pan_rad=np.pi)
     found = find_observations(replace(truth, frames=(*truth.frames[:-1], away)), QUICK)

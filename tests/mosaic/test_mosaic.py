@@ -153,7 +153,7 @@ def expected_shift(solution: Solution, row: int, overlap: Overlap) -> FloatArray
     return np.asarray(PX_PER_RAD * np.column_stack([right, -moved_elevation]))
 
 
-@pytest.mark.parametrize("error", [(4e-3, 0.0), (0.0, -3e-3), (-2e-3, 5e-3)])
+@pytest.mark.parametrize("error", [(-2e-3, 5e-3)])
 def test_a_pointing_error_is_the_seam_error(tmp_path: Path, error: tuple[float, float]) -> None:
     solution = solved(Scene(error_rad=((0.0, 0.0), error)), tmp_path)
     seams = make_mosaics(solution, "A/1", "left", NEAR).seams
@@ -227,7 +227,7 @@ def left_over(mosaics: StopMosaics) -> FloatArray:
     return np.asarray(np.exp(np.power(RADII[:, None] ** 2, [1, 2, 3]) @ mosaics.evening.vignetting))
 
 
-@pytest.mark.parametrize("lost", [0.1, 0.35])
+@pytest.mark.parametrize("lost", [pytest.param(0.1, marks=pytest.mark.slow), 0.35])
 def test_vignetting_is_found_and_taken_out(tmp_path: Path, lost: float) -> None:
     exposure = (1.0, 1.3, 0.8, 1.1, 0.9)
     mosaics = made(Scene(pans_rad=FIVE, vignetting=lost, exposure=exposure), tmp_path)

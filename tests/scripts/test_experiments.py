@@ -230,6 +230,7 @@ def test_conditioning_makes_the_origin_indifferent(monkeypatch: pytest.MonkeyPat
     assert as_it_is.failure or as_it_is.metrics["cost"] > 1.0003 * here["cost"]
 
 
+@pytest.mark.slow
 def test_alternation_is_slower_than_the_joint_solver() -> None:
     found = {
         s.model: s for s in AlternationTask(scenario=replace(TINY, rig_off=True), noise_px=0.5, seed=0).run()

@@ -65,6 +65,7 @@ def test_a_drive_with_guessed_sigmas_is_solved() -> None:
     require_right(simulation, solve_incrementally(with_guessed_sigmas(simulation.traverse)))
 
 
+@pytest.mark.slow
 def test_each_stop_is_right_before_the_next_comes() -> None:
     require_right_on_the_way(simulated(0.4, seed=13))
 
@@ -98,6 +99,7 @@ def test_drives_are_solved_over_seeds(rig: str, stops: int) -> None:
             require_right(simulation, solve_incrementally(simulation.traverse))
 
 
+@pytest.mark.slow
 def test_the_end_keeps_what_the_batch_keeps() -> None:
     traverse = with_guessed_sigmas(simulated(0.1, seed=15).traverse)
     expected, solution = solve(traverse), solve_incrementally(traverse)

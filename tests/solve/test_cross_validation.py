@@ -263,7 +263,9 @@ OPTIONS = {
 }
 
 
-@pytest.mark.parametrize("name", OPTIONS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n == "explicit" else n for n in OPTIONS]
+)
 def test_models_ties_and_landmarks(traverse: Traverse, found: CrossValidation, name: str) -> None:
     other = cross_validate(traverse, OPTIONS[name], halvings=1)
     assert other.warnings == ()

@@ -83,7 +83,7 @@ def test_a_measured_distance_moves_the_second_stop_as_theory_says(way: str) -> N
     )
 
 
-@pytest.mark.parametrize("way", ["hard", "soft", "circle", "free"])
+@pytest.mark.parametrize("way", [pytest.param("hard", marks=pytest.mark.slow), "soft", "circle", "free"])
 def test_gtsams_own_optimiser_on_the_whole_graph_finds_the_same(way: str) -> None:
     t, options = near(), WAYS[way]
     keys = graph_keys(t, options)
