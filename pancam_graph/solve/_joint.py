@@ -146,10 +146,17 @@ class OnLastGroup:
         self._damping = float(parameters_of(rule, self._elimination).getlambdaInitial())
         self._start = gtsam.Values()
         self._start.insert(_KEY, np.zeros(int(joint.template.linkage.group_dim[joint.last]) + 1))
+
+    def _graph(self) -> gtsam.NonlinearFactorGraph:
+        """The graph of the one factor.
+
+        Nothing keeps it: Python frees no cycle that runs through a function which GTSAM holds.
+        """
         # No noise model: rows are whitened, and their number depends on the rank.
         no_noise: Any = None
-        self._graph = gtsam.NonlinearFactorGraph()
-        self._graph.push_back(gtsam.CustomFactor(no_noise, [_KEY], self._evaluate))
+        graph = gtsam.NonlinearFactorGraph()
+        graph.push_back(gtsam.CustomFactor(no_noise, [_KEY], self._evaluate))
+        return graph
 
     def _evaluate(
         self, _this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
@@ -177,14 +184,15 @@ class OnLastGroup:
 
         GTSAM makes one trial at a time, since the elimination of the other groups depends on the damping.
         """
+        graph = self._graph()
         while True:
             tried, parameters = self._damping, parameters_of(self._rule, self._elimination)
             parameters.setlambdaInitial(tried)
             parameters.setlambdaUpperBound(2 * tried)
-            optimizer = gtsam.LevenbergMarquardtOptimizer(self._graph, self._start, parameters)
+            optimizer = gtsam.LevenbergMarquardtOptimizer(graph, self._start, parameters)
             optimizer.iterate()
             vector = optimizer.values().atVector(_KEY)
-            if not vector.any() and self._elimination.turns_to_qr(self._graph, self._start, tried):
+            if not vector.any() and self._elimination.turns_to_qr(graph, self._start, tried):
                 continue
             if vector.any():
                 self._joint.move(vector[:-1], tried)

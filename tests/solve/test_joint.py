@@ -1,15 +1,18 @@
 """All groups but one eliminated before GTSAM's step: it is the step of the whole system, damped alike."""
 
+import gc
+import weakref
 from dataclasses import replace
+from typing import Any
 
 import gtsam
 import numpy as np
 import pytest
 
-from pancam_graph import SimulationOptions, SolveOptions, StopRule, simulate
+from pancam_graph import SimulationOptions, SolveOptions, StopRule, simulate, solve
 from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.data import Freedom, Sharing
-from pancam_graph.elimination import Panels
+from pancam_graph.elimination import LandmarkSystem, Panels
 from pancam_graph.graph import Flex, Model
 from pancam_graph.rigs import mer_navcam
 from pancam_graph.solve import Problem, prepare
@@ -107,3 +110,30 @@ def test_what_no_damping_lets_lower_the_cost_stays_where_it_is() -> None:
     optimiser.iterate()
     assert optimiser.error() <= before
     assert optimiser.error() == pytest.approx(before, rel=1e-10)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        SolveOptions(rig="held"),
+        SolveOptions(),
+        SolveOptions(model="free"),
+        SolveOptions(rig="held", method="alternation", sharing=Sharing(mounts=Freedom(scope="eye"))),
+    ],
+    ids=["held", "estimated", "free", "alternation"],
+)
+def test_what_a_solve_has_in_memory_is_given_back(
+    options: SolveOptions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """GTSAM's factors hold Python functions, which Python's collector does not see."""
+    systems, begin = list[weakref.ref[LandmarkSystem]](), LandmarkSystem.__init__
+
+    def noted(self: LandmarkSystem, *arguments: Any, **named: Any) -> None:
+        begin(self, *arguments, **named)
+        systems.append(weakref.ref(self))
+
+    monkeypatch.setattr(LandmarkSystem, "__init__", noted)
+    solve(simulate(mer_navcam(), replace(OPTIONS, stops=2), seed=3).traverse, options)
+    gc.collect()
+    assert systems
+    assert not any(system() for system in systems)
