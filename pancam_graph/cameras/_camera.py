@@ -26,6 +26,10 @@ class Rays:
     """(n,) False where a pixel lies outside the model's domain; its ray is then not meaningful."""
 
 
+_LARGEST_PX = 1_000_000
+"""Pixels of the longest side of an image: far above any camera's."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Camera(ABC):
     """A camera model in its own frame: x right, y down, z forward, unless its vectors say otherwise.
@@ -43,6 +47,11 @@ class Camera(ABC):
         if self.width_px < 1 or self.height_px < 1:
             raise CameraError(
                 f"image size: expected at least 1 x 1 pixel, found {self.width_px} x {self.height_px}"
+            )
+        if max(self.width_px, self.height_px) > _LARGEST_PX:
+            raise CameraError(
+                f"image size: expected at most {_LARGEST_PX} pixels a side, found {self.width_px} x "
+                f"{self.height_px}"
             )
 
     @abstractmethod

@@ -136,6 +136,12 @@ def test_jacobians_against_differences(camera: Camera) -> None:
         assert numeric == pytest.approx(d_origin[:, :, axis], abs=2e-9)
 
 
+@pytest.mark.parametrize("side_px", [0, -1, 1_000_001, 10**400])
+def test_no_image_has_such_a_side(side_px: int) -> None:
+    with pytest.raises(CameraError, match="image size: expected at"):
+        Pinhole(width_px=side_px, height_px=4, fx_px=1.0, fy_px=1.0, cx_px=0.0, cy_px=0.0)
+
+
 @pytest.mark.parametrize("camera", ALL, ids=IDS)
 def test_another_calibration_leaves_all_but_the_pixels(camera: Camera) -> None:
     """Pixels in units of K are the same before and after, distortion included."""

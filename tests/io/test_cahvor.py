@@ -115,6 +115,7 @@ def test_a_file_as_jpl_prints_it(tmp_path: Path) -> None:
         ("Model = CAHVORE3,0.37", "Model = FISH", "expected CAHV, CAHVOR, CAHVORE1, CAHVORE2 or"),
         ("Dimensions = 64 48", "Dimensions = 64", 'Dimensions: expected 2 numbers, found "64"'),
         ("Dimensions = 64 48", "Dimensions = 0 48", "image size: expected at least 1 x 1 pixel"),
+        ("Dimensions = 64 48", "Dimensions = 1000001 48", "image size: expected at most 1000000 pix"),
         ("\nE =", "\nF =", "E: expected a line of this name"),
         ("\nO =", "\nO = 1", "O: expected 3 numbers"),
         ("\nO =", "\nO = nan 0 0\nx =", "O: expected 3 numbers"),
