@@ -35,6 +35,7 @@ print(before, plus_one(10.0), sum(plus_one.stats.cache_hits.values()), is_on_dis
 
 
 @pytest.mark.skipif(bool(os.environ.get("NUMBA_DISABLE_JIT")), reason="nothing is compiled")
+@pytest.mark.slow
 def test_an_edit_of_a_part_makes_its_callers_on_disk_stale(tmp_path: Path) -> None:
     """In fresh processes: the caller's own file stays as it is, to the time it was written at."""
     folder = tmp_path / "loops"

@@ -238,6 +238,7 @@ def test_vignetting_is_found_and_taken_out(tmp_path: Path, lost: float) -> None:
     assert mosaics.evening.sigma < 0.005
 
 
+@pytest.mark.slow
 def test_no_vignetting_is_made_up(tmp_path: Path) -> None:
     mosaics = made(Scene(pans_rad=FIVE, exposure=(1.0, 1.3, 0.8)), tmp_path)
     assert not mosaics.evening.vignetting.any()
@@ -350,6 +351,7 @@ def test_a_panorama_that_goes_round_has_no_hole_and_no_cut(tmp_path: Path) -> No
     assert min(ring) > 0
 
 
+@pytest.mark.slow
 def test_scale_is_limited_and_can_be_chosen(truth: Solution) -> None:
     small = make_mosaics(truth, "A/1", "left", replace(NEAR, px_per_degree=1.0)).cylinder.projection
     assert isinstance(small, Cylinder)
@@ -481,6 +483,7 @@ def test_without_mosaics_nothing_is_different(truth: Solution, tmp_path: Path) -
     assert not (tmp_path / "out" / "mosaics").exists()
 
 
+@pytest.mark.slow
 def test_older_mosaics_are_replaced_and_strangers_kept(truth: Solution, tmp_path: Path) -> None:
     out = tmp_path / "out"
     write_results(truth, out, report=False, mosaics=NEAR)
@@ -499,6 +502,7 @@ def test_older_mosaics_are_replaced_and_strangers_kept(truth: Solution, tmp_path
         check_out(out)
 
 
+@pytest.mark.slow
 def test_a_failure_leaves_the_older_results_whole(
     truth: Solution, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

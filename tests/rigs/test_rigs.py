@@ -337,6 +337,7 @@ def test_wide_and_zoomed_eyes_of_one_stop_are_solved_together() -> None:
     assert np.abs(solution.final.pan_tilt_rad - simulation.truth.pan_tilt_rad).max() < 1e-10
 
 
+@pytest.mark.slow
 def test_the_zoomed_eye_sharpens_pan_and_tilt() -> None:
     """Relative to the first frame, which is known here: what all frames share, images cannot tell.
 

@@ -404,6 +404,7 @@ def run(scripts_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     return call
 
 
+@pytest.mark.slow
 def test_a_tiny_run_from_end_to_end(
     run: Callable[..., int], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -191,6 +191,7 @@ def test_a_solve_that_does_not_converge_is_a_failed_run() -> None:
 # --- experiments ---
 
 
+@pytest.mark.slow
 def test_our_optimum_is_that_of_an_independent_solver() -> None:
     found = compare(0.5, 0)
     assert found["cost_relative"] < 1e-8

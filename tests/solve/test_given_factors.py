@@ -83,7 +83,7 @@ def test_a_measured_distance_moves_the_second_stop_as_theory_says(way: str) -> N
     )
 
 
-@pytest.mark.parametrize("way", [pytest.param("hard", marks=pytest.mark.slow), "soft", "circle", "free"])
+@pytest.mark.parametrize("way", slow_for("hard", ["hard", "soft", "circle", "free"]))
 def test_gtsams_own_optimiser_on_the_whole_graph_finds_the_same(way: str) -> None:
     t, options = near(), WAYS[way]
     keys = graph_keys(t, options)
@@ -190,6 +190,7 @@ def test_a_factor_between_a_held_stop_and_a_free_one_moves_the_free_one() -> Non
     assert found.final.world_T_mast[0].equals(t.stops[0].world_T_mast, 0.0)
 
 
+@pytest.mark.slow
 def test_outliers_are_sought_with_the_factors() -> None:
     """A drive whose telemetry is far off is brought near by a factor, and costs are of both."""
     simulation = simulate(mer_navcam(), replace(SMALL, outliers=0.1), seed=6)

@@ -270,7 +270,7 @@ def test_errors_are_as_large_as_the_sigmas_say() -> None:
     assert np.mean(stops) == pytest.approx(6, abs=1.7)  # 3 of its sigmas
 
 
-@pytest.mark.parametrize("loss", ["none", "huber"])
+@pytest.mark.parametrize("loss", ["none", pytest.param("huber", marks=pytest.mark.slow)])
 def test_the_number_of_threads_changes_no_bit(monkeypatch: pytest.MonkeyPatch, loss: str) -> None:
     outliers = 0.01 if loss == "huber" else 0.0
     simulation = simulate(

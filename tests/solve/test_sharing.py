@@ -297,7 +297,10 @@ HARD_TIES = {
 }
 
 
-@pytest.mark.parametrize("sharing", HARD_TIES.values(), ids=HARD_TIES)
+@pytest.mark.parametrize(
+    "sharing",
+    [pytest.param(s, id=n, marks=[pytest.mark.slow] * (n == "chosen")) for n, s in HARD_TIES.items()],
+)
 def test_a_hard_tie_has_the_explicit_optimum_too(sharing: Sharing | None) -> None:
     ours, theirs = (
         solve(
