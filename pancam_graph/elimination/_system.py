@@ -88,6 +88,7 @@ class Room(local):
         return self._numbers[:n]
 
 
+_OfChunk = tuple[FloatArray, FloatArray, int, float, int, int, IntArray, int, kernel.Reduced]
 _Wave = list[_Chunk]
 _Systems = list[tuple[FloatArray, FloatArray]]
 """(S, s) of each chunk of a wave, over the columns of its block; S in tiles, see kernel.add_to_panel."""
@@ -253,39 +254,9 @@ class LandmarkSystem:
                 for chunk, (S, s) in zip(wave[first:last], systems[first:last], strict=True):
                     S.fill(0.0)
                     s.fill(0.0)
-                    block = self.blocks[chunk.block]
-                    eliminate(
-                        sights,
-                        bearings,
-                        self.vector,
-                        self.origin_m,
-                        self.loss.kind,
-                        self.loss.width,
-                        chunk.begin,
-                        chunk.end,
-                        block.segment_column,
-                        block.n_units,
-                        self.reduced,
-                        S,
-                        s,
-                    )
+                    eliminate(sights, bearings, *self._of_chunk(chunk), S, s)
                 for chunk, (seen, part) in zip(wave[first:last], parts[first:last], strict=False):
-                    block = self.blocks[chunk.block]
-                    kernel.eliminate_fields(
-                        sights,
-                        bearings,
-                        seen,
-                        self.vector,
-                        self.origin_m,
-                        self.loss.kind,
-                        self.loss.width,
-                        chunk.begin,
-                        chunk.end,
-                        block.segment_column,
-                        block.n_units,
-                        self.reduced,
-                        *part,
-                    )
+                    kernel.eliminate_fields(sights, bearings, seen, *self._of_chunk(chunk), *part)
 
             def summed(first: int, last: int, wave: _Wave = wave, systems: _Systems = systems) -> None:
                 # In the order of the chunks, so that no bit depends on the number of threads.
@@ -305,6 +276,12 @@ class LandmarkSystem:
                 assert self._fields is not None
                 self._fields.add(part, self.blocks[chunk.block], self._panels)
         return self._panels
+
+    def _of_chunk(self, chunk: _Chunk) -> _OfChunk:
+        """What the loops that eliminate take of the landmarks of a chunk, in their order."""
+        block, loss = self.blocks[chunk.block], self.loss
+        landmarks = self.vector, self.origin_m, loss.kind, loss.width, chunk.begin, chunk.end
+        return *landmarks, block.segment_column, block.n_units, self.reduced
 
     def _field_parts(self, wave: _Wave, views: CameraViews) -> Sequence[tuple[kernel.FieldSights, FieldPart]]:
         """Room for what each chunk of a wave tells about fields; empty where there are none."""
