@@ -11,7 +11,17 @@ import numpy as np
 from pydantic import Field
 
 from pancam_graph.base.geometry import FloatArray, IntArray
-from pancam_graph.data import ENTRIES, Flex, Incremental, Solution, Verdict, VerdictTest, flex_of
+from pancam_graph.data import (
+    ENTRIES,
+    Flex,
+    Incremental,
+    Quantity,
+    RigTreatment,
+    Solution,
+    Verdict,
+    VerdictTest,
+    flex_of,
+)
 from pancam_graph.io import (
     SOLUTION_FORMAT,
     VERSION,
@@ -78,7 +88,7 @@ class FlexEntry(Entry):
 class RigTreatmentEntry(Entry):
     """What became of the rig's uncertainty."""
 
-    treatment: Literal["estimated", "held", "considered"]
+    treatment: RigTreatment
     flex: list[FlexEntry]
     """Empty where heads were taken to sit firmly."""
 
@@ -110,7 +120,7 @@ class SolvedImageEntry(Entry):
 class RefinedEntry(Entry):
     """An entry of the rig that was free. Null: the entry has no such owner, or the number is not finite."""
 
-    quantity: Literal["calibration", "mounts", "pan_T_tilt", "radius", "flex", "encoders", "field"]
+    quantity: Quantity
     entry: str
     camera: str | None
     stop: str | None
