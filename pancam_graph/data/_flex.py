@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pancam_graph.data._sharing import ENTRIES, default_sigma
+from pancam_graph.data._sharing import ENTRIES
 from pancam_graph.data._solution import Solution
 
 __all__ = ["Flex", "flex_of"]
@@ -38,7 +38,7 @@ def flex_of(solution: Solution) -> tuple[Flex, ...]:
         out.append(
             Flex(
                 entry=entry,
-                sigma=sharing.flex.sigma.get(entry, default_sigma(entry, 1.0)),
+                sigma=sharing.flex.sigma_of(entry),
                 rms=float(np.sqrt(np.mean(found**2))),
                 largest=float(found[worst]),
                 frame=frames[free[worst]].id,

@@ -158,6 +158,11 @@ class Freedom:
             return ENTRIES[quantity]
         return tuple(e for e in _known(quantity) if e in self.free)
 
+    def sigma_of(self, entry: str, focal_px: float = 1.0) -> float:
+        """Standard deviation of an entry's prior, stated or `default_sigma`, which takes `focal_px`."""
+        stated = self.sigma.get(entry)
+        return default_sigma(entry, focal_px) if stated is None else stated
+
 
 FIXED = Freedom()
 

@@ -32,7 +32,6 @@ from pancam_graph.data import (
     Sharing,
     State,
     Traverse,
-    default_sigma,
 )
 from pancam_graph.elimination import Covariance, FieldColumns, Linkage, Posture
 from pancam_graph.factors import Key
@@ -287,9 +286,9 @@ class HardTemplate(FactorTemplate):
     @cached_property
     def field_sigma_px(self) -> FloatArray:
         """(eyes,) sigma of the prior of each eye's field at a pixel; none where fields are held."""
-        sigma = self.rig_variables.sharing.field.sigma.get("field_px")
+        field = self.rig_variables.sharing.field
         focal_px = [p.calibration_matrix[0, 0] for p in self.traverse.rig.pinholes[: len(self._field_keys)]]
-        return np.array([default_sigma("field_px", f) if sigma is None else sigma for f in focal_px])
+        return np.array([field.sigma_of("field_px", f) for f in focal_px])
 
     def field_factors(self) -> FactorList:
         """The priors of the fields of eyes, if these are free: independent coefficients."""

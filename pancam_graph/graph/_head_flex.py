@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 
 from pancam_graph.base.geometry import FloatArray, IntArray
-from pancam_graph.data import ENTRIES, Freedom, RigCorrection, Traverse, default_sigma
+from pancam_graph.data import ENTRIES, Freedom, RigCorrection, Traverse
 from pancam_graph.factors import Corrected, Fixed, PoseSlot
 
 __all__ = ["HeadFlex"]
@@ -26,7 +26,7 @@ class HeadFlex:
         self.entries = freedom.entries("flex")
         self.columns: IntArray = _COLUMNS[[ENTRIES["flex"].index(e) for e in self.entries]]
         """(entries,) among the components of a correction of the head."""
-        self.sigma = np.array([freedom.sigma.get(e, default_sigma(e, 1.0)) for e in self.entries])
+        self.sigma = np.array([freedom.sigma_of(e) for e in self.entries])
         """(entries,) of the priors."""
 
     def __bool__(self) -> bool:

@@ -189,9 +189,14 @@ class RigVariables:
         return [v for v in self.variables if v.stop == stop]
 
     @property
+    def numbers(self) -> list[RigVariable]:
+        """The variables that stops share and that are numbers of a rig (`rigs.RIG_ENTRIES`)."""
+        return [v for v in self.of_stop(None) if v.quantity in RIG_ENTRIES]
+
+    @property
     def keys(self) -> list[int]:
-        """Keys of the variables that stops share, without radii, which follow from a rig's numbers."""
-        return [v.key for v in self.of_stop(None) if v.quantity in RIG_ENTRIES]
+        """Keys of `numbers`."""
+        return [v.key for v in self.numbers]
 
     def group(self, variable: RigVariable) -> int:
         """Group in which a variable is eliminated: its stop's, or the last one."""
@@ -301,7 +306,7 @@ class RigVariables:
         """Sigma of the prior of an entry by itself, whatever the covariance says."""
         freedom: Freedom = getattr(self.sharing, quantity)
         focal = 1.0 if quantity in _OF_STOPS else self._focal_px(eye)
-        return float(freedom.sigma.get(entry, default_sigma(entry, focal)))
+        return freedom.sigma_of(entry, focal)
 
     def joint_priors(self, new: Sequence[int], known: Sequence[int]) -> list[gtsam.NonlinearFactor]:
         """The prior of the variables `new` given those `known`; both are keys of variables that stops share.
@@ -322,8 +327,7 @@ class RigVariables:
     def prior_information(self) -> FloatArray:
         """Information (n, n) of the priors of the variables of `keys`, one after the other."""
         if self.sharing.covariance is None:
-            of_keys = [v.sigma for v in self.of_stop(None) if v.key in self.keys]
-            return np.diag(np.concatenate(of_keys) ** -2.0)
+            return np.diag(np.concatenate([v.sigma for v in self.numbers]) ** -2.0)
         covariance = self._joint(self.keys)
         size = np.sqrt(np.diag(covariance))
         return np.asarray(np.linalg.inv(covariance / np.outer(size, size)) / np.outer(size, size))
@@ -400,8 +404,7 @@ class RigVariables:
         image keeps its covariance with the others like it. Corrections of a rig that is corrected already
         differ from those of this one in the second order: their Jacobian is in it.
         """
-        variables = [v for v in self.of_stop(None) if v.key in self.keys]
-        g = len(self.traverse.stops)
+        variables, g = self.numbers, len(self.traverse.stops)
         columns = [np.arange(c.start, c.stop) for c in (linkage.columns_of(v.key) for v in variables)]
         entries = [entry for v in variables for entry in self._entries_of(v.key)]
         order = np.concatenate([np.zeros(0, dtype=np.int64), *columns])

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pancam_graph.base.geometry import BoolArray, FloatArray, so3_exp
+from pancam_graph.base.geometry import BoolArray, FloatArray, skew, so3_exp
 from pancam_graph.cameras import Camera, Fields
 from pancam_graph.data import Solution
 from pancam_graph.report._look import AFTER, BEFORE, INK, REJECTED, Figure, axis, layout
@@ -82,17 +82,11 @@ def displacement_px(
             break
         x = (points @ turn.T)[use]
         # A small turn w moves a point by w x point.
-        d_turn = np.einsum("nij,njk->nik", d_uv[use], -_skew(x))
+        d_turn = np.einsum("nij,njk->nik", d_uv[use], -skew(x))
         step, *_ = np.linalg.lstsq(d_turn.reshape(-1, 3), (uv_px - uv)[use].ravel(), rcond=None)
         turn = so3_exp(step) @ turn
     uv, valid = refined.project(points @ turn.T)
     return uv - uv_px, valid & rays.valid
-
-
-def _skew(points: FloatArray) -> FloatArray:
-    x, y, z = points.T
-    o = np.zeros_like(x)
-    return np.stack([o, -z, y, z, o, -x, -y, x, o], axis=1).reshape(-1, 3, 3)
 
 
 def _grid(camera: Camera, across: int) -> tuple[FloatArray, float]:

@@ -114,10 +114,9 @@ def _uncertainty(
     Where a direction is free, covariances are NaN and there is no reduced system.
     """
     prepared, problem = fitted.screened.prepared, regular_problem(fitted)
-    t, wanted = prepared.traverse, prepared.options.landmark_covariances
-    places = fitted.problem.landmarks if wanted else None
+    places = fitted.problem.landmarks if prepared.options.landmark_covariances else None
     # Radii of circles are free unasked: what holds them is then no news.
-    asked = (prepared.options.sharing or t.sharing) is not None
+    asked = prepared.given_sharing is not None
     try:
         reduced = reduced_of(fitted, problem)
         covariances = uncertainty(problem, state, reduced, landmarks=places, unseen=asked)

@@ -97,6 +97,11 @@ class Prepared:
         return self.traverse.observations
 
     @property
+    def given_sharing(self) -> Sharing | None:
+        """What of the rig the user said is free; None where that is left to the rig's treatment."""
+        return self.options.sharing or self.traverse.sharing
+
+    @property
     def rescales_noise(self) -> bool:
         """Whether residuals decide how large the noise is, not the sigmas that observations came with."""
         wanted = self.options.rescale_noise

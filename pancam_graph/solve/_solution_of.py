@@ -55,7 +55,7 @@ def solution_of(judged: Judged) -> Solution:
 def _treatment(fitted: Fitted) -> RigTreatment:
     """`Solution.treatment` of a fit."""
     prepared = fitted.screened.prepared
-    given = prepared.options.sharing or prepared.traverse.sharing
+    given = prepared.given_sharing
     if given is None:
         return prepared.options.rig
     return "estimated" if given.any_free else "held"
@@ -65,8 +65,7 @@ def _rig_covariance(judged: Judged) -> RigCovariance | None:
     """`Solution.rig_covariance` of a fit."""
     fitted, found = judged.fitted, judged.stated.variables
     prepared, template = fitted.screened.prepared, fitted.problem.template
-    given = prepared.options.sharing or prepared.traverse.sharing
-    if given is not None or prepared.options.rig != "estimated" or found is None:
+    if prepared.given_sharing is not None or prepared.options.rig != "estimated" or found is None:
         return None
     if not template.rig_variables.keys:
         return None
