@@ -5,9 +5,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from pancam_graph.base.geometry import IntArray
+from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.elimination._linkage import Linkage
-from pancam_graph.elimination._panels import Panels
+from pancam_graph.elimination._panels import Covariance, Panels
 from pancam_graph.landmarks import Measurements
 
 __all__ = ["Block", "Layout", "blocks_of"]
@@ -57,6 +57,24 @@ class Block:
             source=among(link.group_column),
             n_units=0,
         )
+
+    def joint(self, covariance: Covariance | None) -> FloatArray:
+        """Covariance (columns, columns) of the columns of the block; 0 where a column belongs to no variable.
+
+        None: all is exact, so that it is 0.
+        """
+        out = np.zeros((len(self.row), len(self.row)))
+        if covariance is None:
+            return out
+        filled = [np.flatnonzero(self.row[a:b] >= 0) for a, b in pairwise(self.begin)]
+        of_group = [self.row[a + f] for a, f in zip(self.begin, filled, strict=False)]
+        for i, g in enumerate(self.groups):
+            for j, h in enumerate(self.groups[: i + 1]):
+                part = covariance.block(g, h).take(of_group[i], axis=0).take(of_group[j], axis=1)
+                rows, columns = self.begin[i] + filled[i], self.begin[j] + filled[j]
+                out[rows[:, None], columns] = part
+                out[columns[:, None], rows] = part.T
+        return out
 
 
 @dataclass(frozen=True, kw_only=True)

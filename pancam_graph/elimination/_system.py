@@ -524,23 +524,23 @@ class LandmarkSystem:
         landmark's cameras; None: cameras are exact. Infinite for landmarks at infinity.
         """
         out = np.empty((len(self.landmark_row), 3, 3))
+        of_block: list[list[_Chunk]] = [[] for _ in self.blocks]
         for chunk in self.chunks:
-            block = self.blocks[chunk.block]
-            joint = np.zeros((len(block.row), len(block.row)))
-            filled = [np.flatnonzero(block.row[a:b] >= 0) for a, b in pairwise(block.begin)]
-            for g, a, rows in zip(block.groups, block.begin, filled, strict=False):
-                if covariance is None:
-                    break
-                for h, b, columns in zip(block.groups, block.begin, filled, strict=False):
-                    wanted = np.ix_(block.row[a + rows], block.row[b + columns])
-                    joint[np.ix_(a + rows, b + columns)] = covariance.block(g, h)[wanted]
-            more = np.zeros((chunk.end - chunk.begin, 3, 3))
-            if self._fields is not None and covariance is not None:
-                first, last, arms_of = chunk.begin, chunk.end, partial(self._dense_arms, chunk)
-                more = self._fields.spread(first, last, block, covariance, arms_of)
-            kernel.point_covariances(
-                self.sights, self.reduced, self.vector, joint, more, chunk.begin, chunk.end, out
-            )
+            of_block[chunk.block].append(chunk)
+
+        def work(first: int, last: int) -> None:
+            for block, chunks in zip(self.blocks[first:last], of_block[first:last], strict=True):
+                joint = block.joint(covariance)
+                for chunk in chunks:
+                    begin, end, more = chunk.begin, chunk.end, np.zeros((chunk.end - chunk.begin, 3, 3))
+                    if self._fields is not None and covariance is not None:
+                        arms_of = partial(self._dense_arms, chunk)
+                        more = self._fields.spread(begin, end, block, covariance, arms_of)
+                    kernel.point_covariances(
+                        self.sights, self.reduced, self.vector, joint, more, begin, end, out
+                    )
+
+        in_parallel(work, len(self.blocks), grain=1)
         return self._given(out)
 
     @property

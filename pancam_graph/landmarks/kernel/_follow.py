@@ -136,13 +136,24 @@ def point_covariances(
         for a in range(3):
             for b in range(3):
                 tangent[a, b] = more[j - begin, a, b] + (1.0 if a == b else 0.0)
+        # C is symmetric: its lower triangle with half of the diagonal, then the sum with the transpose.
+        half[:] = 0.0
         for p in range(2 * first, 2 * last):
             row, i = 2 * pair[p >> 1] + (p & 1), 6 * (p >> 1) + (p & 1)
-            for q in range(2 * first, 2 * last):
+            y0 = y1 = y2 = 0.0
+            for q in range(2 * first, p + 1):
                 c, k = joint[row, 2 * pair[q >> 1] + (q & 1)], 6 * (q >> 1) + (q & 1)
-                for a in range(3):
-                    for b in range(3):
-                        tangent[a, b] += arms[i + 2 * a] * c * arms[k + 2 * b]
+                c *= 0.5 if q == p else 1.0
+                y0 += c * arms[k]
+                y1 += c * arms[k + 2]
+                y2 += c * arms[k + 4]
+            for a in range(3):
+                half[a, 0] += arms[i + 2 * a] * y0
+                half[a, 1] += arms[i + 2 * a] * y1
+                half[a, 2] += arms[i + 2 * a] * y2
+        for a in range(3):
+            for b in range(3):
+                tangent[a, b] += half[a, b] + half[b, a]
         w = vector[j, 3]
         t = tangents(vector[j, 0], vector[j, 1], vector[j, 2], w)
         for k in range(3):
