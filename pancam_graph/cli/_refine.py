@@ -15,7 +15,7 @@ _DESCRIPTION = """\
 Refine a rover traverse: mast poses, pointing and terrain points from images taken by a camera mast.
 
 FOLDER has a traverse.json, or rover images with PDS labels (MER, MSL, Mars 2020). OUT gets solution.json,
-points.ply, residuals.csv and report.html, and with --mosaic a folder of mosaics; an older OUT is replaced
+points.ply, residuals.npz and report.html, and with --mosaic a folder of mosaics; an older OUT is replaced
 once the new results are complete. OUT/cache keeps what was found in images: the same command goes on after
 an interrupt, and again only with what has changed.
 
@@ -135,6 +135,7 @@ def _add_options(parser: CommandParser) -> None:
         action=Flag,
         help="write mosaics of each stop before and after too, around the horizon and from above",
     )
+    add("--csv", action=Flag, help="write residuals.csv too, a line for each observation")
     add("--report", action=Flag, default=True, help="write report.html (default)")
 
 
@@ -160,7 +161,7 @@ def _work(call: Invocation) -> int:
     chosen["rescale_noise"] = None if arguments.noise is None else arguments.noise == "estimated"
     chosen["field"] = {"auto": None, "estimated": True, "held": False}[arguments.field]
     sharing = parse_sharing(arguments.sharing)
-    # Covariances of terrain points take at most a twentieth of the solve: points.ply always has them.
+    # Covariances of terrain points take about a tenth of a solve: points.ply always has them.
     options = SolveOptions(**chosen, sharing=sharing, landmark_covariances=True)
 
     begin = time.perf_counter()
@@ -191,7 +192,12 @@ def _work(call: Invocation) -> int:
             solution = solution.with_cross_validation(validated)
         progress.say("writing the results")
         mosaics = MosaicOptions() if arguments.mosaic else None
-        results = {"report": arguments.report, "exports": arguments.export, "mosaics": mosaics}
+        results = {
+            "report": arguments.report,
+            "csv": arguments.csv,
+            "exports": arguments.export,
+            "mosaics": mosaics,
+        }
         solution = write_results(solution, arguments.out, **results, progress=progress.counted)
     print_summary(solution, str(arguments.out), quiet=arguments.quiet)
     return 0 if solution.passed else 1

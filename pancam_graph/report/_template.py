@@ -36,7 +36,7 @@ PAGE = (
 <section>
 <h2>Observations</h2>
 {observations}
-<p class="caption">What was left out, and why; each observation's reason is in <code>residuals.csv</code>.
+<p class="caption">What was left out, and why; each observation's reason is in <code>residuals.npz</code>.
 Those that came back were set aside while the geometry was still rough.</p>
 </section>
 {matching}
@@ -64,7 +64,7 @@ nothing. A cross-validation checks them.</li>
 the centre of the top-left pixel. RMS is the root mean square length of these vectors.</li>
 <li>The world is right-handed and metric, z up. Pan is positive anticlockwise seen from above, tilt positive
 upwards. All conventions: <code>docs/conventions.md</code> of pancam_graph.</li>
-<li>All numbers in full: <code>solution.json</code> and <code>residuals.csv</code> beside this page.</li>
+<li>All numbers in full: <code>solution.json</code> and <code>residuals.npz</code> beside this page.</li>
 </ul>
 </section>
 <script type="text/plain" id="packed-plotly">{plotly}</script>

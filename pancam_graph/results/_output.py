@@ -53,7 +53,7 @@ class Output:
 
     name: str
     """Name of the file or folder; an export is asked for by this name."""
-    when: Literal["always", "report", "mosaics", "export"]
+    when: Literal["always", "report", "csv", "mosaics", "export"]
     """The option with which it is written."""
     writer: Callable[[], OutputWriter]
     """Imports the module that writes it and returns its writer; names and choices are listed without."""

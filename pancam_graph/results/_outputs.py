@@ -45,9 +45,15 @@ def _rig() -> OutputWriter:
 
 
 def _residuals() -> OutputWriter:
-    from pancam_graph.results._residuals_csv import RESIDUALS
+    from pancam_graph.results._residuals import RESIDUALS
 
     return RESIDUALS
+
+
+def _residuals_csv() -> OutputWriter:
+    from pancam_graph.results._residuals import RESIDUALS_CSV
+
+    return RESIDUALS_CSV
 
 
 def _mosaics() -> OutputWriter:
@@ -91,7 +97,8 @@ OUTPUTS = (
         writer=_rig,
         older=EXPORT_FOLDER,
     ),
-    Output(name="residuals.csv", when="always", writer=_residuals),
+    Output(name="residuals.npz", when="always", writer=_residuals),
+    Output(name="residuals.csv", when="csv", writer=_residuals_csv),
     Output(name="mosaics", when="mosaics", writer=_mosaics, older=MOSAIC_FOLDER),
     Output(name="report.html", when="report", writer=_report),
     # Last: it says how long the others took, and what they warned of.

@@ -70,6 +70,7 @@ def write_results(
     out: Path | str,
     *,
     report: bool = True,
+    csv: bool = False,
     exports: Sequence[str] = (),
     mosaics: "MosaicOptions | None" = None,
     progress: Callable[[str, int, int], None] | None = None,
@@ -77,15 +78,16 @@ def write_results(
     """Write the results of a solution into the folder `out`: all `OUTPUTS` that are asked for.
 
     Everything is written into a folder beside and renamed when complete: an older folder of results stays
-    whole until then, and is there as before if anything fails. `exports` are names of `EXPORTS`. With options
-    of `mosaics`, a folder of them is among the results; `progress` is told of each. Returns the solution with
-    the time that writing took as its `seconds.report`, and with warnings of images that the mosaics lack.
+    whole until then, and is there as before if anything fails. `csv`: whether residuals are written as CSV
+    too. `exports` are names of `EXPORTS`. With options of `mosaics`, a folder of them is among the results;
+    `progress` is told of each. Returns the solution with the time that writing took as its `seconds.report`,
+    and with warnings of images that the mosaics lack.
     Raises InputError as `check_out` and `check_exports` do, and where writing fails.
     """
     out = Path(out)
     check_out(out)
     exports = check_exports(solution.traverse, exports)
-    asked = {"always": True, "report": report, "mosaics": mosaics is not None}
+    asked = {"always": True, "report": report, "csv": csv, "mosaics": mosaics is not None}
     chosen = [o for o in OUTPUTS if asked.get(o.when, o.name in exports)]
     started = time.perf_counter()
     try:

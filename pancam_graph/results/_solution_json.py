@@ -243,7 +243,18 @@ def solution_json(solution: Solution) -> bytes:
         "incremental": solution.incremental is None,
     }
     data = solution_file(solution).model_dump(exclude={name for name, gone in missing.items() if gone})
-    return f"{json.dumps(data, indent=1, allow_nan=False, ensure_ascii=False)}\n".encode()
+    entries = ",\n".join(f"{_compact(name)}: {_by_line(value)}" for name, value in data.items())
+    return f"{{\n{entries}\n}}\n".encode()
+
+
+def _by_line(value: object) -> str:
+    """JSON with a line for each element of a list of objects; else one line."""
+    if not (isinstance(value, list) and value and isinstance(value[0], dict)):
+        return _compact(value)
+    return "[\n" + ",\n".join(map(_compact, value)) + "\n]"
+
+
+_compact = json.JSONEncoder(allow_nan=False, ensure_ascii=False).encode
 
 
 def solution_file(solution: Solution) -> SolutionFile:

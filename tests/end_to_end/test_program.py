@@ -79,7 +79,7 @@ def test_solves_and_writes_the_contract(run_apart: Run, traverse_folder: Path, t
     assert [line for line in done.stderr.splitlines() if not line.endswith("since the beginning)")] == []
     assert done.stdout.count("\n") == 1
     out = tmp_path / "out"
-    assert {p.name for p in out.iterdir()} == {"solution.json", "points.ply", "residuals.csv", "report.html"}
+    assert {p.name for p in out.iterdir()} == {"solution.json", "points.ply", "residuals.npz", "report.html"}
     solution = read_solution_json(out / "solution.json")
     assert solution.model == "mast"
     assert solution.landmarks == "eliminated"
@@ -334,7 +334,7 @@ def test_a_lens_that_an_export_cannot_say_is_bad_input_before_the_solve(run: Run
 def test_simulate_then_optimize(run_apart: Run, tmp_path: Path) -> None:
     options = ("--stops", "1", "--pans", "2", "--sweep-deg", "45", "--seed", "3", "--noise-stretch", "4")
     assert run_apart("simulate_traverse.py", "made", *options).returncode == 0
-    assert run_apart("optimize_traverse.py", "made", "--out", "out", "--no-report").returncode == 0
+    assert run_apart("optimize_traverse.py", "made", "--out", "out", "--no-report", "--csv").returncode == 0
     assert (tmp_path / "out" / "residuals.csv").read_text().splitlines()[0].endswith("cov_vv_px2")
     again = run_apart("simulate_traverse.py", "made", *options)
     assert again.returncode == 2

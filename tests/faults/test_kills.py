@@ -62,10 +62,10 @@ def test_results_are_whole_old_or_whole_new_whenever_their_writer_is_killed(
     assert len(runs) > 40
     assert runs[-1].status == 0
     older, newer = runs[0].out, runs[-1].out
-    assert older["residuals.csv"] != newer["residuals.csv"]
+    assert older["residuals.npz"] != newer["residuals.npz"]
     assert sorted(newer) == sorted([*older, *(name for name in newer if name.startswith("cahvor/"))])
     for run in runs:
-        whole = older if run.out["residuals.csv"] == older["residuals.csv"] else newer
+        whole = older if run.out["residuals.npz"] == older["residuals.npz"] else newer
         assert sorted(run.out) == sorted(whole)
         assert {k: v for k, v in run.out.items() if k in CACHE} == CACHE
         assert json.loads(run.out["solution.json"])["format"] == "pancam-graph/solution"

@@ -14,7 +14,7 @@ from support.kills import BYSTANDERS, FULL, KEPT, NEW, OLD, killed_at_every_step
 from support.made_solutions import fabricate
 from support.permissions import run_bound, sealed
 
-FILES = ["points.ply", "report.html", "residuals.csv", "solution.json"]
+FILES = ["points.ply", "report.html", "residuals.npz", "solution.json"]
 RESULTS = """
 import json, os, resource, sys
 from pathlib import Path

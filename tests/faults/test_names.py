@@ -103,7 +103,7 @@ def test_logs_and_progress_show_names_as_they_are(name: str, tmp_path: Path) -> 
 @pytest.mark.parametrize("name", [*PRINTING, *(n for n in CONTROLS if n != NO_TEXT)])
 def test_results_hold_any_name_that_is_text(name: str, tmp_path: Path) -> None:
     solution = renamed(name)
-    write_results(solution, tmp_path / "out", report=False, exports=("cahvor",))
+    write_results(solution, tmp_path / "out", report=False, csv=True, exports=("cahvor",))
     with (tmp_path / "out" / "residuals.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == len(solution.used)

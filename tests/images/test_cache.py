@@ -129,7 +129,7 @@ KINDS = ("mask", "features", "matches", "refined", "terrain", "ties")
         ("images._patches", {"refined", "ties"}),
         ("rigs._rig", {"mask", "matches", "refined", "terrain", "ties"}),
         ("report._style", set()),
-        ("results._residuals_csv", set()),
+        ("results._residuals", set()),
         ("images._steps", set(KINDS)),
     ],
 )

@@ -47,7 +47,7 @@ def run(scripts_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 def results(out: Path) -> dict[str, object]:
     content = json.loads((out / "solution.json").read_text())
     del content["seconds"]
-    return {**content, "residuals": (out / "residuals.csv").read_text()}
+    return {**content, "residuals": (out / "residuals.npz").read_bytes()}
 
 
 def test_an_interrupt_is_one_line_and_the_same_command_goes_on(
@@ -79,7 +79,7 @@ def test_an_interrupt_is_one_line_and_the_same_command_goes_on(
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
         "cache",
         "points.ply",
-        "residuals.csv",
+        "residuals.npz",
         "solution.json",
     ]
     # The cache outlives the next results, which are the same; so are those of a run without it.

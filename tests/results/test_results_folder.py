@@ -222,7 +222,7 @@ def test_points_ply_with_sigmas_and_grey_values(tmp_path: Path) -> None:
 
 def test_residuals_csv(tmp_path: Path) -> None:
     solution = io_samples.solution()
-    write_results(solution, tmp_path / "out")
+    write_results(solution, tmp_path / "out", csv=True)
     with (tmp_path / "out" / "residuals.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     observations = solution.traverse.observations
@@ -244,6 +244,22 @@ def test_residuals_csv(tmp_path: Path) -> None:
     assert [rows[3][k] for k in ("final_du_px", "final_dv_px", "used", "reason")] == ["0.3", "-0.4", "1", ""]
 
 
+def test_residuals_as_arrays_say_what_the_table_says(tmp_path: Path) -> None:
+    solution = io_samples.solution()
+    write_results(solution, tmp_path / "out", csv=True)
+    with (tmp_path / "out" / "residuals.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    with np.load(tmp_path / "out" / "residuals.npz") as found:
+        assert [n for n in found.files if not n.endswith("_names")] == [*rows[0]]
+        for name in rows[0]:
+            cells = [row[name] for row in rows]
+            if f"{name}_names" in found:
+                assert found[f"{name}_names"][found[name]].tolist() == cells
+            else:
+                expected = np.array([float(cell or "nan") for cell in cells])
+                assert found[name].astype(float) == pytest.approx(expected, rel=1e-9, nan_ok=True)
+
+
 def test_the_time_of_writing_is_in_the_file_and_in_what_returns(tmp_path: Path) -> None:
     timed = write_results(io_samples.solution().with_seconds(read=1.5), tmp_path / "a" / "b" / "out")
     found = read_solution_json(tmp_path / "a" / "b" / "out" / "solution.json")
@@ -254,10 +270,11 @@ def test_the_time_of_writing_is_in_the_file_and_in_what_returns(tmp_path: Path) 
 def test_an_older_folder_of_results_is_replaced_whole(tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()  # an empty folder is as good as none
-    write_results(io_samples.solution(), out)
-    assert set(contents(out)) == {"solution.json", "points.ply", "residuals.csv", "report.html"}
+    write_results(io_samples.solution(), out, csv=True)
+    of_all = {"solution.json", "points.ply", "residuals.npz"}
+    assert set(contents(out)) == {*of_all, "residuals.csv", "report.html"}
     write_results(io_samples.solution(model="circle"), out, report=False)
-    assert set(contents(out)) == {"solution.json", "points.ply", "residuals.csv"}
+    assert set(contents(out)) == of_all
     assert read_solution_json(out / "solution.json").model == "circle"
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 

@@ -17,7 +17,7 @@ from pancam_graph.data import mean_sigma_px
 from pancam_graph.data._noise import PixelNoise
 from pancam_graph.graph import Flex
 from pancam_graph.initialise import Start
-from pancam_graph.results._residuals_csv import residuals_csv
+from pancam_graph.results._residuals import residual_columns
 from pancam_graph.rigs import Eye, Rig, mer_navcam
 from pancam_graph.simulate import Simulation
 from pancam_graph.smoother import solve_incrementally
@@ -302,15 +302,15 @@ def test_noise_that_is_a_guess_is_rescaled_with_its_shape() -> None:
 def test_residuals_are_written_with_the_covariances() -> None:
     traverse = simulated("pinhole").traverse
     solution = solve(traverse, SolveOptions(rig="held", loss="none"))
-    lines = residuals_csv(solution).decode().splitlines()
-    names = lines[0].split(",")
-    assert names[-3:] == ["cov_uu_px2", "cov_uv_px2", "cov_vv_px2"]
-    row = dict(zip(names, lines[8].split(","), strict=True))
+    columns = residual_columns(solution)
+    names = [*columns][-3:]
+    assert names == ["cov_uu_px2", "cov_uv_px2", "cov_vv_px2"]
     covariance = observed(traverse).covariance_px2
     assert covariance is not None
-    found = [float(row[name]) for name in names[-3:]]
-    assert found == pytest.approx([covariance[7, 0, 0], covariance[7, 0, 1], covariance[7, 1, 1]], rel=1e-9)
-    assert float(row["sigma_px"]) == pytest.approx(0.3)
+    found = np.stack([np.asarray(columns[name]) for name in names], axis=1)
+    expected = np.stack([covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]], axis=1)
+    assert found == pytest.approx(expected, rel=1e-9)
+    assert columns["sigma_px"] == pytest.approx(np.full(len(covariance), 0.3))
 
 
 # --- what it is good for ---
