@@ -12,6 +12,10 @@ from pancam_graph.cameras._field import FIELD_COEFFICIENTS as FIELD_COEFFICIENTS
 from pancam_graph.cameras._field import FIELD_PER_COEFFICIENT as FIELD_PER_COEFFICIENT
 from pancam_graph.cameras._field import FIELD_SHAPE as FIELD_SHAPE
 from pancam_graph.cameras._field import Fields as Fields
+from pancam_graph.cameras._field_camera import FieldCamera as FieldCamera
+from pancam_graph.cameras._field_camera import field_of as field_of
+from pancam_graph.cameras._field_camera import with_field as with_field
+from pancam_graph.cameras._field_camera import without_field as without_field
 from pancam_graph.cameras._lens import MOUNT as MOUNT
 from pancam_graph.cameras._lens import Distorted as Distorted
 from pancam_graph.cameras._lens import Distortion as Distortion

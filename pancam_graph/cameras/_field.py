@@ -37,12 +37,27 @@ class Fields:
         """Where pixels (m, 2) of images (m,) lie in the spline: first coefficients, weights.
 
         The coefficients that count are 4 x 4 for u and v each, from row and column (m, 2) on, with weights
-        (m, 4, 4). Beyond the edges the outermost cells are continued.
+        (m, 4, 4). Beyond the edges of the image these are those of the edge.
         """
-        place = (uv_px + 0.5) / self.size_px[image] * _CELLS
-        cell = np.clip(np.floor(place), 0, _CELLS - 1)
-        along_u, along_v = np.moveaxis(_cubics(place - cell), 1, 0)
-        return cell[:, ::-1].astype(np.int64), along_v[:, :, None] * along_u[:, None, :]
+        cell, t, _ = self._cells(image, uv_px)
+        along_u, along_v = np.moveaxis(_cubics(t), 1, 0)
+        return cell[:, ::-1], along_v[:, :, None] * along_u[:, None, :]
+
+    def slope(self, image: IntArray, uv_px: FloatArray) -> FloatArray:
+        """Derivatives (m, 2, 2) of `at` by the pixel: 0 across an edge, beyond it."""
+        cell, t, t_by_uv = self._cells(image, uv_px)
+        along_u, along_v = np.moveaxis(_cubics(t), 1, 0)
+        by_u, by_v = np.moveaxis(_slopes(t) * t_by_uv[..., None], 1, 0)
+        weights = along_v[:, :, None] * by_u[:, None, :], by_v[:, :, None] * along_u[:, None, :]
+        return np.stack([self.weighted(image, cell[:, ::-1], weight) for weight in weights], axis=2)
+
+    def _cells(self, image: IntArray, uv_px: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Cell (m, 2) of each pixel, place in it from 0 to 1, and the derivative of that by the pixel."""
+        scale = _CELLS / self.size_px[image]
+        place = (uv_px + 0.5) * scale
+        inside = np.clip(place, 0.0, _CELLS)
+        cell = np.minimum(np.floor(inside), _CELLS - 1)
+        return cell.astype(np.int64), inside - cell, np.where(inside == place, scale, 0.0)
 
     def at(self, image: IntArray, uv_px: FloatArray) -> FloatArray:
         """The fields (m, 2), pixels, at pixels (m, 2) of images (m,)."""
@@ -64,3 +79,9 @@ def _cubics(t: FloatArray) -> FloatArray:
     s = 1 - t
     second, third = 4 - 6 * t**2 + 3 * t**3, 4 - 6 * s**2 + 3 * s**3
     return np.stack([s**3, second, third, t**3], axis=-1) / 6
+
+
+def _slopes(t: FloatArray) -> FloatArray:
+    """Derivatives (..., 4) of `_cubics` by t."""
+    s = 1 - t
+    return np.stack([-(s**2), 3 * t**2 - 4 * t, 4 * s - 3 * s**2, t**2], axis=-1) / 2

@@ -9,7 +9,7 @@ import numpy as np
 from pancam_graph.base.choices import expected_one_of
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, corrected_poses
-from pancam_graph.cameras import CALIBRATION_ENTRIES, Camera, projection_matrix
+from pancam_graph.cameras import CALIBRATION_ENTRIES, Camera, projection_matrix, with_field
 from pancam_graph.data._cross_validation import CrossValidation
 from pancam_graph.data._rig_treatment import RigTreatment
 from pancam_graph.data._sharing import Quantity, Sharing
@@ -250,7 +250,7 @@ class Solution:
 
     @cached_property
     def rig(self) -> Rig:
-        """The adjusted rig: its tilt axis, and the calibration and mount of each eye.
+        """The adjusted rig: its tilt axis, and the calibration, smooth field and mount of each eye.
 
         It has only corrections that serve the whole traverse. Corrections of single stops or images are in
         `final.rig`. If nothing was free, it is the rig of the input.
@@ -264,6 +264,8 @@ class Solution:
             calibration = _common(correction.calibration_px[of_eye])
             mount = _common(correction.mount[of_eye])
             camera, head_T_camera = eye.camera, eye.head_T_camera
+            if correction.field_px is not None:
+                camera = with_field(camera, correction.field_px[i])
             if calibration.any():
                 fx, fy, skew, cx, cy = calibration
                 change = np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 0.0]])
@@ -294,17 +296,19 @@ class Solution:
 
     @cached_property
     def image_cameras(self) -> tuple[Camera, ...]:
-        """Adjusted camera of each image, distortion included, in the camera's own frame.
+        """Adjusted camera of each image, distortion and smooth field included, in the camera's own frame.
 
         Images of the same eye and calibration share one object; it is the rig's own if nothing changed.
         """
         t, K, made = self.traverse, self.calibration, dict[tuple[int, bytes], Camera]()
         moved = np.any(t.calibration != K, axis=(1, 2))
+        fields = None if self.final.rig is None else self.final.rig.field_px
         for i, eye in enumerate(t.image_eye.tolist()):
             key = (eye, K[i].tobytes())
             if key not in made:
                 camera = t.rig.eyes[eye].camera
-                made[key] = camera.with_calibration(K[i]) if moved[i] else camera
+                camera = camera.with_calibration(K[i]) if moved[i] else camera
+                made[key] = camera if fields is None else with_field(camera, fields[eye])
         return tuple(made[eye, k.tobytes()] for eye, k in zip(t.image_eye.tolist(), K, strict=True))
 
     @property

@@ -96,7 +96,7 @@ def placed_images(
     """The images that an eye took at a stop, and a warning for each that cannot be shown.
 
     `twice` is what `same_pictures` gives: a picture that is there twice is shown at its first place.
-    Where the rig was adjusted, its calibration belongs to the refined pointing only.
+    Where the rig was adjusted, its calibration and smooth field belong to the refined pointing only.
     """
     traverse = solution.traverse
     images, warnings = [], []
@@ -125,15 +125,18 @@ def placed_images(
         except ImageError as error:
             warnings.append(f"mosaic: image {entry.id} is left out: {error}")
             continue
-        camera = traverse.rig.eyes[eye].camera
-        cameras = {}
-        for pointing, view in views.items():
-            adjusted = camera
-            if pointing == "refined" and np.any(solution.calibration[row] != traverse.calibration[row]):
-                adjusted = camera.with_calibration(solution.calibration[row])
-            cameras[pointing] = PlacedCamera(
-                camera=adjusted, world_R_camera=view.world_R_camera[row], centre_m=view.world_t_camera[row]
+        camera: dict[Pointing, Camera] = {
+            "telemetry": traverse.rig.eyes[eye].camera,
+            "refined": solution.image_cameras[row],
+        }
+        cameras = {
+            pointing: PlacedCamera(
+                camera=camera[pointing],
+                world_R_camera=view.world_R_camera[row],
+                centre_m=view.world_t_camera[row],
             )
+            for pointing, view in views.items()
+        }
         images.append(
             PlacedImage(id=entry.id, grey=grey, usable=usable_mask(grey), wanted=wanted, at=cameras)
         )

@@ -3,7 +3,7 @@
 import numpy as np
 
 from pancam_graph.base.geometry import BoolArray, FloatArray, skew, so3_exp
-from pancam_graph.cameras import Camera, Fields
+from pancam_graph.cameras import Camera, FieldCamera
 from pancam_graph.data import Solution
 from pancam_graph.report._look import AFTER, BEFORE, INK, REJECTED, Figure, axis, layout
 from pancam_graph.report._numbers import Json, round_factor, rounded, short
@@ -35,14 +35,13 @@ def lens_figures(solution: Solution, held_px: FloatArray | None) -> list[tuple[s
         grid, _ = _grid(told, _ACROSS)
         figures = []
         whole, valid = displacement_px(told, refined, grid)
-        field = _field_px(solution, number, grid)
-        if valid.any() and np.abs((whole + field)[valid]).max() > 1e-9:
+        if valid.any() and np.abs(whole[valid]).max() > 1e-9:
             bent, bent_valid = displacement_px(told, refined, grid, turned=True)
-            figures.append(_arrows(f"lens-{number}", told, grid[valid], (whole + field)[valid], _MOVED))
+            figures.append(_arrows(f"lens-{number}", told, grid[valid], whole[valid], _MOVED))
             keep = valid & bent_valid
-            figures.append(_arrows(f"bent-{number}", told, grid[keep], (bent + field)[keep], _BENT))
-        if field.any():
-            figures.append(_arrows(f"field-{number}", told, grid, field, _FIELD))
+            figures.append(_arrows(f"bent-{number}", told, grid[keep], bent[keep], _BENT))
+        if isinstance(refined, FieldCamera):
+            figures.append(_arrows(f"field-{number}", told, grid, refined.at(grid)[0], _FIELD))
         figures += _residual_figures(solution, number, held_px)
         if figures:
             out.append((traverse.rig.eyes[number].name, figures))
@@ -52,16 +51,6 @@ def lens_figures(solution: Solution, held_px: FloatArray | None) -> list[tuple[s
 _MOVED = "The refined camera shows a line of sight displaced by so much against the camera as told"
 _FIELD = "Of that the smooth field beside the lens, which no number of the table describes"
 _BENT = "The same less what a turn of the camera would do, which pan, tilt and mount can take up"
-
-
-def _field_px(solution: Solution, eye: int, uv_px: FloatArray) -> FloatArray:
-    """Smooth distortion field (n, 2) of an eye at pixels (n, 2); 0 where it has none."""
-    rig, camera = solution.final.rig, solution.traverse.rig.eyes[eye].camera
-    if rig is None or rig.field_px is None:
-        return np.zeros_like(uv_px)
-    one, at = np.zeros(1, dtype=np.int64), np.zeros(len(uv_px), dtype=np.int64)
-    size_px = np.array([[camera.width_px, camera.height_px]], dtype=float)
-    return Fields(coefficients_px=rig.field_px[[eye]], row=one, size_px=size_px).at(at, uv_px)
 
 
 def displacement_px(

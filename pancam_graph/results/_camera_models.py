@@ -7,10 +7,11 @@ import numpy as np
 
 from pancam_graph.base.errors import CameraError, InputError
 from pancam_graph.base.text import visible
-from pancam_graph.cameras import CAHV, Camera, as_cahv
+from pancam_graph.cameras import CAHV, Camera, as_cahv, without_field
 from pancam_graph.data import Solution, Traverse
 from pancam_graph.io import cahvor_text
 from pancam_graph.results._exported import file_names, whole_export, write_export_json
+from pancam_graph.results._left_out_field import field_left_out, warned_of_field
 from pancam_graph.results._output import OutputWriter, Written
 
 __all__ = ["CAMERAS", "fill_cameras", "require_cahv_family", "world_models", "write_cameras"]
@@ -26,7 +27,8 @@ def write_cameras(solution: Solution, folder: Path | str) -> None:
     """Write each image's refined camera as a text file, `IMAGE.cahvor`, into the folder `folder`.
 
     Vectors are in the world frame of the traverse, z up. A camera keeps the model that the rig has; a pinhole
-    is written as CAHV, a Brown lens with k1 and k2 alone as CAHVOR: both exactly. Whole or not at all: an
+    is written as CAHV, a Brown lens with k1 and k2 alone as CAHVOR: both exactly. Smooth fields have no place
+    in these files: `export.json` says by how many pixels each camera misses its own. Whole or not at all: an
     older export is replaced at the end. Images without a finite pose are left out. `export.json` says which
     file is of which image.
 
@@ -48,11 +50,16 @@ def fill_cameras(solution: Solution, folder: Path) -> None:
             text = cahvor_text(model, [f"pancam_graph, image {visible(image.id).replace('=', '-')}", *_FRAME])
             (folder / f"{name}.cahvor").write_text(text, encoding="utf-8", newline="\n")
             listed.append({"id": image.id, "file": f"{name}.cahvor"})
-    write_export_json(folder, "cahvor", {"frame": "world", "images": listed})
+    lost = field_left_out(solution)
+    about = {"frame": "world", "images": listed} | ({"field_left_out": lost} if lost else {})
+    write_export_json(folder, "cahvor", about)
 
 
 def world_models(solution: Solution) -> list[CAHV | None]:
-    """Each image's refined camera with its vectors in the world frame; None without a finite pose."""
+    """Each image's refined camera with its vectors in the world frame; None without a finite pose.
+
+    Without its smooth field, which the CAHV family has not.
+    """
     made: dict[int, CAHV] = {}
     out: list[CAHV | None] = []
     for camera, rotation, centre in zip(
@@ -61,7 +68,7 @@ def world_models(solution: Solution) -> list[CAHV | None]:
         if not (np.isfinite(rotation).all() and np.isfinite(centre).all()):
             out.append(None)
             continue
-        model = made.setdefault(id(camera), as_cahv(camera))
+        model = made.setdefault(id(camera), as_cahv(without_field(camera)))
         out.append(model.transformed(gtsam.Pose3(gtsam.Rot3(rotation), centre)))
     return out
 
@@ -74,14 +81,14 @@ def require_cahv_family(traverse: Traverse) -> None:
 
 def _require(name: str, camera: Camera) -> None:
     try:
-        as_cahv(camera)
+        as_cahv(without_field(camera))
     except CameraError as error:
         raise InputError(f"cahvor: camera {name}: {error}") from error
 
 
 def _write(written: Written, folder: Path) -> Written:
     fill_cameras(written.solution, folder)
-    return written
+    return warned_of_field(written, "cahvor")
 
 
 CAMERAS = OutputWriter(write=_write, check=require_cahv_family)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pancam_graph.base.geometry import FloatArray, wxyz_from_rotation
-from pancam_graph.cameras import lens_of, straightening_map
+from pancam_graph.cameras import lens_of, straightening_map, without_field
 from pancam_graph.data import Solution, rms_px
 from pancam_graph.io import readable_picture
 from pancam_graph.results._brightness import Brightness, brightness_of
@@ -55,7 +55,8 @@ def write_colmap(solution: Solution, folder: Path | str) -> None:
 
     `sparse/` is a text model with cameras, rigs, frames, images and points; every camera is a PINHOLE.
     `images/CAMERA/FRAME.png` are the images, in 8 bits, resampled where the camera is not a pinhole without
-    skew. `stereo/` is what `colmap patch_match_stereo` starts from, and `export.json` says what was done.
+    skew: lens and smooth field are taken out of them. `stereo/` is what `colmap patch_match_stereo` starts
+    from, and `export.json` says what was done.
 
     Observations are those used, each carried along its line of sight to the pinhole, so that COLMAP's
     residuals are those of the solution times the enlargement of the image. Points that fit best beyond
@@ -293,7 +294,7 @@ def _about(
             {
                 "camera_id": number,
                 "camera": solution.traverse.images[i].camera,
-                "model": lens_of(s.camera).name,
+                "model": lens_of(without_field(s.camera)).name,
                 "range_m": s.range_m if moving else None,
                 "largest_shift_px": float(placed.shift_px[of_camera].max(initial=0.0)) if moving else 0.0,
             }

@@ -10,10 +10,11 @@ import numpy as np
 
 from pancam_graph.base.errors import CameraError
 from pancam_graph.base.text import visible
-from pancam_graph.cameras import CAHV, as_cahv
+from pancam_graph.cameras import CAHV, as_cahv, without_field
 from pancam_graph.data import Solution
 from pancam_graph.io import cahvor_text, picture_digests, rig_json
 from pancam_graph.results._exported import file_names, whole_export, write_export_json
+from pancam_graph.results._left_out_field import field_left_out, warned_of_field
 from pancam_graph.results._output import OutputWriter, Written
 from pancam_graph.rigs import Rig, camera_z_up
 
@@ -55,6 +56,8 @@ def fill_rig(solution: Solution, folder: Path) -> None:
         (folder / "rover").mkdir()
         ids = [image.id for image in traverse.images]
         about["images"] = _written(folder, "rover/", ids, models, _ROVER)
+    if lost := field_left_out(solution):
+        about["field_left_out"] = lost
     write_export_json(folder, "rig", about)
 
 
@@ -95,7 +98,7 @@ def rover_models(solution: Solution) -> list[CAHV | None]:
         R, t = final.world_R_camera[i], final.world_t_camera[i]
         rover_T_world = mounted * final.world_T_mast[int(traverse.image_stop[i])].inverse()
         try:
-            model = as_cahv(camera)
+            model = as_cahv(without_field(camera))
         except CameraError:
             out.append(None)
             continue
@@ -111,7 +114,9 @@ def _mast_models(rig: Rig) -> list[CAHV | None]:
     out: list[CAHV | None] = []
     for eye, rotation, centre in zip(rig.eyes, rotations, centres, strict=True):
         try:
-            out.append(as_cahv(eye.camera).transformed(gtsam.Pose3(gtsam.Rot3(rotation), centre)))
+            out.append(
+                as_cahv(without_field(eye.camera)).transformed(gtsam.Pose3(gtsam.Rot3(rotation), centre))
+            )
         except CameraError:
             out.append(None)
     return out
@@ -133,7 +138,7 @@ def _written(
 
 def _write(written: Written, folder: Path) -> Written:
     fill_rig(written.solution, folder)
-    return written
+    return warned_of_field(written, "rig")
 
 
 RIG = OutputWriter(write=_write)

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
+from pancam_graph.base.errors import CameraError
 from pancam_graph.base.geometry import FloatArray
-from pancam_graph.cameras import FIELD_PER_COEFFICIENT, FIELD_SHAPE, Fields
+from pancam_graph.cameras import FIELD_PER_COEFFICIENT, FIELD_SHAPE, Fields, Pinhole, with_field
 
 SIZE = np.array([[1024.0, 768.0], [640.0, 640.0]])
 
@@ -34,11 +35,53 @@ def test_a_field_is_the_spline_of_its_image() -> None:
         assert found[here] == pytest.approx(expected, abs=1e-12)
 
 
-def test_beyond_the_edge_the_outermost_cells_go_on() -> None:
-    fields = random_fields()
-    step = np.linspace(-3.0, 3.0, 13)
-    along = fields.at(np.zeros(13, dtype=int), np.column_stack([-0.5 + step, np.full(13, 300.0)]))
-    assert np.diff(along, 4, axis=0) == pytest.approx(0.0, abs=1e-9)  # one cubic on both sides
+def test_beyond_the_edge_the_field_is_that_of_the_edge() -> None:
+    fields, rng = random_fields(), np.random.default_rng(2)
+    image = rng.integers(0, 2, 100)
+    uv = rng.uniform(-1.5 * SIZE[image], 2.5 * SIZE[image])
+    assert fields.at(image, uv) == pytest.approx(fields.at(image, np.clip(uv, -0.5, SIZE[image] - 0.5)))
+
+
+def test_slope_of_a_field() -> None:
+    fields, rng = random_fields(), np.random.default_rng(3)
+    image = rng.integers(0, 2, 100)
+    uv = rng.uniform(-0.3 * SIZE[image], 1.3 * SIZE[image])
+    by_difference = [
+        (fields.at(image, uv + step) - fields.at(image, uv - step)) / 2e-3 for step in 1e-3 * np.eye(2)
+    ]
+    assert fields.slope(image, uv) == pytest.approx(np.stack(by_difference, axis=2), abs=1e-9)
+
+
+def test_a_camera_with_a_field_is_what_observations_of_it_are() -> None:
+    """A pixel as measured less the field there is where the lens alone sees the point."""
+    lens = Pinhole(width_px=1024, height_px=768, fx_px=900.0, fy_px=900.0, cx_px=500.0, cy_px=380.0)
+    coefficients = np.random.default_rng(4).normal(size=FIELD_SHAPE)
+    camera = with_field(lens, coefficients)
+    points = np.random.default_rng(5).uniform([-0.5, -0.4, 1.0], [0.5, 0.4, 1.0], (200, 3))
+    uv, valid = camera.project(points)
+    fields = Fields(coefficients_px=coefficients[None], row=np.zeros(1, dtype=int), size_px=SIZE[:1])
+    assert valid.all()
+    assert uv - fields.at(np.zeros(200, dtype=int), uv) == pytest.approx(lens.project(points)[0], abs=1e-9)
+    assert with_field(camera, np.zeros(FIELD_SHAPE)) is lens
+
+
+@pytest.mark.parametrize(
+    ("field_px", "says"),
+    [
+        (np.zeros((2, 7, 6)), "expected 2 x 7 x 7 numbers, found 2 x 7 x 6"),
+        (np.full(FIELD_SHAPE, np.nan), "expected finite numbers"),
+    ],
+)
+def test_fields_that_are_none(field_px: FloatArray, says: str) -> None:
+    lens = Pinhole(width_px=64, height_px=48, fx_px=90.0, fy_px=90.0, cx_px=30.0, cy_px=20.0)
+    with pytest.raises(CameraError, match=says):
+        with_field(lens, np.where(field_px == 0, 1.0, field_px))
+
+
+def test_a_field_that_folds_is_outside_the_domain() -> None:
+    lens = Pinhole(width_px=64, height_px=48, fx_px=90.0, fy_px=90.0, cx_px=30.0, cy_px=20.0)
+    steep = np.broadcast_to(100.0 * np.arange(7.0), FIELD_SHAPE)
+    assert not with_field(lens, steep).unproject(np.array([[30.0, 20.0]])).valid.any()
 
 
 def test_equal_coefficients_are_a_shift() -> None:
