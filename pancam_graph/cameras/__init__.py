@@ -13,8 +13,10 @@ from pancam_graph.cameras._field import FIELD_PER_COEFFICIENT as FIELD_PER_COEFF
 from pancam_graph.cameras._field import FIELD_SHAPE as FIELD_SHAPE
 from pancam_graph.cameras._field import Fields as Fields
 from pancam_graph.cameras._field_camera import FieldCamera as FieldCamera
-from pancam_graph.cameras._field_camera import field_of as field_of
+from pancam_graph.cameras._field_camera import fields_of as fields_of
+from pancam_graph.cameras._field_camera import with_added_field as with_added_field
 from pancam_graph.cameras._field_camera import with_field as with_field
+from pancam_graph.cameras._field_camera import with_field_of as with_field_of
 from pancam_graph.cameras._field_camera import without_field as without_field
 from pancam_graph.cameras._lens import MOUNT as MOUNT
 from pancam_graph.cameras._lens import Distorted as Distorted

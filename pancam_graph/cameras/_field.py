@@ -4,6 +4,7 @@ The field is added to where the camera model sees a point: pixel = model + field
 as measured, so it is linear in its coefficients, whatever the cameras are.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +33,16 @@ class Fields:
     """(n,) the field of each image"""
     size_px: FloatArray
     """(n, 2) width and height of each image"""
+
+    @staticmethod
+    def joined(fields: "Sequence[Fields]") -> "Fields":
+        """The fields of the images of several sets, one after the other."""
+        begin = np.cumsum([0, *(len(f.coefficients_px) for f in fields)])
+        return Fields(
+            coefficients_px=np.concatenate([f.coefficients_px for f in fields]),
+            row=np.concatenate([f.row + b for f, b in zip(fields, begin, strict=False)]),
+            size_px=np.concatenate([f.size_px for f in fields]),
+        )
 
     def basis(self, image: IntArray, uv_px: FloatArray) -> tuple[IntArray, FloatArray]:
         """Where pixels (m, 2) of images (m,) lie in the spline: first coefficients, weights.

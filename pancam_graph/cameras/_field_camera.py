@@ -1,5 +1,6 @@
 """A camera with its smooth distortion field: the one place where lens and field come together."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.cameras._camera import Camera, Pinhole, Rays, require_finite
 from pancam_graph.cameras._field import FIELD_SHAPE, Fields
 
-__all__ = ["FieldCamera", "field_of", "with_field", "without_field"]
+__all__ = ["FieldCamera", "fields_of", "with_added_field", "with_field", "with_field_of", "without_field"]
 
 _ROUNDS = 20
 _CLOSE = 1e-13
@@ -120,9 +121,19 @@ class FieldCamera(Camera):
         return uv, step <= close
 
 
-def field_of(camera: Camera) -> FloatArray | None:
-    """Coefficients (2, 7, 7) of a camera's field, pixels; None where it has none."""
-    return camera.field_px if isinstance(camera, FieldCamera) else None
+def fields_of(cameras: Sequence[Camera], image_camera: IntArray) -> Fields | None:
+    """The fields of images that each of some cameras took, by the camera's index (n,).
+
+    None where no camera has a field.
+    """
+    if not any(isinstance(camera, FieldCamera) for camera in cameras):
+        return None
+    size_px = np.array([[c.width_px, c.height_px] for c in cameras], dtype=float)
+    return Fields(
+        coefficients_px=np.array([_coefficients_px(camera) for camera in cameras]),
+        row=image_camera,
+        size_px=size_px[image_camera],
+    )
 
 
 def with_field(camera: Camera, field_px: FloatArray | None) -> Camera:
@@ -133,6 +144,20 @@ def with_field(camera: Camera, field_px: FloatArray | None) -> Camera:
     return FieldCamera(width_px=lens.width_px, height_px=lens.height_px, lens=lens, field_px=field_px)
 
 
+def with_added_field(camera: Camera, field_px: FloatArray) -> Camera:
+    """A camera whose field has these coefficients (2, 7, 7), pixels, more than it had."""
+    return with_field(camera, _coefficients_px(camera) + field_px)
+
+
+def with_field_of(lens: Camera, other: Camera) -> Camera:
+    """A lens with the field of another camera, or without one where that has none."""
+    return with_field(lens, other.field_px if isinstance(other, FieldCamera) else None)
+
+
 def without_field(camera: Camera) -> Camera:
     """The lens of a camera without its field."""
     return camera.lens if isinstance(camera, FieldCamera) else camera
+
+
+def _coefficients_px(camera: Camera) -> FloatArray:
+    return camera.field_px if isinstance(camera, FieldCamera) else np.zeros(FIELD_SHAPE)

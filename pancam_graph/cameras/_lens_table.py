@@ -10,6 +10,7 @@ import numpy as np
 from pancam_graph.base.compiled import uncounted
 from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.cameras._camera import Camera
+from pancam_graph.cameras._field_camera import without_field
 from pancam_graph.cameras._lens import Distorted, Distortion
 from pancam_graph.cameras._lenses import LENSES, lens_of
 
@@ -38,11 +39,12 @@ class LensTable:
     def of(cameras: Sequence[Camera], image_camera: IntArray) -> "LensTable":
         """The table of images that each of some cameras took, by the camera's index (n,).
 
-        Raises CameraError for a camera whose class is not among `LENSES`.
+        Their smooth fields are not in it (`fields_of`). Raises CameraError for a camera whose class is not
+        among `LENSES`.
         """
-        lenses = [lens_of(camera) for camera in cameras]
         row, kind, parameters = np.full(len(cameras), -1), list[int](), list[FloatArray]()
-        for i, (camera, lens) in enumerate(zip(cameras, lenses, strict=True)):
+        for i, camera in enumerate(map(without_field, cameras)):
+            lens = lens_of(camera)
             if lens.distortion is not None:
                 row[i] = len(kind)
                 kind.append(_KINDS.index(lens.name))

@@ -9,7 +9,7 @@ import numpy as np
 from pancam_graph.base.choices import expected_one_of
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, corrected_poses
-from pancam_graph.cameras import CALIBRATION_ENTRIES, Camera, projection_matrix, with_field
+from pancam_graph.cameras import CALIBRATION_ENTRIES, Camera, projection_matrix, with_added_field
 from pancam_graph.data._cross_validation import CrossValidation
 from pancam_graph.data._rig_treatment import RigTreatment
 from pancam_graph.data._sharing import Quantity, Sharing
@@ -265,7 +265,7 @@ class Solution:
             mount = _common(correction.mount[of_eye])
             camera, head_T_camera = eye.camera, eye.head_T_camera
             if correction.field_px is not None:
-                camera = with_field(camera, correction.field_px[i])
+                camera = with_added_field(camera, correction.field_px[i])
             if calibration.any():
                 fx, fy, skew, cx, cy = calibration
                 change = np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 0.0]])
@@ -308,7 +308,7 @@ class Solution:
             if key not in made:
                 camera = t.rig.eyes[eye].camera
                 camera = camera.with_calibration(K[i]) if moved[i] else camera
-                made[key] = camera if fields is None else with_field(camera, fields[eye])
+                made[key] = camera if fields is None else with_added_field(camera, fields[eye])
         return tuple(made[eye, k.tobytes()] for eye, k in zip(t.image_eye.tolist(), K, strict=True))
 
     @property

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.base.threads import in_parallel
+from pancam_graph.cameras import Fields
 from pancam_graph.elimination._blocks import Block, Layout, blocks_of
 from pancam_graph.elimination._fields import FieldPart, FieldSystem
 from pancam_graph.elimination._linkage import Linkage, Posture
@@ -143,6 +144,7 @@ class LandmarkSystem:
         self._fields: FieldSystem | None = None
         if linkage.fields is not None:
             self._fields = FieldSystem(linkage.fields, self.sights.image, self.sights.uv_px, self._begin)
+        self._plain: tuple[Fields, kernel.Sights] | None = None
         self._memory = room or Room()
         self._moved, self._moved_cost = np.empty_like(self.vector), np.zeros(n)
         self._has_moved = False
@@ -293,7 +295,14 @@ class LandmarkSystem:
 
     def _sights_at(self, views: CameraViews) -> kernel.Sights:
         """Observations without the fields of these cameras."""
-        return self.sights if self._fields is None else self.sights._replace(uv_px=self._fields.pixels(views))
+        if self._fields is not None:
+            return self.sights._replace(uv_px=self._fields.pixels(views))
+        if views.fields is None:
+            return self.sights
+        if self._plain is None or self._plain[0] is not views.fields:
+            uv_px = views.without_field(self.sights.image, self.sights.uv_px)
+            self._plain = views.fields, self.sights._replace(uv_px=np.ascontiguousarray(uv_px))
+        return self._plain[1]
 
     def put_back(self, panels: Panels, g: int) -> tuple[FloatArray, FloatArray]:
         """The system (n, n), (n,) in the columns of one group, landmarks and other variables held.

@@ -2,8 +2,8 @@
 
 Variables: `M` mast pose per stop (Pose3), `A` pan and tilt of a stop's frames, stacked (vector), `F` how the
 heads of these frames stand off the rigid mast, stacked (vector), where that is free, the free entries of the
-rig (`_rig_variables`), and `D` the smooth distortion field of an eye (vector), where that is free. Quantities
-that telemetry holds (sigma 0) are not variables.
+rig (`_rig_variables`), and `D` what the smooth distortion field of an eye has more than the rig's (vector),
+where that is free. Quantities that telemetry holds (sigma 0) are not variables.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ from pancam_graph.base.geometry import (
     pose_arrays,
     twists_in_parent,
 )
-from pancam_graph.cameras import FIELD_COEFFICIENTS, FIELD_PER_COEFFICIENT, FIELD_SHAPE, Fields
+from pancam_graph.cameras import FIELD_COEFFICIENTS, FIELD_SHAPE, Fields
 from pancam_graph.data import (
     FIXED,
     Quantity,
@@ -67,12 +67,6 @@ class HardTemplate(FactorTemplate):
         """Key of the pan and tilt of those frames of a stop that are not held."""
         return key_of(Kind.ANGLES, stop)
 
-    @cached_property
-    def _field_keys(self) -> list[int]:
-        """Keys of the fields of all eyes; empty where fields are held."""
-        is_free = bool(self.rig_variables.sharing.field.entries("field"))
-        return [key_of(Kind.FIELD, i) for i in range(len(self.traverse.rig.eyes))] if is_free else []
-
     @staticmethod
     def flex_key(stop: int) -> int:
         """Key of how the heads of those frames stand off the rigid mast."""
@@ -103,7 +97,7 @@ class HardTemplate(FactorTemplate):
         for v in free.of_stop(None):
             add(v.key, len(v.entries), len(t.stops))
         fields = self._field_columns(sum(d for d, g in zip(dims, group, strict=True) if g == len(t.stops)))
-        for key in self._field_keys:
+        for key in self.rig_variables.field_keys:
             add(key, FIELD_COEFFICIENTS, len(t.stops))
 
         row = {key: i for i, key in enumerate(keys)}
@@ -147,12 +141,12 @@ class HardTemplate(FactorTemplate):
     def _field_columns(self, first: int) -> FieldColumns | None:
         """Columns of fields, which follow all others that stops share: `first` of them."""
         t = self.traverse
-        if not self._field_keys:
+        if not self.rig_variables.field_keys:
             return None
         return FieldColumns(
             group=len(t.stops),
             first=first,
-            n=FIELD_COEFFICIENTS * len(self._field_keys),
+            n=FIELD_COEFFICIENTS * len(self.rig_variables.field_keys),
             image_column=FIELD_COEFFICIENTS * t.image_eye,
         )
 
@@ -243,18 +237,20 @@ class HardTemplate(FactorTemplate):
         head = compose(masts[0][t.frame_stop], masts[1][t.frame_stop], *mast_T_head)
         image = t.image_frame
         views = self.views_of(*compose(head[0][image], head[1][image], *free.mounts(values)), values)
-        return replace(views, fields=self._fields(values)) if self._field_keys else views
+        return replace(views, fields=self._fields(values)) if self.rig_variables.field_keys else views
 
     def _fields(self, values: gtsam.Values) -> Fields:
         t = self.traverse
+        coefficients_px = self._field_changes(values)
+        if self.fields is not None:
+            coefficients_px = self.fields.coefficients_px + coefficients_px
         size = np.array([[e.camera.width_px, e.camera.height_px] for e in t.rig.eyes], dtype=float)
-        return Fields(
-            coefficients_px=np.array([values.atVector(key) for key in self._field_keys]).reshape(
-                -1, *FIELD_SHAPE
-            ),
-            row=t.image_eye,
-            size_px=size[t.image_eye],
-        )
+        return Fields(coefficients_px=coefficients_px, row=t.image_eye, size_px=size[t.image_eye])
+
+    def _field_changes(self, values: gtsam.Values) -> FloatArray:
+        """(eyes, *FIELD_SHAPE) what the fields of eyes have more than those of the rig."""
+        coefficients_px = np.array([values.atVector(key) for key in self.rig_variables.field_keys])
+        return coefficients_px.reshape(-1, *FIELD_SHAPE)
 
     def _mast_T_head(
         self, angles: FloatArray, axes: tuple[FloatArray, FloatArray] | None, flex: FloatArray | None
@@ -278,25 +274,10 @@ class HardTemplate(FactorTemplate):
     def correction(self, values: gtsam.Values) -> RigCorrection | None:
         """As in the base class, with the fields of eyes."""
         found = super().correction(values)
-        if not self._field_keys:
+        if not self.rig_variables.field_keys:
             return found
         found = found or RigCorrection.to_calibrations(self.traverse, self.traverse.calibration)
-        return replace(found, field_px=self._fields(values).coefficients_px)
-
-    @cached_property
-    def field_sigma_px(self) -> FloatArray:
-        """(eyes,) sigma of the prior of each eye's field at a pixel; none where fields are held."""
-        field = self.rig_variables.sharing.field
-        focal_px = [p.calibration_matrix[0, 0] for p in self.traverse.rig.pinholes[: len(self._field_keys)]]
-        return np.array([field.sigma_of("field_px", f) for f in focal_px])
-
-    def field_factors(self) -> FactorList:
-        """The priors of the fields of eyes, if these are free: independent coefficients."""
-        out: FactorList = []
-        for key, sigma in zip(self._field_keys, self.field_sigma_px / FIELD_PER_COEFFICIENT, strict=True):
-            noise = gtsam.noiseModel.Isotropic.Sigma(FIELD_COEFFICIENTS, sigma)
-            out.append(gtsam.PriorFactorVector(key, np.zeros(FIELD_COEFFICIENTS), noise))
-        return out
+        return replace(found, field_px=self._field_changes(values))
 
     def flex_factors(self, stop: int) -> FactorList:
         """The prior of how a stop's heads stand off the rigid mast, if they may."""
@@ -336,7 +317,7 @@ class HardTemplate(FactorTemplate):
                 values.insert(slot.key, state.world_T_mast[stop])
         self.rig_variables.insert(values, state.rig)
         known = None if state.rig is None else state.rig.field_px
-        for eye, key in enumerate(self._field_keys):
+        for eye, key in enumerate(self.rig_variables.field_keys):
             values.insert(key, np.zeros(FIELD_COEFFICIENTS) if known is None else known[eye].ravel())
         return values
 

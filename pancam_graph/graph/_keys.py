@@ -32,7 +32,7 @@ class Kind(Enum):
     ENCODERS = "S"
     """Free entries of the scale of pans and tilts over their readings (vector)."""
     FIELD = "D"
-    """Coefficients of the smooth distortion field of an eye, pixels (vector)."""
+    """Coefficients, pixels, that the smooth distortion field of an eye has more than in the rig (vector)."""
     RADIUS = "R"
     """Radius of an eye's circle, metres (number)."""
     NATIVE_CALIBRATION = "C"

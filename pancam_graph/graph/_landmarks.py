@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 
 from pancam_graph.base.geometry import BoolArray, FloatArray
+from pancam_graph.cameras import without_field
 from pancam_graph.factors import Fixed, Key, camera_projection_factor
 from pancam_graph.graph._given import GivenFactor, seated
 from pancam_graph.graph._keys import Kind, key_of, read_variable
@@ -30,12 +31,13 @@ class ExplicitLandmarks:
     def __init__(self, template: SoftTemplate, measurements: Measurements) -> None:
         self.template = template
         self.measurements = measurements
+        self._plain_px = template.without_field(measurements.image, measurements.uv_px)
         self.calibrations = NativeCalibrations(template.rig_variables)
         rig = template.traverse.rig
         self._calibration = [
             gtsam.Cal3_S2(p.fx_px, p.fy_px, p.skew_px, p.cx_px, p.cy_px) for p in rig.pinholes
         ]
-        self._lens = [eye.camera.with_unit_calibration() for eye in rig.eyes]
+        self._lens = [without_field(eye.camera).with_unit_calibration() for eye in rig.eyes]
 
     @staticmethod
     def key(landmark: int) -> int:
@@ -80,18 +82,18 @@ class ExplicitLandmarks:
                         if self.calibrations.any
                         else Fixed(self._calibration[eye[image]].vector()),
                         lens=self._lens[eye[image]],
-                        uv_px=m.uv_px[i],
+                        uv_px=self._plain_px[i],
                     )
                 )
             elif self.calibrations.any:
                 calibration = self.calibrations.key(image)
                 graph.push_back(
-                    gtsam.GeneralSFMFactor2Cal3_S2(m.uv_px[i], noise, camera, landmark, calibration)
+                    gtsam.GeneralSFMFactor2Cal3_S2(self._plain_px[i], noise, camera, landmark, calibration)
                 )
             else:
                 graph.push_back(
                     gtsam.GenericProjectionFactorCal3_S2(
-                        m.uv_px[i],
+                        self._plain_px[i],
                         noise,
                         camera,
                         landmark,

@@ -71,6 +71,7 @@ class ProjectiveTemplate(SoftTemplate):
             world_t_camera=centre_m + self.conditioning.origin_m,
             calibration=K,
             lenses=self.lenses,
+            fields=self.fields,
         )
 
     def posture(self, values: gtsam.Values) -> Posture:

@@ -20,7 +20,7 @@ from pancam_graph.base.geometry import (
     correction_twists,
     pose_arrays,
 )
-from pancam_graph.cameras import CALIBRATION_ENTRIES
+from pancam_graph.cameras import CALIBRATION_ENTRIES, FIELD_COEFFICIENTS, FIELD_PER_COEFFICIENT
 from pancam_graph.data import (
     ENTRIES,
     Freedom,
@@ -198,6 +198,12 @@ class RigVariables:
         """Keys of `numbers`."""
         return [v.key for v in self.numbers]
 
+    @cached_property
+    def field_keys(self) -> list[int]:
+        """Keys of the fields of all eyes; empty where fields are held."""
+        is_free = bool(self.sharing.field.entries("field"))
+        return [key_of(Kind.FIELD, i) for i in range(len(self.traverse.rig.eyes))] if is_free else []
+
     def group(self, variable: RigVariable) -> int:
         """Group in which a variable is eliminated: its stop's, or the last one."""
         return len(self.traverse.stops) if variable.stop is None else variable.stop
@@ -270,9 +276,16 @@ class RigVariables:
                 values.insert(v.key, entries)
 
     def prior_factors(self, stop: int | None) -> list[gtsam.NonlinearFactor]:
-        """Priors of `of_stop`."""
+        """Priors of `of_stop`; with what all stops share also those of fields."""
         out: list[gtsam.NonlinearFactor] = []
-        joint = self.keys if stop is None and self.sharing.covariance is not None else []
+        joint: list[int] = []
+        if stop is None and self.sharing.covariance is not None:
+            joint = [*self.keys, *self.field_keys]
+        elif stop is None:
+            for eye, key in enumerate(self.field_keys):
+                sigma = np.full(FIELD_COEFFICIENTS, self._own_sigma("field", "", eye))
+                noise = gtsam.noiseModel.Diagonal.Sigmas(sigma)
+                out.append(gtsam.PriorFactorVector(key, np.zeros(FIELD_COEFFICIENTS), noise))
         out += self.joint_priors(joint, ())
         for v in self.of_stop(stop):
             if v.key in joint or not np.isfinite(v.sigma).any():
@@ -288,6 +301,9 @@ class RigVariables:
 
     def _entries_of(self, key: int) -> list[RigEntry]:
         """The numbers of the rig that a variable of an eye, or of the tilt axis, corrects."""
+        if kind_of(key) is Kind.FIELD:
+            eye = self.traverse.rig.eyes[index_of(key)]
+            return [RigEntry("field", eye.name, entry) for entry in RIG_ENTRIES["field"]]
         quantity = next(q for q, kind in _KIND.items() if kind is kind_of(key))
         camera = None if quantity in _OF_STOPS else self.traverse.rig.eyes[index_of(key)].name
         freedom: Freedom = getattr(self.sharing, quantity)
@@ -306,6 +322,8 @@ class RigVariables:
         """Sigma of the prior of an entry by itself, whatever the covariance says."""
         freedom: Freedom = getattr(self.sharing, quantity)
         focal = 1.0 if quantity in _OF_STOPS else self._focal_px(eye)
+        if quantity == "field":  # any coefficient, where the freedom says how large a field is at a pixel
+            return freedom.sigma_of("field_px", focal) / FIELD_PER_COEFFICIENT
         return freedom.sigma_of(entry, focal)
 
     def joint_priors(self, new: Sequence[int], known: Sequence[int]) -> list[gtsam.NonlinearFactor]:
@@ -323,6 +341,17 @@ class RigVariables:
         rows = scipy.linalg.solve_triangular(root, np.diag(1 / size), lower=True)
         first = len(covariance) - sum(len(self._entries_of(key)) for key in new)
         return [conditional_prior_factor(rows[first:], [Key(key) for key in keys])]
+
+    def field_sigmas(self, changes_px: FloatArray) -> FloatArray:
+        """Size of changes (eyes, ...) of fields' coefficients: RMS (eyes,) in sigmas of their priors."""
+        prior = self.sharing.covariance or RigCovariance(entries=(), matrix=np.zeros((0, 0)))
+        out = []
+        for key, change_px in zip(self.field_keys, changes_px.reshape(len(changes_px), -1), strict=True):
+            entries = self._entries_of(key)
+            own = np.full(len(entries), self._own_sigma("field", "", index_of(key)))
+            whitened = np.linalg.solve(np.linalg.cholesky(prior.among(entries, own)), change_px)
+            out.append(np.sqrt(np.mean(whitened**2)))
+        return np.array(out)
 
     def prior_information(self) -> FloatArray:
         """Information (n, n) of the priors of the variables of `keys`, one after the other."""
@@ -401,14 +430,17 @@ class RigVariables:
         """Joint covariance of the rig's numbers about their values after the adjustment.
 
         Of the numbers that belong to the whole traverse; an entry of the prior's covariance whose eye has no
-        image keeps its covariance with the others like it. Corrections of a rig that is corrected already
-        differ from those of this one in the second order: their Jacobian is in it.
+        image, or that was held, keeps its covariance with the others like it. Corrections of a rig that is
+        corrected already differ from those of this one in the second order: their Jacobian is in it.
         """
         variables, g = self.numbers, len(self.traverse.stops)
-        columns = [np.arange(c.start, c.stop) for c in (linkage.columns_of(v.key) for v in variables)]
-        entries = [entry for v in variables for entry in self._entries_of(v.key)]
+        keys = [*self.keys, *self.field_keys]
+        columns = [np.arange(c.start, c.stop) for c in map(linkage.columns_of, keys)]
+        entries = [entry for key in keys for entry in self._entries_of(key)]
         order = np.concatenate([np.zeros(0, dtype=np.int64), *columns])
-        jacobian = scipy.linalg.block_diag(*(self._moved(v, values) for v in variables))
+        moved = [self._moved(v, values) for v in variables]
+        of_field = [np.eye(len(RIG_ENTRIES["field"])) for _ in self.field_keys]  # it is linear
+        jacobian = scipy.linalg.block_diag(*moved, *of_field)
         matrix = jacobian @ covariance.block(g, g)[np.ix_(order, order)] @ jacobian.T
         prior = self.sharing.covariance
         if prior is not None:

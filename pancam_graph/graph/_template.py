@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from pancam_graph.base.geometry import FloatArray, IntArray
-from pancam_graph.cameras import LensTable
+from pancam_graph.cameras import Fields, LensTable, fields_of
 from pancam_graph.data import Refined, RigCorrection, Sharing, State, Traverse
 from pancam_graph.elimination import Covariance, JointCovariance, Linkage, PosePlace, Posture, Root
 from pancam_graph.factors import Fixed, Key, Slot, encoder_factor, joint_prior_factor
@@ -95,7 +95,6 @@ class FactorTemplate(ABC):
             rig=(
                 *(factor for owner in (*stops, None) for factor in self.rig_variables.prior_factors(owner)),
                 *(factor for stop in stops for factor in self.flex_factors(stop)),
-                *self.field_factors(),
             ),
             given=tuple(given),
             seated=tuple(factor for factor in placed if factor is not None),
@@ -254,10 +253,6 @@ class FactorTemplate(ABC):
         """The prior of how a stop's heads stand off the rigid mast; none here."""
         return []
 
-    def field_factors(self) -> FactorList:
-        """The priors of the smooth distortion fields of eyes; none here."""
-        return []
-
     @cached_property
     def angle_sigmas_rad(self) -> FloatArray:
         """(frames, 2) sigmas of the priors of pan and tilt, widened where heads flex; 0 where held."""
@@ -300,7 +295,18 @@ class FactorTemplate(ABC):
             world_t_camera=world_t_camera,
             calibration=self.rig_variables.calibration(values),
             lenses=self.lenses,
+            fields=self.fields,
         )
+
+    @cached_property
+    def fields(self) -> Fields | None:
+        """The smooth fields of all images' cameras as the rig has them; None where it has none."""
+        t = self.traverse
+        return fields_of([eye.camera for eye in t.rig.eyes], t.image_eye)
+
+    def without_field(self, image: IntArray, uv_px: FloatArray) -> FloatArray:
+        """Where pixels (n, 2) of images (n,) would be if the rig's cameras had no smooth fields."""
+        return uv_px if self.fields is None else uv_px - self.fields.at(image, uv_px)
 
     @cached_property
     def lenses(self) -> LensTable:

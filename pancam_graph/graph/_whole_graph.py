@@ -4,6 +4,7 @@ import gtsam
 import numpy as np
 
 from pancam_graph.base.geometry import BoolArray, FloatArray
+from pancam_graph.cameras import without_field
 from pancam_graph.factors import Fixed, Key, Slot, mast_projection_factor
 from pancam_graph.graph._factors import graph_of
 from pancam_graph.graph._keys import Kind, key_of
@@ -68,7 +69,11 @@ def _rigid_graph(
     """
     factors = template.factors()
     graph, m, t, rig = graph_of(factors.priors), measurements, template.traverse, template.rig_variables
-    free, lenses = bool(rig.of["calibration"]), [e.camera.with_unit_calibration() for e in t.rig.eyes]
+    free, lenses = (
+        bool(rig.of["calibration"]),
+        [without_field(e.camera).with_unit_calibration() for e in t.rig.eyes],
+    )
+    plain_px = template.without_field(m.image, m.uv_px)
     for i in np.flatnonzero(accepted).tolist():
         image = int(m.image[i])
         calibration: Slot = Fixed(np.zeros(0))
@@ -90,7 +95,7 @@ def _rigid_graph(
                 nominal=t.calibration[image : image + 1],
                 basis=basis,
                 lens=lenses[int(t.image_eye[image])],
-                uv_px=m.uv_px[i : i + 1],
+                uv_px=plain_px[i : i + 1],
             )
         )
     return graph

@@ -3,21 +3,60 @@
 from dataclasses import replace
 from typing import Annotated, Any, ClassVar, Literal, Union
 
+import numpy as np
 from pydantic import Discriminator, Field, GetCoreSchemaHandler, Tag, create_model
 from pydantic_core import CoreSchema
 
-from pancam_graph.cameras import LENSES, Lens, LensField, lens_of
-from pancam_graph.io._entries import Label, PoseEntry, SparseEntry
+from pancam_graph.base.errors import InputError
+from pancam_graph.cameras import (
+    FIELD_SHAPE,
+    LENSES,
+    Camera,
+    FieldCamera,
+    Lens,
+    LensField,
+    lens_of,
+    with_field,
+    without_field,
+)
+from pancam_graph.io._entries import Entry, Label, PoseEntry, SparseEntry
 from pancam_graph.io._json import prefixed
 from pancam_graph.rigs import Eye
 
 __all__ = ["AnyCamera", "CameraEntry", "camera_entry"]
 
 
+class FieldEntry(Entry):
+    """Coefficients of the smooth distortion field of a camera, by rows of the image (`cameras.Fields`)."""
+
+    u_px: list[list[float]]
+    v_px: list[list[float]]
+
+    def on(self, lens: Camera) -> Camera:
+        """A lens with this field. Raises InputError for another number of coefficients."""
+        _, rows, columns = FIELD_SHAPE
+        for key, table in (("u_px", self.u_px), ("v_px", self.v_px)):
+            if [len(row) for row in table] != [columns] * rows:
+                found = f"{len(table)} of {', '.join(str(n) for n in sorted({len(row) for row in table}))}"
+                raise InputError(
+                    f"field: {key}: expected {rows} rows of {columns} numbers, found {found or 'none'}"
+                )
+        with prefixed("field"):
+            return with_field(lens, np.array([self.u_px, self.v_px]))
+
+    @staticmethod
+    def of(camera: Camera) -> "FieldEntry | None":
+        """The entry of a camera's field; None where it has none."""
+        if not isinstance(camera, FieldCamera):
+            return None
+        u_px, v_px = camera.field_px.tolist()
+        return FieldEntry(u_px=u_px, v_px=v_px)
+
+
 class CameraEntry(SparseEntry):
     """A camera and how it sits on the head; the other entries are those of its lens (`LENSES`)."""
 
-    _OPTIONAL: ClassVar = frozenset({"unit"})
+    _OPTIONAL: ClassVar = frozenset({"unit", "field"})
 
     name: Label
     unit: Label | None = None
@@ -25,6 +64,8 @@ class CameraEntry(SparseEntry):
     width_px: int
     height_px: int
     model: str
+    field: FieldEntry | None = None
+    """Smooth distortion field on top of the lens."""
 
     def eye(self, where: str) -> Eye:
         """The eye. Raises InputError naming `where`."""
@@ -33,6 +74,8 @@ class CameraEntry(SparseEntry):
         numbers = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
         with prefixed(where):
             camera = lens.camera(width_px=self.width_px, height_px=self.height_px, **numbers)
+            if self.field is not None:
+                camera = self.field.on(camera)
             if lens.in_head_frame:
                 return replace(Eye.from_head_model(self.name, camera), unit=self.unit or "")
         mount = next(getattr(self, field.key) for field in lens.fields if field.kind == "mount")
@@ -82,8 +125,8 @@ def camera_entry(eye: Eye) -> CameraEntry:
     that model does not have.
     """
     with prefixed(f"camera {eye.name}"):
-        lens = lens_of(eye.camera)
-    camera = eye.head_model() if lens.in_head_frame else eye.camera
+        lens = lens_of(without_field(eye.camera))
+    camera = eye.head_model() if lens.in_head_frame else without_field(eye.camera)
     values = {
         field.key: PoseEntry.of(eye.head_T_camera) if field.kind == "mount" else field.of(camera)
         for field in lens.fields
@@ -94,5 +137,6 @@ def camera_entry(eye: Eye) -> CameraEntry:
         width_px=camera.width_px,
         height_px=camera.height_px,
         model=lens.name,
+        field=FieldEntry.of(eye.camera),
         **values,
     )

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.base.threads import in_parallel
-from pancam_graph.cameras import Camera, Fields, LensTable
+from pancam_graph.cameras import Camera, Fields, LensTable, fields_of
 from pancam_graph.landmarks import kernel
 from pancam_graph.landmarks._losses import SQUARED, Loss
 
@@ -94,17 +94,21 @@ class CameraViews:
             world_t_camera=np.zeros((n, 3)),
             calibration=np.array([c.pinhole.calibration_matrix for c in cameras]).reshape(n, 3, 3),
             lenses=LensTable.of(cameras, np.arange(n)),
+            fields=fields_of(cameras, np.arange(n)),
         )
 
     @staticmethod
     def joined(parts: "Sequence[CameraViews]") -> "CameraViews":
-        """The cameras of several sets of images, one after the other; none of them has fields."""
+        """The cameras of several sets of images, one after the other: all have fields, or none has."""
         lenses = [v.lenses or LensTable.without(len(v.world_t_camera)) for v in parts]
+        fields = [v.fields for v in parts if v.fields is not None]
+        assert len(fields) in {0, len(parts)}
         return CameraViews(
             world_R_camera=np.concatenate([v.world_R_camera for v in parts]),
             world_t_camera=np.concatenate([v.world_t_camera for v in parts]),
             calibration=np.concatenate([v.calibration for v in parts]),
             lenses=LensTable.joined(lenses),
+            fields=Fields.joined(fields) if fields else None,
         )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from pancam_graph.base.geometry import FloatArray, IntArray
+from pancam_graph.cameras import FieldCamera
 from pancam_graph.data import (
     ENTRIES,
     Flex,
@@ -238,7 +239,7 @@ def solution_json(solution: Solution) -> bytes:
         "verdict": solution.verdict is None,
         "rig": solution.treatment is None,
         "refined": not solution.refined,
-        "fields": solution.final.rig is None or solution.final.rig.field_px is None,
+        "fields": not any(isinstance(eye.camera, FieldCamera) for eye in solution.rig.eyes),
         "cross_validation": solution.cross_validation is None,
         "incremental": solution.incremental is None,
     }
@@ -346,11 +347,9 @@ def _flex_of_frame(solution: Solution, row: int, flex: tuple[Flex, ...]) -> dict
 
 
 def _fields(solution: Solution) -> list[FieldEntry]:
-    rig = solution.final.rig
-    if rig is None or rig.field_px is None:
-        return []
-    named = zip(solution.traverse.rig.eyes, rig.field_px.tolist(), strict=True)
-    return [FieldEntry(camera=eye.name, u_px=u, v_px=v) for eye, (u, v) in named]
+    named = ((eye.name, eye.camera) for eye in solution.rig.eyes)
+    fields = ((name, camera.field_px.tolist()) for name, camera in named if isinstance(camera, FieldCamera))
+    return [FieldEntry(camera=name, u_px=u_px, v_px=v_px) for name, (u_px, v_px) in fields]
 
 
 def _images(solution: Solution) -> list[SolvedImageEntry]:

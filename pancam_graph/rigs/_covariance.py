@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from pancam_graph.base.choices import expected_one_of
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray
+from pancam_graph.cameras import FIELD_SHAPE
 
 __all__ = ["ASPECT", "FOCAL", "POSE_ENTRIES", "RIG_ENTRIES", "RigCovariance", "RigEntry"]
 
@@ -16,13 +18,18 @@ FOCAL = "focal"
 ASPECT = "aspect"
 POSE_ENTRIES = ("rx_rad", "ry_rad", "rz_rad", "x_m", "y_m", "z_m")
 """A rotation vector and a shift in the pose's own frame (geometry.corrected_poses)."""
+FIELD_ENTRIES = tuple(
+    f"{axis}{row}{column}_px" for axis, row, column in product("uv", *map(range, FIELD_SHAPE[1:]))
+)
+"""Coefficients of a smooth field (cameras.Fields) in their order: those of u, then v, row by row."""
 
 RIG_ENTRIES: Mapping[str, tuple[str, ...]] = {
     "calibration": (FOCAL, ASPECT, "skew_px", "cx_px", "cy_px"),
     "mounts": POSE_ENTRIES,
     "pan_T_tilt": POSE_ENTRIES,
+    "field": FIELD_ENTRIES,
 }
-"""Names of the numbers of a rig by quantity: calibration and mount of each eye, and the tilt axis."""
+"""Names of the numbers of a rig by quantity: calibration, mount and field of each eye, and the tilt axis."""
 
 _ASYMMETRY = 1e-9
 """Largest difference of two entries that mirror each other, as a share of their variances' geometric mean."""
@@ -31,7 +38,7 @@ _LEAST_EIGENVALUE = 1e-13
 
 
 class RigEntry(NamedTuple):
-    """One number of a rig."""
+    """One number of a rig, as `RIG_ENTRIES` has it."""
 
     quantity: str
     """One of `RIG_ENTRIES`."""

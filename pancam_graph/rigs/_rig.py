@@ -15,7 +15,7 @@ from pancam_graph.base.geometry import (
     pan_tilt_rotation,
     pose_arrays,
 )
-from pancam_graph.cameras import CAHV, Camera, Pinhole
+from pancam_graph.cameras import CAHV, Camera, Pinhole, with_field_of, without_field
 from pancam_graph.rigs._uncertainty import RigUncertainty
 
 __all__ = ["Eye", "PointingSigma", "Rig"]
@@ -36,19 +36,28 @@ class Eye:
     known."""
 
     @staticmethod
-    def from_head_model(name: str, model: CAHV) -> "Eye":
-        """An eye from a CAHV-family model whose vectors are in the head frame."""
-        camera, head_T_camera = model.split()
-        return Eye(name=name, camera=camera, head_T_camera=head_T_camera)
+    def from_head_model(name: str, model: Camera) -> "Eye":
+        """An eye from a CAHV-family model whose vectors are in the head frame; a field on top stays.
+
+        Raises TypeError as `head_model`.
+        """
+        lens, head_T_camera = _cahv(name, model).split()
+        return Eye(name=name, camera=with_field_of(lens, model), head_T_camera=head_T_camera)
 
     def head_model(self) -> CAHV:
-        """The CAHV-family model with its vectors in the head frame; inverse of `from_head_model`.
+        """The lens as a CAHV-family model with its vectors in the head frame; inverse of `from_head_model`.
 
         Raises TypeError for a pinhole or Brown camera, which has no such vectors.
         """
-        if not isinstance(self.camera, CAHV):
-            raise TypeError(f"eye {self.name}: a {type(self.camera).__name__} has no CAHV vectors")
-        return self.camera.transformed(self.head_T_camera)
+        return _cahv(self.name, self.camera).transformed(self.head_T_camera)
+
+
+def _cahv(eye: str, camera: Camera) -> CAHV:
+    """The lens of a camera; raises TypeError for one that has no CAHV vectors."""
+    lens = without_field(camera)
+    if not isinstance(lens, CAHV):
+        raise TypeError(f"eye {eye}: a {type(lens).__name__} has no CAHV vectors")
+    return lens
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,6 +8,7 @@ import numpy as np
 
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray
+from pancam_graph.cameras import FIELD_PER_COEFFICIENT
 from pancam_graph.rigs._covariance import ASPECT, FOCAL, RigCovariance, RigEntry
 
 __all__ = ["RigUncertainty"]
@@ -88,6 +89,8 @@ class RigUncertainty:
         if quantity == "calibration":
             of_entry = {FOCAL: self.focal, ASPECT: self.aspect, "skew_px": self.skew_px}
             return of_entry.get(entry, self.principal_point_px)
+        if quantity == "field":
+            return self.field_px / FIELD_PER_COEFFICIENT
         turn, shift = (
             (self.mount_rad, self.mount_m) if quantity == "mounts" else (self.tilt_axis_rad, self.tilt_axis_m)
         )

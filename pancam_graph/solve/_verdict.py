@@ -343,10 +343,10 @@ def _fields(at: Optimum) -> Iterator[VerdictTest]:
     if rig is None or rig.field_px is None or not isinstance(template, HardTemplate):
         return
     size_px = FIELD_PER_COEFFICIENT * np.sqrt(np.mean(rig.field_px**2, axis=(1, 2, 3)))
-    share = size_px / template.field_sigma_px
+    share = template.rig_variables.field_sigmas(rig.field_px)
     eye = int(np.argmax(share))
     name = at.traverse.rig.eyes[eye].name
-    says = f"smooth field of {name}: {size_px[eye]:.2g} px, {share[eye]:.2g} times its "
+    says = f"smooth field of {name}: {size_px[eye]:.2g} px from the rig's, {share[eye]:.2g} times its "
     yield VerdictTest.note(
         "field",
         float(share[eye]),

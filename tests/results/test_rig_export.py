@@ -18,6 +18,7 @@ from pancam_graph import (
     write_results,
 )
 from pancam_graph.base.errors import InputError
+from pancam_graph.cameras import FieldCamera
 from pancam_graph.data import RigTreatment, State
 from pancam_graph.io import read_cahvor, read_pds, read_rig, use_rig
 from pancam_graph.results._rig import rover_models
@@ -72,6 +73,30 @@ def test_the_rig_is_an_export_that_another_run_reads(tmp_path: Path) -> None:
         np.testing.assert_allclose(model.project(point[None])[0], expected, atol=1e-8)
     with pytest.raises(InputError, match="expected others than those that the rig was calibrated with"):
         use_rig(traverse, folder / "rig.json")
+
+
+def test_smooth_fields_are_in_the_rig_and_said_to_be_missing_elsewhere(tmp_path: Path) -> None:
+    solution = solve(drive(), SolveOptions(field=True))
+    written = write_results(solution, tmp_path / "out", report=False, exports=["rig", "cahvor", "colmap"])
+    rig, joint = read_rig(tmp_path / "out/rig/rig.json"), solution.rig_covariance
+    assert rig.uncertainty.covariance is not None and joint is not None
+    assert [e for e in joint.entries if e.quantity == "field"] != []
+    np.testing.assert_array_equal(rig.uncertainty.covariance.matrix, joint.matrix)
+    for eye, other in zip(rig.eyes, solution.rig.eyes, strict=True):
+        assert isinstance(eye.camera, FieldCamera) and isinstance(other.camera, FieldCamera)
+        np.testing.assert_array_equal(eye.camera.field_px, other.camera.field_px)
+    said = [w for w in written.warnings if "cannot hold the smooth fields" in w]
+    assert len(said) == 2
+    lost = json.loads((tmp_path / "out/cahvor/export.json").read_text())["field_left_out"]
+    pixels = np.random.default_rng(0).uniform(0, 1023, (5000, 2))
+    for eye in solution.rig.eyes:
+        assert isinstance(eye.camera, FieldCamera)
+        length = np.linalg.norm(eye.camera.at(pixels)[0], axis=1)
+        assert lost[eye.name]["max_px"] >= 0.98 * length.max()
+        assert lost[eye.name]["rms_px"] == pytest.approx(np.sqrt(np.mean(length**2)), rel=0.1)
+    # COLMAP's pinholes see the straightened observations as the solution sees the raw ones.
+    about = json.loads((tmp_path / "out/colmap/export.json").read_text())
+    assert about["rms_px"] == pytest.approx(about["rms_raw_px"], rel=0.02)
 
 
 def test_cameras_in_the_rover_frame_are_those_of_labels_where_nothing_moved(opportunity_folder: Path) -> None:

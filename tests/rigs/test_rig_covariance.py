@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from pancam_graph.base.errors import InputError
+from pancam_graph.cameras import FIELD_PER_COEFFICIENT
 from pancam_graph.rigs import RIG_ENTRIES, RigCovariance, RigEntry, RigUncertainty
 
 A, B = RigEntry("calibration", "left", "focal"), RigEntry("mounts", "left", "rx_rad")
@@ -66,6 +67,9 @@ def test_each_number_of_a_rig_has_a_sigma_of_its_own_name() -> None:
         found = {(q, e) for q, entries in RIG_ENTRIES.items() for e in entries if told.sigma_of(q, e)}
         assert found
         assert {told.sigma_of(q, e) for q, e in found} == {1.0 + i}
+    # That of a field is of the whole at a pixel, which many coefficients make.
+    told = replace(RigUncertainty.exact(), field_px=0.1)
+    assert {told.sigma_of("field", e) for e in RIG_ENTRIES["field"]} == {0.1 / FIELD_PER_COEFFICIENT}
 
 
 def test_an_exact_number_has_no_covariance() -> None:

@@ -6,11 +6,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pancam_graph import SolveOptions, cross_validate, simulate, solve
+from pancam_graph import SolveOptions, build_graph, cross_validate, simulate, solve
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray, wrap_angle
-from pancam_graph.cameras import FIELD_SHAPE
+from pancam_graph.cameras import FIELD_SHAPE, FieldCamera, fields_of, with_field
 from pancam_graph.data import FIXED, Freedom, Sharing, Solution, Traverse
+from pancam_graph.graph import Model
 from pancam_graph.rigs import rig_template
 from pancam_graph.simulate import Simulation, SimulationOptions
 from pancam_graph.smoother import solve_incrementally
@@ -113,6 +114,73 @@ def test_stop_by_stop_ends_with_the_field_of_the_whole() -> None:
     assert a is not None and b is not None
     assert a == pytest.approx(b, abs=0.02)
     assert step.passed
+
+
+@cache
+def known() -> tuple[Traverse, Traverse]:
+    """A drive whose rig has the true fields, and the same with these taken out of rig and observations."""
+    made = drive()
+    traverse, field_px = made.traverse, made.truth.field_px
+    observed = traverse.observations
+    assert observed is not None and field_px is not None
+    eyes = [
+        replace(eye, camera=with_field(eye.camera, px))
+        for eye, px in zip(traverse.rig.eyes, field_px, strict=True)
+    ]
+    fields = fields_of([eye.camera for eye in eyes], traverse.image_eye)
+    assert fields is not None
+    plain = replace(observed, uv_px=observed.uv_px - fields.at(observed.image, observed.uv_px))
+    return replace(traverse, rig=replace(traverse.rig, eyes=tuple(eyes))), traverse.with_observations(plain)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"model": "circle"},
+        pytest.param({"model": "projective"}, marks=pytest.mark.slow),
+        pytest.param({"method": "alternation"}, marks=pytest.mark.slow),
+        {"rig": "considered"},
+    ],
+)
+def test_a_field_that_the_rig_has_is_as_none_in_the_observations(options: dict[str, str]) -> None:
+    chosen = SolveOptions(loss="none", **options)  # type: ignore[arg-type]  # parameters of the test
+    with_it, without = (solve(traverse, chosen) for traverse in known())
+    assert with_it.cost_final == pytest.approx(without.cost_final, rel=1e-6)
+    assert with_it.final.pan_tilt_rad == pytest.approx(without.final.pan_tilt_rad, abs=1e-9)
+    assert with_it.angle_sigma_rad == pytest.approx(without.angle_sigma_rad, rel=1e-6)
+    for camera, plain in zip(with_it.image_cameras, without.image_cameras, strict=True):
+        assert isinstance(camera, FieldCamera)
+        assert camera.lens.pinhole == plain.pinhole
+
+
+def test_stop_by_stop_a_field_of_the_rig_counts() -> None:
+    with_it, without = (solve_incrementally(traverse, SolveOptions(loss="none")) for traverse in known())
+    assert with_it.cost_final == pytest.approx(without.cost_final, rel=1e-6)
+
+
+@pytest.mark.parametrize("model", ["mast", "circle"])
+def test_in_a_graph_a_field_of_the_rig_counts(model: Model) -> None:
+    errors = []
+    for traverse in known():
+        observed = traverse.observations
+        assert observed is not None
+        few = traverse.with_observations(observed.select(np.flatnonzero(observed.track % 20 == 0)))
+        graph, values = build_graph(few, SolveOptions(loss="none", model=model))
+        errors.append(graph.error(values))
+    assert errors[0] == pytest.approx(errors[1], rel=1e-9)
+
+
+def test_a_field_is_estimated_about_that_of_the_rig() -> None:
+    """Where the rig has the true field, what is found is less than its uncertainty, and all is in the rig."""
+    with_it, _ = known()
+    found = solve(with_it, WITH_FIELD)
+    change, told = field_of(found), with_it.rig.eyes[0].camera
+    assert change is not None and isinstance(told, FieldCamera)
+    assert np.sqrt(np.mean(change**2)) < 0.5 * np.sqrt(np.mean(told.field_px**2))
+    refined = found.rig.eyes[0].camera
+    assert isinstance(refined, FieldCamera)
+    assert refined.field_px == pytest.approx(told.field_px + change[0])
 
 
 @pytest.mark.slow
