@@ -113,6 +113,7 @@ _BEFORE = (
 """What was imported first."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "module", "before"),
     [

@@ -13,6 +13,7 @@ from pancam_graph.base.errors import ImageError, InputError
 from pancam_graph.images import find_observations
 from pancam_graph.io import left_out, read_image, read_pds
 from support.image_scenes import QUICK, SIZE_PX, as_bytes, found_in, make_traverse
+from support.parameters import slow_but_for
 from support.pds_files import pds_file
 from support.pictures import read_picture
 
@@ -99,7 +100,7 @@ def spoil(file: Path, kind: str) -> str:
     return "expected 240 x 240 pixels as of camera left of the rig small, found 480 x 240"
 
 
-@pytest.mark.parametrize("kind", ["missing", "truncated", "of another size"])
+@pytest.mark.parametrize("kind", slow_but_for("truncated", ["missing", "truncated", "of another size"]))
 def test_an_image_file_that_cannot_be_used_is_named_and_the_rest_found(truth: Traverse, kind: str) -> None:
     assert truth.folder is not None
     write_traverse(truth, truth.folder)
@@ -143,6 +144,7 @@ def test_of_many_image_files_a_few_are_named() -> None:
     assert len(left_out(dict(list(errors.items())[:5]))) == 5
 
 
+@pytest.mark.slow
 def test_colour_is_named_and_its_luma_used(truth: Traverse) -> None:
     assert truth.folder is not None
     grey = read_picture(truth.folder / LAST)

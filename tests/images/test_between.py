@@ -327,6 +327,7 @@ def errors_px(rendering: Rendering, traverse: Traverse) -> tuple[FloatArray, np.
     return error, first
 
 
+@pytest.mark.slow
 def test_the_noise_that_patches_predict_is_that_of_their_errors(
     small: tuple[Rendering, Traverse], small_found: Traverse
 ) -> None:
@@ -366,6 +367,7 @@ def linking(traverse: Traverse, first: np.ndarray) -> np.ndarray:
     return np.asarray(stop != stop[first])
 
 
+@pytest.mark.slow
 def test_ties_between_stops_lie_on_the_terrain(
     small: tuple[Rendering, Traverse], small_found: Traverse
 ) -> None:
@@ -376,6 +378,7 @@ def test_ties_between_stops_lie_on_the_terrain(
     assert np.median(error[link]) < 0.6
 
 
+@pytest.mark.slow
 def test_least_squares_matching_beats_the_features_own_places(
     small: tuple[Rendering, Traverse], small_run: tuple[Traverse, Fitted, int]
 ) -> None:
@@ -445,6 +448,7 @@ def test_ties_that_were_found_before_an_interrupt_are_kept(
         )
 
 
+@pytest.mark.slow
 def test_all_that_was_looked_at_is_accounted_for(
     small_found: Traverse, small_run: tuple[Traverse, Fitted, int]
 ) -> None:
@@ -465,6 +469,7 @@ def test_all_that_was_looked_at_is_accounted_for(
     assert len(observations) - small_run[2] == sum(s.kept for s in found.stops)
 
 
+@pytest.mark.slow
 def test_small_panoramas_place_the_second_stop(
     small: tuple[Rendering, Traverse], small_found: Traverse
 ) -> None:

@@ -65,6 +65,7 @@ def test_with_and_without_a_cache_the_same_bytes(
     assert made == {}
 
 
+@pytest.mark.slow
 def test_only_what_an_image_touches_is_made_anew(
     scene: Traverse, made: dict[str, int], tmp_path: Path
 ) -> None:
@@ -208,6 +209,7 @@ def test_damaged_files_are_logged_and_made_anew(
     assert files[0].read_bytes() == data
 
 
+@pytest.mark.slow
 def test_what_is_not_needed_any_more_is_deleted_and_nothing_else(scene: Traverse, tmp_path: Path) -> None:
     run(scene, tmp_path)
     before = {p.name for p in tmp_path.iterdir()}

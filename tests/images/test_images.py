@@ -108,6 +108,7 @@ def test_same_input_same_bytes_whatever_the_threads(
     assert as_bytes(found_in(again)) == as_bytes(found_in(panorama_found))
 
 
+@pytest.mark.slow
 def test_disturbed_start_finds_the_same(panorama: tuple[Traverse, Scene], panorama_found: Traverse) -> None:
     truth, scene = panorama
     obs = found_in(find_observations(disturbed(truth, 0.5, seed=4), QUICK))

@@ -224,6 +224,7 @@ def deck_truth(truth: Traverse, scene: Scene, row: int) -> np.ndarray:
     return np.asarray(on.reshape(SIZE_PX, SIZE_PX))
 
 
+@pytest.mark.slow
 def test_what_drives_along_is_masked_between_stops_and_nothing_else(tmp_path: Path) -> None:
     truth, scene = make_traverse(
         tmp_path,

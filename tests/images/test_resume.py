@@ -101,6 +101,7 @@ def test_an_interrupt_before_anything_is_kept_says_so(run: Run, monkeypatch: pyt
     assert not Path("out").exists()
 
 
+@pytest.mark.slow
 def test_bad_input_that_shows_late_leaves_nothing_behind_that_was_not_there(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -95,6 +95,7 @@ def test_the_surface_is_the_plane_and_fades_to_a_far_sky(truth: Solution) -> Non
     assert surface.inverse_range(np.array([[0.0, 0.6, 0.8]])) == pytest.approx(1e-5, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_hills_beyond_the_horizon_do_not_pull_the_ground_down(truth: Solution) -> None:
     """Hundreds of landmarks of a far ridge above the horizon leave the plane where near ones have it."""
     landmarks = truth.final.landmarks_m.copy()
@@ -246,6 +247,7 @@ def test_no_vignetting_is_made_up(tmp_path: Path) -> None:
     assert mosaics.evening.sigma < 0.01
 
 
+@pytest.mark.slow
 def test_vignetting_that_overlaps_do_not_tell_is_left_alone(tmp_path: Path) -> None:
     mosaics = made(Scene(vignetting=0.35), tmp_path)
     assert not mosaics.evening.vignetting.any()
@@ -281,6 +283,7 @@ def test_samples_of_16_bits_are_those_of_the_scene(tmp_path: Path) -> None:
         assert np.abs(level - plain[between]).max() < 1.0
 
 
+@pytest.mark.slow
 def test_images_of_8_bits_have_mosaics_of_8_bits(tmp_path: Path) -> None:
     solution = solved(Scene(bits=8), tmp_path)
     assert make_mosaics(solution, "A/1", "left", NEAR).cylinder.samples is None
@@ -289,6 +292,7 @@ def test_images_of_8_bits_have_mosaics_of_8_bits(tmp_path: Path) -> None:
         assert not any("16bit" in kind for kind in entry["files"])
 
 
+@pytest.mark.slow
 def test_what_a_mask_covers_is_no_ground_and_shown_last(truth_made: StopMosaics, tmp_path: Path) -> None:
     """The lower two thirds of each image are black in the mask."""
     solution = solved(Scene(), tmp_path)
@@ -310,6 +314,7 @@ def test_what_a_mask_covers_is_no_ground_and_shown_last(truth_made: StopMosaics,
         make_mosaics(solution, "A/1", "left", NEAR)
 
 
+@pytest.mark.slow
 def test_wrong_landmarks_do_not_hide_the_ground(truth: Solution) -> None:
     landmarks = truth.final.landmarks_m.copy()
     wrong = np.random.default_rng(2).choice(len(landmarks), 60, replace=False)
@@ -330,6 +335,7 @@ def test_both_pointings_share_seams_and_exposure(tmp_path: Path) -> None:
     assert np.mean(pictures["telemetry"] == pictures["refined"]) < 0.9
 
 
+@pytest.mark.slow
 def test_a_panorama_that_goes_round_has_no_hole_and_no_cut(tmp_path: Path) -> None:
     scene = Scene(pans_rad=tuple(np.deg2rad(np.arange(0, 360, 36.0))), points=8000)
     whole = made(scene, tmp_path)
@@ -375,6 +381,7 @@ def test_bad_options_are_refused(options: dict[str, Any], said: str) -> None:
     assert said in str(error.value)
 
 
+@pytest.mark.slow
 def test_images_that_cannot_be_had_are_warned_of(tmp_path: Path) -> None:
     solution = solved(Scene(pans_rad=tuple(np.deg2rad([60.0, 40.0, 20.0, 0.0, -20.0]))), tmp_path)
     (tmp_path / "f0-left.png").unlink()
@@ -402,6 +409,7 @@ def test_images_that_cannot_be_had_are_warned_of(tmp_path: Path) -> None:
     assert json.loads((out / "solution.json").read_text())["warnings"] == list(saved.warnings)
 
 
+@pytest.mark.slow
 def test_a_picture_that_is_there_twice_is_shown_once(tmp_path: Path) -> None:
     solution = solved(Scene(), tmp_path)
     picture = read_picture(tmp_path / "f0-left.png").astype(float)
@@ -427,6 +435,7 @@ def test_no_image_at_all_is_a_warning(tmp_path: Path) -> None:
         make_mosaics(solution, "B", "left")
 
 
+@pytest.mark.slow
 def test_each_eye_has_its_mosaic_and_the_report_shows_them(tmp_path: Path) -> None:
     solution = solved(Scene(pans_rad=(0.4, -0.1), cameras=("left", "right")), tmp_path)
     out = tmp_path / "out"

@@ -215,6 +215,7 @@ def test_poses_need_cameras_to_be_a_rig() -> None:
 # --- With noise -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angles", ["exact", "free"])
 def test_errors_have_the_covariance_that_is_said(angles: str) -> None:
     """60 noisy sets from one truth: squared errors over the covariance, where it is not 0, and residuals.

@@ -129,6 +129,7 @@ def test_the_truth_has_no_error() -> None:
 # --- what a solution predicts ---
 
 
+@pytest.mark.slow
 def test_errors_of_the_mast_are_those_its_covariance_predicts() -> None:
     """Over seeds: their medians, which 12 of them tell to a third."""
     scenario = replace(TINY, stops=2, spacing_m=3.0)
@@ -221,6 +222,7 @@ def test_two_processes_give_what_one_does() -> None:
     assert run_tasks(tasks, processes=2) == run_tasks(tasks, processes=1)
 
 
+@pytest.mark.slow
 def test_conditioning_makes_the_origin_indifferent(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("experiments.conditioning.ORIGINS_M", (0.0, 1e5))
     found = {(s.experiment, s.model): s for s in ConditioningTask(scenario=TINY, noise_px=0.5, seed=0).run()}

@@ -109,7 +109,11 @@ def shifts(rendering: Rendering, images: dict[int, FloatArray], a: int, b: int, 
     return np.array(out)
 
 
-@pytest.mark.parametrize(("a", "b"), [(0, 1), (0, 4)], ids=["both eyes", "two stops"])
+@pytest.mark.parametrize(
+    ("a", "b"),
+    [pytest.param(0, 1, marks=pytest.mark.slow), (0, 4)],
+    ids=["both eyes", "two stops"],
+)
 def test_images_show_each_point_where_the_truth_has_it(
     stereo: Rendering, stereo_images: dict[int, FloatArray], a: int, b: int
 ) -> None:

@@ -243,6 +243,7 @@ def test_noise_outliers_and_telemetry_do_not_move_the_rest() -> None:
     np.testing.assert_allclose(larger, 3 * angle, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_wrong_rig_is_claimed_and_the_true_one_makes_the_images() -> None:
     rig = rig_template("exomars-pancam")
     base = simulate(rig, SMALL)

@@ -54,6 +54,7 @@ def require_stops(simulation: Simulation, smoother: TraverseSmoother) -> None:
             assert error @ np.linalg.solve(covariance, error) / 6 < 3**2
 
 
+@pytest.mark.slow
 def test_a_drive_with_given_sigmas_is_solved() -> None:
     simulation = simulated(0.6, seed=11, min_views=2)
     require_right(simulation, solve_incrementally(simulation.traverse))
@@ -108,6 +109,7 @@ def test_the_end_keeps_what_the_batch_keeps() -> None:
         assert np.sqrt(np.diag(one)) == pytest.approx(np.sqrt(np.diag(other)), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_what_is_left_out_counts_once() -> None:
     smoother, updates = driven(simulated(0.4, seed=15).traverse)
     fate = smoother.state().fate

@@ -420,6 +420,7 @@ def test_a_late_match_closes_the_loop(loop: Simulation) -> None:
     assert np.trace(after) < 0.5 * np.trace(sigma)
 
 
+@pytest.mark.slow
 def test_a_wrong_loop_closure_is_found_and_not_believed(loop: Simulation) -> None:
     smoother, parts, held_back = closing(loop)
     last, middle = len(parts) - 1, 7

@@ -153,6 +153,7 @@ def test_errors_between_stops_are_as_large_as_their_covariance_says_over_many_se
     assert 0.7 < np.sum(squares) / (6 * len(squares)) < 1.35  # 180 degrees of freedom: 1 +- 0.105
 
 
+@pytest.mark.slow
 def test_all_stops_and_frames_are_in_the_graph_held_ones_with_a_constraint() -> None:
     t = near()
     held = replace(t, frames=(replace(t.frames[0], sigma_pan_rad=0.0, sigma_tilt_rad=0.0), *t.frames[1:]))
@@ -165,6 +166,7 @@ def test_all_stops_and_frames_are_in_the_graph_held_ones_with_a_constraint() -> 
     assert all(values.exists(keys.angles(frame.id)) for frame in held.frames)
 
 
+@pytest.mark.slow
 def test_what_a_solution_used_is_taken_by_least_squares() -> None:
     t = near()
     assert t.observations is not None

@@ -190,6 +190,7 @@ def test_considered_is_as_unsure_as_its_covariance_says() -> None:
     assert np.all(joint.angle_sigma_rad <= 1.001 * loose.angle_sigma_rad)
 
 
+@pytest.mark.slow
 def test_stop_by_stop_a_covariance_counts_as_in_one_solve() -> None:
     """Also where the second eye is first seen at the second stop."""
     options = SimulationOptions(stops=2, pans=4, points_per_image=20, spacing_m=3.0)

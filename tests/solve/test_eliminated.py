@@ -69,6 +69,7 @@ def test_near_landmarks_eliminated_or_explicit_give_one_optimum(model: str) -> N
     assert ours.final.world_t_camera == pytest.approx(theirs.final.world_t_camera, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_with_landmarks_on_the_horizon_the_optimum_is_no_worse_than_the_explicit_one() -> None:
     """Explicit ones end at infinity; unit 4-vectors follow their noise beyond it."""
     ours, theirs = (

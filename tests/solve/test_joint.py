@@ -117,8 +117,11 @@ def test_what_no_damping_lets_lower_the_cost_stays_where_it_is() -> None:
     [
         SolveOptions(rig="held"),
         SolveOptions(),
-        SolveOptions(model="free"),
-        SolveOptions(rig="held", method="alternation", sharing=Sharing(mounts=Freedom(scope="eye"))),
+        pytest.param(SolveOptions(model="free"), marks=pytest.mark.slow),
+        pytest.param(
+            SolveOptions(rig="held", method="alternation", sharing=Sharing(mounts=Freedom(scope="eye"))),
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["held", "estimated", "free", "alternation"],
 )

@@ -17,6 +17,7 @@ from pancam_graph.smoother._incremental import solve_incrementally
 from pancam_graph.solve import judge, prepare, reconsidered, screen
 from pancam_graph.solve._let_go import letting_go
 from pancam_graph.solve._telemetry_tests import Suspected
+from support.parameters import slow_but_for
 from support.solving import fitted
 from support.truth import errors_in_sigmas
 
@@ -121,6 +122,7 @@ def test_pans_of_a_stop_in_common_and_all_that_looks_alike_are_let_go() -> None:
     assert "the heading of stop0001" in let_go(solution)
 
 
+@pytest.mark.slow
 def test_a_leg_is_let_go() -> None:
     simulation = drive(options=replace(DRIVE, stops=4, pans=6))
     solution = solve(shifted(simulation.traverse, 2, (0.0, 0.7, 0.0)))
@@ -128,7 +130,7 @@ def test_a_leg_is_let_go() -> None:
     assert "the position of stop0002 and of all stops up to stop0003" in let_go(solution)
 
 
-@pytest.mark.parametrize("rig", ["mer-navcam", "exomars-pancam"])
+@pytest.mark.parametrize("rig", slow_but_for("mer-navcam", ["mer-navcam", "exomars-pancam"]))
 def test_pixels_of_a_frame_that_are_shifted_are_not_taken_for_its_pointing(rig: str) -> None:
     traverse = drive(rig=rig).traverse
     observations = traverse.observations
@@ -138,6 +140,7 @@ def test_pixels_of_a_frame_that_are_shifted_are_not_taken_for_its_pointing(rig: 
     assert not solve(traverse.with_observations(replace(observations, uv_px=uv_px))).passed
 
 
+@pytest.mark.slow
 def test_where_too_much_is_wrong_nothing_is_let_go() -> None:
     traverse, rng = drive().traverse, np.random.default_rng(1)
     for i in range(len(traverse.frames)):

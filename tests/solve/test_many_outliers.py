@@ -16,13 +16,14 @@ CUTOFF_PX = 4.0 * 0.3
 
 
 @pytest.mark.parametrize("share", [pytest.param(0.4, marks=pytest.mark.slow), 0.6])
-@pytest.mark.parametrize("min_views", [2, 3])
+@pytest.mark.parametrize("min_views", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_drive_with_given_sigmas_is_solved(share: float, min_views: int) -> None:
     options = replace(DRIVE, outliers=share, min_views=min_views)
     simulation = simulate(TEMPLATES["mer-navcam"](), options, seed=11)
     require_right(simulation, solve(simulation.traverse))
 
 
+@pytest.mark.slow
 def test_a_drive_with_guessed_sigmas_is_solved() -> None:
     simulation = simulate(TEMPLATES["mer-navcam"](), replace(DRIVE, outliers=0.6), seed=12)
     observations = simulation.traverse.observations
@@ -65,6 +66,7 @@ def test_a_link_of_one_track_among_many_that_were_rejected_is_not_believed() -> 
     assert set(frame[outside]) < {a, b}
 
 
+@pytest.mark.slow
 def test_judged_again_from_the_end_nothing_changes_but_what_is_excluded() -> None:
     """Where few observations would change, none does; excluded ones stay out, whatever else does."""
     simulation = simulate(TEMPLATES["mer-navcam"](), replace(DRIVE, outliers=0.1), seed=4)

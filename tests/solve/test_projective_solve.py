@@ -80,6 +80,7 @@ def test_images_are_reproduced_by_the_matrices_of_a_solution() -> None:
     assert shown.sum() > 500
 
 
+@pytest.mark.slow
 def test_it_fits_no_worse_than_free_and_meets_it_as_the_calibration_gets_firm() -> None:
     """What K gains shrinks with the square of its sigma, once that is small against what images know."""
     free = solve(small().traverse, replace(TO_THE_END, model="free"))
@@ -100,6 +101,7 @@ def test_it_fits_no_worse_than_free_and_meets_it_as_the_calibration_gets_firm() 
     assert found.stop_covariance[1] == pytest.approx(free.stop_covariance[1], rel=1e-3, abs=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.05, 1e-3])
 def test_it_is_free_with_a_calibration_for_every_image_in_other_numbers(share: float) -> None:
     """The same tie: the same optimum, the same sigmas; poses and K as variables on one side."""
@@ -290,6 +292,7 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch: pytest.MonkeyPatch, l
     assert np.array_equal(one.stop_covariance, three.stop_covariance)
 
 
+@pytest.mark.slow
 def test_outliers_are_left_out() -> None:
     """But for some of two or three rays, which move along their lines of sight and fit all the same."""
     simulation = simulate(mer_navcam(), replace(SMALL, outliers=0.03), seed=1)

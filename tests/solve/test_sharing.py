@@ -21,6 +21,7 @@ from pancam_graph.cameras import CAHVOR, Brown
 from pancam_graph.data._sharing import FIXED, Scope, parse_sharing
 from pancam_graph.graph import ExplicitLandmarks, Flex, Model, SoftTemplate, Tie
 from pancam_graph.rigs import Eye, Rig, mer_navcam
+from support.parameters import slow_but_for
 from support.shared_rigs import FOCAL, TWO_TILTS, WRONG, loose, simulated, start_of
 from support.solving import fitted, solution_from
 
@@ -269,7 +270,7 @@ def options_of(name: str, **changes: Any) -> SolveOptions:
     return SolveOptions(**given_ | {"relative_decrease": 1e-12} | changes)
 
 
-@pytest.mark.parametrize("name", COMPARED)
+@pytest.mark.parametrize("name", slow_but_for("mounts", COMPARED))
 def test_landmarks_eliminated_or_explicit_give_one_optimum(name: str) -> None:
     ours, theirs = (solve(near(), options_of(name, landmarks=way)) for way in ("eliminated", "explicit"))
     assert ours.converged
@@ -299,7 +300,10 @@ HARD_TIES = {
 
 @pytest.mark.parametrize(
     "sharing",
-    [pytest.param(s, id=n, marks=[pytest.mark.slow] * (n == "chosen")) for n, s in HARD_TIES.items()],
+    [
+        pytest.param(s, id=n, marks=[pytest.mark.slow] * (n != "all that flexes"))
+        for n, s in HARD_TIES.items()
+    ],
 )
 def test_a_hard_tie_has_the_explicit_optimum_too(sharing: Sharing | None) -> None:
     ours, theirs = (
@@ -323,7 +327,12 @@ def test_a_hard_tie_has_the_explicit_optimum_too(sharing: Sharing | None) -> Non
         assert a.sigma == pytest.approx(b.sigma, rel=1e-3)
 
 
-@pytest.mark.parametrize("name", ["mounts per stop and axis", "calibration, circle", "calibration, free"])
+@pytest.mark.parametrize(
+    "name",
+    slow_but_for(
+        "calibration, circle", ["mounts per stop and axis", "calibration, circle", "calibration, free"]
+    ),
+)
 def test_sigmas_are_gtsams(name: str) -> None:
     adjustment = fitted(near(), options_of(name))
     problem, solution = adjustment.problem, solution_from(adjustment)

@@ -13,6 +13,7 @@ from pancam_graph.smoother._incremental import solve_incrementally
 from pancam_graph.solve import _rig_score, judge
 from pancam_graph.solve._rig_score import held_entries
 from pancam_graph.solve._telemetry_tests import entry_errors, leg_errors, telemetry_of, total
+from support.parameters import slow_for
 from support.solving import fitted
 from support.truth import errors_in_sigmas
 
@@ -39,7 +40,7 @@ def with_sigmas(traverse: Traverse, factor: float) -> Traverse:
     return traverse.with_observations(replace(observations, sigma_px=observations.sigma_px * factor))
 
 
-@pytest.mark.parametrize("rig", ["mer-navcam", "exomars-pancam", "ladybug3"])
+@pytest.mark.parametrize("rig", slow_for("exomars-pancam", ["mer-navcam", "exomars-pancam", "ladybug3"]))
 @pytest.mark.parametrize("outliers", [0.1])
 def test_a_right_drive_passes(rig: str, outliers: float) -> None:
     solution = solve(drive(rig=rig, outliers=outliers).traverse)
@@ -136,6 +137,7 @@ def test_the_score_of_a_held_number_is_what_freeing_it_gains() -> None:
     assert max(e.gain for e in held.values()) > 0.4 * gain
 
 
+@pytest.mark.slow
 def test_the_score_of_a_long_drive_comes_from_part_of_its_stops(monkeypatch: pytest.MonkeyPatch) -> None:
     """Within a factor of two of what all observations say, of the same number."""
     problem = fitted(
@@ -171,6 +173,7 @@ def test_a_held_rig_that_is_wrong_by_little_fails_where_little_is_seen() -> None
     assert [name for name, test in named(solution).items() if not test.passed] == ["held rig"]
 
 
+@pytest.mark.slow
 def test_a_considered_rig_that_is_wrong_is_advised_of() -> None:
     solution = solve(drive(focal_error=4e-3).traverse, SolveOptions(rig="considered"))
     assert named(solution)["held rig"].is_note
