@@ -17,7 +17,7 @@ from pancam_graph.rigs import FOCAL
 from pancam_graph.solve._problem import Problem
 from pancam_graph.solve._reduced import ReducedSystem
 
-__all__ = ["HeldEntry", "held_entries"]
+__all__ = ["HeldEntry", "held_entries", "part_of"]
 
 _FREED: dict[Quantity, Freedom] = {
     "calibration": Freedom(scope="eye", free=(FOCAL, "cx_px", "cy_px")),
@@ -67,7 +67,7 @@ def held_entries(problem: Problem) -> list[HeldEntry]:
         return []
     freedoms: dict[str, Any] = {q: _FREED[q] for q in freed}
     wide = replace(sharing, **freedoms)
-    part = _part(problem, wide)
+    part = part_of(problem, wide)
     share = part.kept.sum() / max(problem.kept.sum(), 1)
     try:
         entries = list(_scores(part, wide, freed))
@@ -76,7 +76,7 @@ def held_entries(problem: Problem) -> list[HeldEntry]:
     return [replace(e, gain=float(e.gain / share)) for e in entries]
 
 
-def _part(problem: Problem, sharing: Sharing) -> Problem:
+def part_of(problem: Problem, sharing: Sharing) -> Problem:
     """A problem, or of a large one about `_ENOUGH` observations of a few stops; the rig is shared as told.
 
     The caller's factors may join any stops: a problem that has some keeps all stops.

@@ -16,6 +16,7 @@ from pancam_graph.graph import HardTemplate
 from pancam_graph.solve._chances import CHANCE, rms_limit, two_sided_limit
 from pancam_graph.solve._covariance import Uncertainty
 from pancam_graph.solve._fit import Fitted
+from pancam_graph.solve._held_sureness import held_rig
 from pancam_graph.solve._let_go import Part, most_let_go, sentence
 from pancam_graph.solve._noise_tests import Residuals
 from pancam_graph.solve._problem import Problem
@@ -46,6 +47,10 @@ _HELD_SHARE = 0.02
 """Share of the cost by which a held number of the rig must lower it too, beside what chance explains.
 
 Gains of large problems are raised from a part."""
+
+
+_UNCONFIRMED = 2.0
+"""Expected growth of a sigma, over the odds that a held rig is exact and that it is off as it says."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -391,6 +396,26 @@ def _held(at: Optimum) -> Iterator[VerdictTest]:
             f"no held number of the rig would lower the cost by much{exact if treatment == 'held' else ''}",
             _advice(best, cost),
         )
+    yield from _unconfirmed(at)
+
+
+def _unconfirmed(at: Optimum) -> Iterator[VerdictTest]:
+    """A rig that is held, of which images do not say that it is exact, against what hangs on it."""
+    found = held_rig(at.problem, at.uncertainty)
+    if found is None:
+        return
+    for_it = found.log_odds >= 0
+    odds = f"{np.exp(min(abs(found.log_odds), 20.0)):.3g} to 1 {'for' if for_it else 'against'} it"
+    yield VerdictTest.of(
+        "held rig confirmed",
+        found.expected_growth,
+        _UNCONFIRMED,
+        f"images say that the held rig is exact ({odds}), or little hangs on it",
+        f"the rig is held, but images do not say that it is exact ({odds}): if it is off as its uncertainty "
+        f"says, {found.what} is at least {found.growth:.2g} times less sure than stated; estimate it (--rig "
+        "estimated), count its uncertainty (--rig considered), or say in traverse.json that it is exact (an "
+        "uncertainty of 0)",
+    )
 
 
 def _advice(entry: HeldEntry, cost: float) -> str:
