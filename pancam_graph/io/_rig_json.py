@@ -5,15 +5,23 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from pancam_graph.base.errors import InputError
+from pancam_graph.base.geometry import compose, so3_log
 from pancam_graph.data import Traverse
 from pancam_graph.io._entries import RIG_FORMAT, VERSION, Entry, Text
 from pancam_graph.io._json import prefixed, read_json, validated
 from pancam_graph.io._schema import OwnRigEntry, rig_entry
 from pancam_graph.io._seen_pictures import require_other_pictures
-from pancam_graph.rigs import Eye, Rig
+from pancam_graph.rigs import Eye, Rig, RigUncertainty
 
 __all__ = ["read_rig", "rig_json", "use_rig"]
+
+
+_FARTHEST_SIGMAS = 8.0
+"""Difference of a camera by two rigs, in sigmas of mount, tilt axis and angles, from which they are not of
+one mast."""
 
 
 class RigFile(Entry):
@@ -59,14 +67,15 @@ def use_rig(traverse: Traverse, path: Path | str) -> Traverse:
     rig of the file. Cameras go by their names. Telemetry's accuracy stays that of the traverse.
 
     Raises InputError naming the file where it lacks a camera of the traverse, for a camera of another size,
-    for one that is another unit by its labels, and where the rig was calibrated with pictures of the
-    traverse.
+    for one that is another unit by its labels, where its cameras at the traverse's angles are far from the
+    traverse's own, and where the rig was calibrated with pictures of the traverse.
     """
     path, own = Path(path), traverse.rig
     rig = read_rig(path)
     with prefixed(path):
         for row in sorted(set(traverse.image_eye.tolist())):
             _require_same(own.eyes[row], rig)
+        _require_near(traverse, rig)
         require_other_pictures(traverse, rig)
     rig = replace(
         rig,
@@ -80,6 +89,43 @@ def use_rig(traverse: Traverse, path: Path | str) -> Traverse:
         moved = own.rover_T_mast.inverse() * rig.rover_T_mast
         stops = tuple(replace(stop, world_T_mast=stop.world_T_mast * moved) for stop in stops)
     return replace(traverse, rig=rig, stops=stops)
+
+
+def _require_near(traverse: Traverse, rig: Rig) -> None:
+    """Raise InputError unless a rig has the cameras near where the traverse's own has them at its angles.
+
+    In the frame of the rover where both know the mast on it, else of the mast. Axes that a reader fitted to
+    the labels of one folder have zeros of their own: with the angles of another folder they point elsewhere.
+    """
+    own, eye = traverse.rig, traverse.image_eye
+    angles = traverse.pan_tilt_rad[traverse.image_frame]
+    other = np.array([rig.eye_index(e.name) if e.name in {o.name for o in rig.eyes} else 0 for e in own.eyes])
+    poses = [own.mast_T_camera(angles, eye), rig.mast_T_camera(angles, other[eye])]
+    if own.rover_T_mast is not None and rig.rover_T_mast is not None:
+        masts = own.rover_T_mast, rig.rover_T_mast
+        poses = [
+            compose(mast.rotation().matrix(), mast.translation(), *pose)
+            for mast, pose in zip(masts, poses, strict=True)
+        ]
+    (R, t), (R_other, t_other) = poses
+    turned = np.linalg.norm(so3_log(R.transpose(0, 2, 1) @ R_other), axis=1)
+    moved = np.linalg.norm(t_other - t, axis=1)
+    usual, u, pointing = RigUncertainty.usual(own.longest_side_px), own.uncertainty, own.pointing_sigma
+    turn = [max(a, b) for a, b in ((usual.mount_rad, u.mount_rad), (usual.tilt_axis_rad, u.tilt_axis_rad))]
+    shift = [max(a, b) for a, b in ((usual.mount_m, u.mount_m), (usual.tilt_axis_m, u.tilt_axis_m))]
+    turn_rad = float(np.linalg.norm([*turn, pointing.pan_rad, pointing.tilt_rad]))
+    shift_m = float(np.linalg.norm(shift)) + turn_rad * float(
+        np.linalg.norm(t - t.mean(axis=0), axis=1).max()
+    )
+    far = np.maximum(turned / turn_rad, moved / shift_m)
+    worst = int(np.argmax(far)) if len(far) else 0
+    if len(far) and far[worst] > _FARTHEST_SIGMAS:
+        raise InputError(
+            f"rig: expected cameras near those of the traverse (within {_FARTHEST_SIGMAS * turn_rad:.2g} rad "
+            f"and {_FARTHEST_SIGMAS * shift_m:.2g} m), found image {traverse.images[worst].id} turned by "
+            f"{turned[worst]:.2g} rad and moved by {moved[worst]:.2g} m; it is another mast, or its axes "
+            "were fitted to other labels: calibrate with both folders in one traverse"
+        )
 
 
 def _require_same(eye: Eye, rig: Rig) -> None:

@@ -80,7 +80,7 @@ def test_a_rig_without_a_covariance_has_no_such_key(tmp_path: Path) -> None:
 
 
 def test_the_rig_of_a_file_takes_the_place_of_the_traverses(tmp_path: Path) -> None:
-    other = gtsam.Pose3(gtsam.Rot3(), np.array([0.4, 0.0, 1.0]))
+    other = MAST * gtsam.Pose3(gtsam.Rot3.Rodrigues(0.002, 0.0, -0.003), np.array([0.002, 0.0, -0.001]))
     sample = io_samples.traverse()
     given = replace(sample, rig=replace(sample.rig, rover_T_mast=other, mast_height_m=3.0))
     used = use_rig(given, written(tmp_path, sample_rig()))
@@ -93,6 +93,18 @@ def test_the_rig_of_a_file_takes_the_place_of_the_traverses(tmp_path: Path) -> N
         np.testing.assert_allclose(
             rover.matrix(), (before.world_T_mast * other.inverse()).matrix(), rtol=0, atol=1e-12
         )
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_rig_with_axes_of_its_own_zeros_is_refused(tmp_path: Path, known: bool) -> None:
+    """As where a reader fitted axes to the labels of one folder: the same angles point elsewhere."""
+    sample, turned = io_samples.traverse(), gtsam.Pose3(gtsam.Rot3.Rz(0.05), np.zeros(3))
+    rig = replace(sample_rig(), rover_T_mast=MAST if known else None)
+    given = replace(sample, rig=replace(sample.rig, rover_T_mast=MAST if known else None))
+    assert use_rig(given, written(tmp_path, rig)).rig.name == rig.name
+    other = replace(rig, pan_T_tilt=turned * rig.pan_T_tilt)
+    with pytest.raises(InputError, match=r"rig.json: rig: expected cameras near those of .*0.05"):
+        use_rig(given, written(tmp_path, other))
 
 
 def with_eye(rig: Rig, **changes: Any) -> Rig:
