@@ -137,7 +137,7 @@ def in_order(
 
 @contextmanager
 def blas_on_one_thread() -> Iterator[None]:
-    """A context in which BLAS uses one thread, and leaves the other cores to the compiled loops.
+    """A context in which BLAS and OpenCV use one thread each: loops and tasks of ours take the other cores.
 
     Matrices here have a few hundred rows. On these, threads of BLAS wait for each other longer than they
     save: with two cores in use, two took twice the time of one. Most libraries have one number of threads for
@@ -163,6 +163,8 @@ class _Limit:
         self._users = 0
         self._limits = dict[bool, Any]()
         """The limits that are set, by whether OpenCV was loaded, which has a BLAS of its own."""
+        self._opencv_threads = 0
+        """How many threads OpenCV had, where it is limited; else 0."""
 
     def enter(self, with_opencv: bool) -> None:
         """Set the limit, unless another context has."""
@@ -180,10 +182,17 @@ class _Limit:
 
     def _limit(self, with_opencv: bool) -> None:
         self._limits[with_opencv] = _blas(with_opencv, of_thread=False).limit(limits=1)
+        if with_opencv:
+            # Tasks run on all cores already: OpenCV's own threads only wait for these.
+            self._opencv_threads = sys.modules["cv2"].getNumThreads()
+            sys.modules["cv2"].setNumThreads(1)
 
     def _restore(self) -> None:
         while self._limits:  # what was set last, first
             self._limits.popitem()[1].restore_original_limits()
+        if self._opencv_threads:
+            sys.modules["cv2"].setNumThreads(self._opencv_threads)
+            self._opencv_threads = 0
 
 
 _LIMIT = _Limit()

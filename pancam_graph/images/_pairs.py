@@ -29,6 +29,7 @@ FAR_M = 1e7
 _DEPTHS = 16
 _AT_ONCE = 16_384  # points at once: few calls for few features, and little enough for the caches of a core
 _COARSE_FARTHEST_M = 200.0
+_LEAST_CELLS, _MOST_CELLS = 16, 48
 _DIFFERENCE = 1e-2
 MAX_TURN_RAD = float(np.deg2rad(30.0))
 """Between lines of sight with a larger angle, descriptors of the same terrain do not agree."""
@@ -63,6 +64,14 @@ class Segments:
             magnification=self.magnification[rows],
             valid=self.valid[rows],
         )
+
+    def among(self, rows: BoolArray) -> "Segments":
+        """The segments as those of some `rows` (m,) of more pixels; all others are not valid."""
+        out = {}
+        for name, column in vars(self).items():
+            out[name] = np.zeros((len(rows), *column.shape[1:]), dtype=column.dtype)
+            out[name][rows] = column
+        return Segments(**out)
 
     def bounds_px(self) -> tuple[FloatArray, FloatArray]:
         """Lowest and highest pixel (2,) that the valid segments reach; at least one must be valid."""
@@ -201,6 +210,44 @@ class PairGeometry:
         Depths from `options.min_depth_m` to infinity; the half widths are `options.search_sigmas` standard
         deviations and `slack_px` pixels of the coarser image.
         """
+        near = self._near(uv_px, p, root, slack_px, options)
+        part = self._segments(uv_px[near], p, root, slack_px, options)
+        return part if near.all() else part.among(near)
+
+    def _near(
+        self, uv_px: FloatArray, p: FloatArray, root: FloatArray, slack_px: float, options: FrontEndOptions
+    ) -> BoolArray:
+        """Which pixels (n, 2) of a lie in or next to a cell of it of which a corner can lie on b; quick.
+
+        All, where the corners are as many as the pixels.
+        """
+        size_a = np.array([self.camera_a.width_px, self.camera_a.height_px])
+        size_b = min(self.camera_b.width_px, self.camera_b.height_px)
+        # Three corners and more fall into the field of b, however narrow that is.
+        zoom = float(self.magnification((size_a[None] - 1) / 2)[0])
+        cells = int(np.clip(np.ceil(3 * size_a.max() * zoom / size_b), _LEAST_CELLS, _MOST_CELLS))
+        if (cells + 1) ** 2 >= len(uv_px):
+            return np.ones(len(uv_px), dtype=bool)
+        on_b = np.pad(self._cells_on_b(cells, p, root, slack_px, options), 1)
+        near = np.any([on_b[i : i + cells, j : j + cells] for i in range(3) for j in range(3)], axis=0)
+        column, row = np.clip(uv_px / (size_a - 1) * cells, 0, cells - 1).astype(np.int64).T
+        return np.asarray(near[row, column])
+
+    def _cells_on_b(
+        self, cells: int, p: FloatArray, root: FloatArray, slack_px: float, options: FrontEndOptions
+    ) -> BoolArray:
+        """Which of cells x cells pieces of image a, by row and column, have a corner that can lie on b."""
+        u, v = np.meshgrid(
+            *np.linspace(0, [self.camera_a.width_px - 1, self.camera_a.height_px - 1], cells + 1).T
+        )
+        valid = self._segments(np.column_stack([u.ravel(), v.ravel()]), p, root, slack_px, options).valid
+        corner = valid.reshape(u.shape)
+        return np.asarray(corner[:-1, :-1] | corner[1:, :-1] | corner[:-1, 1:] | corner[1:, 1:])
+
+    def _segments(
+        self, uv_px: FloatArray, p: FloatArray, root: FloatArray, slack_px: float, options: FrontEndOptions
+    ) -> Segments:
+        """As `segments`, of all pixels."""
         rays = self.camera_a.unproject(uv_px)
         n, b_T_a = len(uv_px), self.b_T_a(p)
         d_b_T_a = self.d_b_T_a(p, root)
@@ -274,14 +321,9 @@ class PairGeometry:
 
         Within the search window, if `widened`, else exactly as telemetry has it.
         """
-        size = np.array([self.camera_a.width_px, self.camera_a.height_px])
-        u, v = np.meshgrid(*np.linspace(0, size - 1, cells + 1).T)
         root = np.diag(self.sigma) if widened else np.zeros((len(self.sigma), 0))
         slack_px = options.search_slack_px if widened else 0.0
-        corners = np.column_stack([u.ravel(), v.ravel()])
-        valid = self.segments(corners, self.no_correction, root, slack_px, options).valid
-        corner = valid.reshape(u.shape)
-        return np.asarray(corner[:-1, :-1] | corner[1:, :-1] | corner[:-1, 1:] | corner[1:, 1:])
+        return self._cells_on_b(cells, self.no_correction, root, slack_px, options)
 
 
 def move_pixels(points_m: FloatArray, d_uv: FloatArray, d_b_T_a: tuple[FloatArray, FloatArray]) -> FloatArray:

@@ -34,11 +34,10 @@ def find_sky(image: NDArray[Any], elevation_rad: FloatArray) -> BoolArray:
     if not (elevation_rad > _SEED_RAD).any():
         return np.zeros(image.shape, dtype=bool)
     grey = image.astype(np.float32)
-    seeds, level = _seeds(grey, elevation_rad)
+    gradient = np.hypot(*_gradient(grey, _EDGE_BLUR_PX))
+    seeds, level = _seeds(grey, elevation_rad, gradient)
     if not seeds.any():
         return np.zeros(image.shape, dtype=bool)
-    du, dv = _gradient(grey, _EDGE_BLUR_PX)
-    gradient = np.hypot(du, dv)
     plain = _filled((gradient < _EDGE * level).astype(np.uint8), round(_SPECK * grey.size))
     plain &= elevation_rad > _LOWEST_RAD
     # Sky ends at the first edge from above. A column in which that edge is weak ends where its neighbours do.
@@ -54,21 +53,23 @@ def find_sky(image: NDArray[Any], elevation_rad: FloatArray) -> BoolArray:
     return np.asarray(is_sky[labels])
 
 
-def _seeds(grey: NDArray[np.float32], elevation_rad: FloatArray) -> tuple[BoolArray, float]:
-    """Pixels of blocks above the horizontal without structure, and the gradient there, blurred for edges."""
+def _seeds(
+    grey: NDArray[np.float32], elevation_rad: FloatArray, gradient: NDArray[Any]
+) -> tuple[BoolArray, float]:
+    """Pixels of blocks above the horizontal without structure, and the `gradient` (height, width) there."""
+    high = _blocks(elevation_rad).min(axis=2) > _SEED_RAD
     change = np.abs(np.diff(grey, axis=1, append=grey[:, -2:-1]))
-    noise = np.maximum(_blocks(change).mean(axis=2) / 1.128, _HALF_STEP)
-    du, dv = (_blocks(g) for g in _gradient(grey, _SEED_BLUR_PX))
+    noise = np.maximum(_blocks(change)[high].mean(axis=1) / 1.128, _HALF_STEP)
+    du, dv = (_blocks(g)[high] for g in _gradient(grey, _SEED_BLUR_PX))
     # Skies brighten towards the horizon and lenses darken towards the corners: a gradient is no structure.
-    slopeless = np.hypot(du - du.mean(axis=2, keepdims=True), dv - dv.mean(axis=2, keepdims=True))
+    slopeless = np.hypot(du - du.mean(axis=1, keepdims=True), dv - dv.mean(axis=1, keepdims=True))
     # The median gradient that white noise has.
     expected = 1.177 * noise / (np.sqrt(8 * np.pi) * _SEED_BLUR_PX**2)
-    high = _blocks(elevation_rad).min(axis=2) > _SEED_RAD
-    quiet = high & (np.median(slopeless, axis=2) < _NOISE_RATIO * expected)
+    quiet = np.zeros_like(high)
+    quiet[high] = np.median(slopeless, axis=1) < _NOISE_RATIO * expected
     if not quiet.any():
         return np.zeros(grey.shape, dtype=bool), 0.0
-    gradient = np.median(_blocks(np.hypot(*_gradient(grey, _EDGE_BLUR_PX))), axis=2)
-    level = float(np.median(gradient[quiet]))
+    level = float(np.median(np.median(_blocks(gradient)[quiet], axis=1)))
     seeds = np.zeros(grey.shape, dtype=bool)
     whole = np.kron(quiet, np.ones((_BLOCK_PX, _BLOCK_PX), dtype=bool))[: grey.shape[0], : grey.shape[1]]
     seeds[: whole.shape[0], : whole.shape[1]] = whole

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
+from pancam_graph.base.compiled import entry
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 
 __all__ = ["Links", "apart_tracks", "join_tracks", "shared_still", "spread_tracks"]
@@ -45,35 +46,67 @@ def join_tracks(links: Links) -> tuple[IntArray, IntArray, IntArray]:
     linked to it, and the track remains. Returns columns `image`, `feature`, `track` of equal length, sorted
     by track, then image; tracks are numbered from 0 in the order of their first image and feature.
     """
-    ends = np.concatenate(
-        [
-            np.column_stack([links.image_a, links.feature_a]),
-            np.column_stack([links.image_b, links.feature_b]),
-        ]
-    )
-    if not len(ends):
-        return ends[:, 0], ends[:, 0], ends[:, 0]
-    nodes, index = np.unique(ends, axis=0, return_inverse=True)
+    if not len(links.distance):
+        empty = np.empty(0, dtype=np.int64)
+        return empty, empty, empty
+    width = 1 + max(int(links.feature_a.max()), int(links.feature_b.max()))
+    ends = np.concatenate([links.image_a * width + links.feature_a, links.image_b * width + links.feature_b])
+    nodes, index = np.unique(ends, return_inverse=True)
+    image, feature = np.divmod(nodes, width)
     from_node, to_node = index.reshape(2, -1)
     order = np.lexsort((to_node, from_node, links.distance))
-    track_of = list(range(len(nodes)))
-    members = [[i] for i in range(len(nodes))]
-    images = [{int(i)} for i in nodes[:, 0]]
-    for i, j in zip(from_node[order].tolist(), to_node[order].tolist(), strict=True):
-        keep, gone = sorted((track_of[i], track_of[j]), key=lambda k: (-len(members[k]), k))
-        if keep == gone or not images[keep].isdisjoint(images[gone]):
-            continue
-        for member in members[gone]:
-            track_of[member] = keep
-        members[keep] += members[gone]
-        images[keep] |= images[gone]
-        members[gone] = []
+    n = len(nodes)
+    track_of, size = np.arange(n), np.ones(n, dtype=np.int64)
+    after, last, seen = np.full(n, -1), np.arange(n), np.full(int(image.max()) + 1, -1)
+    _join(from_node[order], to_node[order], image, track_of, size, after, last, seen)
     # Nodes are sorted by image and feature, so a track's first node is its lowest.
-    tracks = [sorted(m) for m in members if len(m) > 1]
-    tracks.sort(key=lambda m: m[0])
-    rows = np.array([i for m in tracks for i in m], dtype=np.int64)
-    number = np.repeat(np.arange(len(tracks), dtype=np.int64), [len(m) for m in tracks])
-    return nodes[rows, 0], nodes[rows, 1], number
+    lowest = np.full(n, n)
+    np.minimum.at(lowest, track_of, np.arange(n))
+    rows = np.flatnonzero(size[track_of] > 1)
+    rows = rows[np.argsort(lowest[track_of[rows]], kind="stable")]
+    first = lowest[track_of[rows]]
+    return image[rows], feature[rows], np.cumsum(np.diff(first, prepend=first[:1]) > 0)
+
+
+@entry
+def _join(
+    from_node: IntArray,
+    to_node: IntArray,
+    image: IntArray,
+    track_of: IntArray,
+    size: IntArray,
+    after: IntArray,
+    last: IntArray,
+    seen: IntArray,
+) -> None:
+    """Join the tracks of the nodes of each link in turn, unless both have a node in one image.
+
+    Each track begins as its own node: `track_of` (nodes,) is its number, `size` counts its nodes, `after` is
+    the next node of the same track (-1: none) and `last` its last, for the numbers that are tracks; the first
+    node of a track has its number. `image` is that of each node, `seen` (images,) scratch, all -1.
+    """
+    for k in range(len(from_node)):
+        keep, gone = track_of[from_node[k]], track_of[to_node[k]]
+        if keep == gone:
+            continue
+        if size[gone] > size[keep] or (size[gone] == size[keep] and gone < keep):
+            keep, gone = gone, keep
+        node = keep
+        while node >= 0:
+            seen[image[node]] = k
+            node = after[node]
+        node, clash = gone, False
+        while node >= 0:
+            clash = clash or seen[image[node]] == k
+            node = after[node]
+        if clash:
+            continue
+        node = gone
+        while node >= 0:
+            track_of[node] = keep
+            node = after[node]
+        after[last[keep]], last[keep] = gone, last[gone]
+        size[keep] += size[gone]
 
 
 def apart_tracks(image: IntArray, track: IntArray, uv_px: FloatArray, least_px: float) -> BoolArray:

@@ -1,0 +1,38 @@
+"""Windows of a pair of images: where in one the pixels of the other can lie."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pancam_graph import SimulationOptions, Traverse, simulate
+from pancam_graph.images import FrontEndOptions
+from pancam_graph.images._overlap import overlapping_pairs
+from pancam_graph.images._pairs import PairGeometry
+from pancam_graph.rigs import Rig, exomars_pancam, mer_navcam
+
+OPTIONS = FrontEndOptions()
+
+
+def traverse(rig: Rig) -> Traverse:
+    return simulate(rig, SimulationOptions(stops=2, pans=6, points_per_image=1), seed=0).traverse
+
+
+@pytest.mark.parametrize("rig", [mer_navcam, exomars_pancam])
+def test_pixels_are_left_out_at_once_only_where_they_have_no_window(rig: Callable[[], Rig]) -> None:
+    t = traverse(rig())
+    pairs = overlapping_pairs(t, OPTIONS, stops=np.ones((2, 2), dtype=bool))
+    turned = [replace(p, a=p.b, b=p.a) for p in pairs]
+    rng = np.random.default_rng(0)
+    quick = 0
+    for pair in rng.permutation(np.array([*pairs, *turned], dtype=object))[:12]:
+        assert isinstance(pair, PairGeometry)
+        uv = rng.uniform(0, 1, (3000, 2)) * [pair.camera_a.width_px - 1, pair.camera_a.height_px - 1]
+        window = pair.no_correction, np.diag(pair.sigma), OPTIONS.search_slack_px, OPTIONS
+        found, whole = pair.segments(uv, *window), pair._segments(uv, *window)
+        assert np.array_equal(found.valid, whole.valid)
+        for name, column in vars(whole).items():
+            assert np.array_equal(getattr(found, name)[whole.valid], column[whole.valid]), name
+        quick += int(not pair._near(uv, *window).all())
+    assert quick > 3
