@@ -14,6 +14,8 @@ __all__ = ["Covariance", "FreeDirectionError", "Panels", "Pattern", "Root", "pat
 
 _RANK_TOLERANCE = 1e-12
 """A pivot counts as zero up to this share of its diagonal entry before elimination."""
+_ROUNDED = 1e-9
+"""A pivot below this share may be off by a percent: rounding errors reach 5e-12 of that entry."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -196,10 +198,12 @@ class Panels:
         rows: list[FloatArray] = [np.zeros((0, 0))] * len(st.dim)
         # Pivots are compared with the diagonal before elimination: one tiny beside it is rounding.
         summed = [np.diag(panel).copy() for panel in self.panel]
+        least = 1.0
         for g in st.order:
-            rows[g] = _root_of_panel(self.panel[g], summed[g])
+            rows[g], pivot = _root_of_panel(self.panel[g], summed[g])
+            least = min(least, pivot)
             self._pass_on(g, rows[g])
-        return Root(structure=st, rows=tuple(rows))
+        return Root(structure=st, rows=tuple(rows), least_pivot=least)
 
     def _pass_on(self, g: int, rows: FloatArray) -> None:
         st = self.structure
@@ -214,8 +218,8 @@ class Panels:
             self.add_rows(i, after, begin, update, update[:, -1])
 
 
-def _root_of_panel(panel: FloatArray, summed: FloatArray) -> FloatArray:
-    """Rows (rank, columns) of the square root of a panel whose own block comes first.
+def _root_of_panel(panel: FloatArray, summed: FloatArray) -> tuple[FloatArray, float]:
+    """Rows (rank, columns) of the square root of a panel whose own block comes first, and its least pivot.
 
     Pivoted Cholesky P'S P = U'U of the block, scaled by the diagonal (n,) as it was before other groups were
     eliminated: this balances radians and metres, and a pivot tiny beside that diagonal is rounding.
@@ -236,7 +240,7 @@ def _root_of_panel(panel: FloatArray, summed: FloatArray) -> FloatArray:
         right = panel[pivot[:rank], n:] * scale[pivot[:rank], None]
         # U'^-1 right, transposed: BLAS gets columns in its own order, and no large copy is made.
         rows[:, n:] = scipy.linalg.blas.dtrsm(1.0, upper[:, :rank], right.T, side=1, overwrite_b=1).T
-    return rows
+    return rows, float(np.min(np.diag(upper)[:rank], initial=1.0)) ** 2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -246,11 +250,14 @@ class Root:
     structure: Pattern
     rows: tuple[FloatArray, ...]
     """For each group (rank, columns of its panel + 1): R, and e as the last column."""
+    least_pivot: float = 1.0
+    """Smallest pivot, as a share of its diagonal entry before elimination; 1 where no digits were lost."""
 
     @property
-    def leaves_free(self) -> bool:
-        """Whether a direction of some group is undetermined: fewer rows than columns."""
-        return any(len(rows) < n for rows, n in zip(self.rows, self.structure.dim, strict=True))
+    def is_rounded(self) -> bool:
+        """Whether rounding errors of the normal equations hold a direction, or next to nothing does."""
+        free = any(len(rows) < n for rows, n in zip(self.rows, self.structure.dim, strict=True))
+        return free or self.least_pivot < _ROUNDED
 
     def gain(self) -> float:
         """Decrease of the linearised cost by the step that solves the system: |e|^2 / 2."""

@@ -526,19 +526,29 @@ class LandmarkSystem:
         """Landmarks at the point of linearisation, in the order they were given in."""
         return Landmarks(vector=self._given(self.vector), origin_m=self._given(self.origin_m))
 
-    def landmark_covariance_m2(self, covariance: Covariance | None) -> FloatArray:
+    def landmark_covariance_m2(
+        self, covariance: Covariance | None, *, only: BoolArray | None = None
+    ) -> FloatArray:
         """Covariance (landmarks, 3, 3) of world points X / w, cameras marginalised, in the order given.
 
         It is V^-1 + V^-1 E' C E V^-1 at the last linearisation, with C the covariance of the variables of a
-        landmark's cameras; None: cameras are exact. Infinite for landmarks at infinity.
+        landmark's cameras; None: cameras are exact. Infinite for landmarks at infinity, NaN for those that
+        are not among `only` (landmarks,).
         """
-        out = np.empty((len(self.landmark_row), 3, 3))
+        out = np.full((len(self.landmark_row), 3, 3), np.nan)
         of_block: list[list[_Chunk]] = [[] for _ in self.blocks]
+        asked = None if only is None else np.flatnonzero(only[self.landmark_row])
         for chunk in self.chunks:
-            of_block[chunk.block].append(chunk)
+            parts = [chunk]
+            if asked is not None:
+                among = asked[(asked >= chunk.begin) & (asked < chunk.end)].tolist()
+                parts = [replace(chunk, begin=j, end=j + 1) for j in among]
+            of_block[chunk.block] += parts
 
         def work(first: int, last: int) -> None:
             for block, chunks in zip(self.blocks[first:last], of_block[first:last], strict=True):
+                if not chunks:
+                    continue
                 joint = block.joint(covariance)
                 for chunk in chunks:
                     begin, end, more = chunk.begin, chunk.end, np.zeros((chunk.end - chunk.begin, 3, 3))

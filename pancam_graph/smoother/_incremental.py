@@ -87,13 +87,13 @@ def solve_incrementally(
             raise InputError(f"incremental: {name}: expected {expected}, found {chosen}")
     if traverse.observations is not None:
         traverse.observations.noise.require_even()
-    begin = time.perf_counter()
+    begin, sharing = time.perf_counter(), free_numbers(traverse, options)
     smoother = TraverseSmoother(
         traverse.rig,
         SmootherOptions(
             # What is considered enters sigmas alone, and these are `solve`'s.
             rig="estimated" if options.rig == "estimated" else "held",
-            sharing=free_numbers(traverse, options),
+            sharing=sharing,
             outlier_sigma=None if options.loss == "none" else options.outlier_sigma,
         ),
     )
@@ -106,8 +106,7 @@ def solve_incrementally(
         if on_stop is not None:
             on_stop(updates[-1])
     if factors is not None:
-        sharing = replace(free_numbers(traverse, options), field=FIXED)
-        smoother.add_factors_of(HardTemplate(traverse, sharing), factors)
+        smoother.add_factors_of(HardTemplate(traverse, replace(sharing, field=FIXED)), factors)
     solved = time.perf_counter()
     solution = _as_solution(traverse, options, smoother, [i for i, _ in order], updates, factors)
     done = time.perf_counter()

@@ -75,4 +75,4 @@ def with_rig(fitted: Fitted, problem: Problem) -> tuple[Problem, ReducedSystem] 
     # What is left of the rig's own block once all else is eliminated is the inverse of its covariance.
     told = upper + np.triu(upper, 1).T - scipy.linalg.inv(spread)
     own[:] = (told + told.T) / 2 + prior
-    return wide, ReducedSystem(system=system, rows=rows, root=panels.root())
+    return wide, ReducedSystem.by_root(system, rows, panels.root())

@@ -138,7 +138,7 @@ class Ended:
         """
         if self.joint is None:
             return ReducedSystem.of(self.problem, (self.system, self.rows))
-        return ReducedSystem(system=self.system, rows=self.rows, root=self.joint).firm(self.problem)
+        return ReducedSystem.by_root(self.system, self.rows, self.joint).firm(self.problem)
 
 
 def _gain_ahead(system: LandmarkSystem, root: Callable[[], Root]) -> float | None:

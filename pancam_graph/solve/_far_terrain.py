@@ -21,7 +21,7 @@ from pancam_graph.landmarks import InverseRanges, Landmarks, at_inverse_ranges, 
 from pancam_graph.solve._joint import all_columns, retracted
 from pancam_graph.solve._problem import Problem, reach_m
 from pancam_graph.solve._range_prior import RangePrior
-from pancam_graph.solve._reduced import ReducedSystem, held_columns, panels_of
+from pancam_graph.solve._reduced import held_columns, panels_of
 
 __all__ = ["FarTerrain", "far_terrain"]
 
@@ -32,9 +32,11 @@ _SPURIOUS = 2e-5
 """Share of the information about a stop's position that noise of ranges may feign before it is looked at."""
 _MORE = 0.05
 """Feigned information, summed over directions in units of the true one of each, from which on it counts."""
+_FAINTEST = 1e-8
+"""Share of a diagonal entry of the system that each direction counts as known to as excess is weighed."""
 _LEAST = 10
 """Least landmarks with a broad range."""
-_ROUNDS = 60
+_ROUNDS = 100
 _SETTLED = 0.05
 """Step in sigmas that ends the rounds."""
 _NEAR = 0.3
@@ -46,8 +48,7 @@ _DOUBTFUL, _MOST_DOUBT = 0.2, 0.7
 _MOST_GROUPS = 1
 """Groups of variables, at most, of which information is taken off."""
 _FIRST_ROUNDS = 10
-"""Rounds after which it may depend on direction however large the step is, and after which a step that is no
-shorter than the one before is taken by half, lest two states alternate."""
+"""Rounds after which it may depend on direction however large the step is, and steps are short."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -91,45 +92,54 @@ def far_terrain(problem: Problem) -> FarTerrain | None:
         return None
     prior = RangePrior()
     expected = _expected(placed, broad, prior)
-    reduced = ReducedSystem.of(placed.at(placed.values, expected.landmarks))
-    feigned = _feigned(placed, reduced)
+    feigned = _feigned(placed, expected.landmarks)
     _LOG.info("far terrain: %d landmarks of broad range feign %.2g of information", broad.sum(), feigned)
     if feigned < _MORE:
         return None
-    return _solved(placed, broad, prior, reduced, expected)
+    return _solved(placed, broad, prior, expected)
 
 
-def _solved(
-    problem: Problem, broad: BoolArray, prior: RangePrior, reduced: ReducedSystem, known: _Expected
-) -> FarTerrain:
+def _solved(problem: Problem, broad: BoolArray, prior: RangePrior, known: _Expected) -> FarTerrain:
     """Rounds of: step to where the gradient vanishes, ranges fitted there, and expected ranges again."""
     link = problem.template.linkage
     held = all_columns(link, held_columns(problem.template))
-    length, learnt = np.inf, 0
+    root = panels_of(problem.at(problem.values, known.landmarks)).root()
+    learnt = 0
     for number in range(_ROUNDS):
-        before, length = length, float(np.sqrt(2 * reduced.root.gain()))
+        length = float(np.sqrt(2 * root.gain()))
         _LOG.debug("far terrain: round %d, step %.3g sigma", number, length)
         near = length < (_SETTLED if learnt else _NEAR) or (not learnt and number >= _FIRST_ROUNDS)
         if near and learnt < _LEARNT:
             # A distribution learnt far from the solution keeps traces of the bias there.
             prior, learnt = RangePrior(is_divided=True), learnt + 1
             known = _expected(problem, broad, prior)
-            reduced = ReducedSystem.of(problem.at(problem.values, known.landmarks))
-            length = float(np.sqrt(2 * reduced.root.gain()))
+            root = panels_of(problem.at(problem.values, known.landmarks)).root()
+            length = float(np.sqrt(2 * root.gain()))
         if length < _SETTLED:
             break
-        alternates = number >= _FIRST_ROUNDS and length > 0.9 * before
-        step = reduced.root.step() * (0.5 if alternates else 1.0)
+        step = root.step() if number < _FIRST_ROUNDS else _short_step(problem, known)
         step[held] = 0.0
         problem = problem.at(retracted(link, problem.values, step), problem.landmarks).placed()
         known = _expected(problem, broad, prior)
-        reduced = ReducedSystem.of(problem.at(problem.values, known.landmarks))
+        root = panels_of(problem.at(problem.values, known.landmarks)).root()
     return FarTerrain(
         problem=problem,
         expected=known.landmarks,
         doubt=_doubt(problem, known),
         converged=length < _SETTLED,
     )
+
+
+def _short_step(problem: Problem, known: _Expected) -> FloatArray:
+    """A step (columns,) that does not overshoot where few landmarks of no known range tell of a direction.
+
+    The slope of the gradient there is A(g)'N A(q^), which may exceed A(g)'N A(g) many times. It never exceeds
+    the mean of the systems at both ranges, which takes its place.
+    """
+    panels = panels_of(problem.at(problem.values, known.landmarks))
+    for panel, fitted in zip(panels.panel, panels_of(problem).panel, strict=True):
+        panel[:, :-1] = 0.5 * (panel[:, :-1] + fitted[:, :-1])
+    return panels.root().step()
 
 
 def _may_matter(problem: Problem) -> bool:
@@ -242,14 +252,18 @@ def _shares(information: FloatArray, covariance: FloatArray) -> tuple[FloatArray
     return share, unit @ turn
 
 
-def _feigned(problem: Problem, reduced: ReducedSystem) -> float:
+def _feigned(problem: Problem, expected: Landmarks) -> float:
     """Information that fitted ranges add to that of the system at expected ones, in units of the latter.
 
-    It is summed over all directions: the trace of the excess times the covariance. 0 where nothing holds a
-    direction.
+    It is summed over all directions: the trace of the excess times the covariance. Each direction counts as
+    known to a share of its diagonal at least, since rounding errors of both systems are no excess.
     """
+    fitted, system = panels_of(problem), panels_of(problem.at(problem.values, expected))
+    excess = system.copy()
+    for panel, more in zip(excess.panel, fitted.panel, strict=True):
+        np.subtract(more, panel, out=panel)
+    system.damp(_FAINTEST)
     try:
-        covariance = reduced.root.covariance()
-    except FreeDirectionError:
+        return excess.trace_with(system.root().covariance())
+    except FreeDirectionError:  # where even so nothing holds a direction
         return 0.0
-    return panels_of(problem).trace_with(covariance) - float(np.sum(problem.template.linkage.dim))

@@ -169,13 +169,16 @@ class OnLastGroup:
         root = joint.damped_root(self._damping)
         rows = root.rows[joint.last]
         n, last2 = len(rows), float(np.sum(rows[:, -1] ** 2))
-        others2 = 2 * root.gain() - last2
+        # Without the landmarks' own gain GTSAM would expect none where cameras have nothing left to gain, and
+        # refuse every step.
+        gain = root.gain() + joint.system.gain_alone
+        others2 = 2 * gain - last2
         error, jacobian = np.zeros(n + 2), np.zeros((n + 2, rows.shape[1]), order="F")
         jacobian[:n, :-1], error[:n] = rows[:, :-1], rows[:, -1]
-        # Decrease by the other groups, and the part of the cost beyond the squares of all e.
+        # Decrease by other groups and by landmarks, and the part of the cost beyond the squares of all e.
         error[n] = np.sqrt(max(others2, 0.0))
         jacobian[n, -1] = error[n] / _UNIT
-        error[n + 1] = np.sqrt(max(2 * (joint.cost - root.gain()), 0.0))
+        error[n + 1] = np.sqrt(max(2 * (joint.cost - gain), 0.0))
         jacobians[0] = jacobian
         return error
 

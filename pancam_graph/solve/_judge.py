@@ -200,15 +200,21 @@ def _diverging(problem: Problem, reduced: ReducedSystem | None, variables: Covar
         square = np.bincount(m.landmark, excess, minlength=m.n_landmarks)
         beyond &= square > 9.0
         if beyond.any() and reduced is not None and variables is not None:
-            beyond &= square > 9.0 * _by_cameras(problem, reduced, variables)
+            beyond &= square > 9.0 * _by_cameras(problem, reduced, variables, beyond)
     return beyond
 
 
-def _by_cameras(problem: Problem, reduced: ReducedSystem, variables: Covariance) -> FloatArray:
-    """Variance (landmarks,) of each landmark's range, over what it would be if cameras were exact."""
+def _by_cameras(
+    problem: Problem, reduced: ReducedSystem, variables: Covariance, only: BoolArray
+) -> FloatArray:
+    """Variance (landmarks,) of the range of landmarks, over what it would be if cameras were exact.
+
+    1 for those that are not among `only` (landmarks,).
+    """
+    of_system = only[reduced.rows]
     along = problem.landmarks.vector[reduced.rows, :3]
     with_cameras, alone = (
-        np.einsum("ni,nij,nj->n", along, reduced.system.landmark_covariance_m2(c), along)
+        np.einsum("ni,nij,nj->n", along, reduced.system.landmark_covariance_m2(c, only=of_system), along)
         for c in (variables, None)
     )
     out = np.ones(len(problem.landmarks.vector))

@@ -32,6 +32,8 @@ _FEW_ROUNDS = 60
 """Rounds for each trial of a division."""
 _RELAXED = 1.8
 """Exponent of the update of expectation-maximisation, which converges for any below 2."""
+_MOST_RAISED = 1e100
+"""Largest factor of an update before that exponent, lest the shares overflow."""
 
 
 class RangePrior:
@@ -125,9 +127,9 @@ def _learnt(
     """Shares (nodes,) of the nodes after rounds of expectation-maximisation; `common` pulls, if given."""
     n = len(likelihood)
     for _ in range(rounds):
-        counts = share * (likelihood.T @ (1 / (likelihood @ share)))
+        counts = share * (likelihood.T @ (1 / (likelihood @ share).clip(1e-300)))
         wanted = counts / n if common is None else (counts + _PULL * common) / (n + _PULL)
-        share = share * (wanted / share.clip(1e-300)) ** _RELAXED
+        share = share * (wanted / share.clip(1e-300)).clip(max=_MOST_RAISED) ** _RELAXED
         share = (share / share.sum()).clip(1e-300)
     return share
 

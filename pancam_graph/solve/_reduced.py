@@ -8,7 +8,7 @@ import numpy as np
 
 from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.elimination import LandmarkSystem, Linkage, Panels, Root, Rows, with_rows
-from pancam_graph.graph import Factors, FactorTemplate, graph_of
+from pancam_graph.graph import Factors, FactorTemplate, Kind, graph_of, kind_of
 from pancam_graph.solve._problem import Problem, system_of
 
 __all__ = [
@@ -32,6 +32,13 @@ class ReducedSystem:
     """(n,) rows of its landmarks among all."""
     root: Root
     """Square root of the system."""
+    gain: float
+    """Decrease of the linearised cost by the step of the cameras, as the normal equations have it."""
+
+    @staticmethod
+    def by_root(system: LandmarkSystem, rows: IntArray, root: Root) -> "ReducedSystem":
+        """The same of a square root of the normal equations."""
+        return ReducedSystem(system=system, rows=rows, root=root, gain=root.gain())
 
     @staticmethod
     def of(
@@ -46,12 +53,12 @@ class ReducedSystem:
         takes part.
         """
         system, rows = arranged or system_of(problem)
-        panels = landmark_panels(problem, system, without=without)
-        return ReducedSystem(system=system, rows=rows, root=panels.root()).firm(problem)
+        root = landmark_panels(problem, system, without=without).root()
+        return ReducedSystem.by_root(system, rows, root).firm(problem)
 
     def firm(self, problem: Problem) -> "ReducedSystem":
         """The same, or one by QR where a weak prior of the problem is lost in rounding errors of this one."""
-        if not self.root.leaves_free:
+        if not self.root.is_rounded:
             return self
         return replace(self, root=_root_by_qr(problem, self.system))
 
@@ -100,7 +107,7 @@ def loosened_root(problem: Problem, system: LandmarkSystem, factor: float) -> Ro
     add(factors.priors, factor**-2)
     panels.hold(held_columns(template))
     root = panels.root()
-    return _root_by_qr(problem, system, factor) if root.leaves_free else root
+    return _root_by_qr(problem, system, factor) if root.is_rounded else root
 
 
 def _root_by_qr(problem: Problem, system: LandmarkSystem, factor: float = 1.0) -> Root:
@@ -116,7 +123,30 @@ def _root_by_qr(problem: Problem, system: LandmarkSystem, factor: float = 1.0) -
     panels.hold(held)
     more = _rows(link, graph_of((*factors.ties, *factors.seated)).linearize(values), held, 1.0)
     more += _rows(link, graph_of(factors.priors).linearize(values), held, 1 / factor)
-    return with_rows(panels.root(), more)
+    return with_rows(_without_shift(problem, panels.root(), held), more)
+
+
+def _without_shift(problem: Problem, root: Root, held: Mapping[int, IntArray]) -> Root:
+    """The root of what images alone say, without what rounding says of a common shift of all poses.
+
+    Images cannot tell it: each row's product with the shift is 0 but for rounding, and a row along the shift
+    is rounding itself.
+    """
+    link, st = problem.template.linkage, root.structure
+    shift = np.zeros((int(link.group_column[-1]), 3))
+    for key, group in zip(link.key, link.group, strict=True):
+        if kind_of(key) in {Kind.MAST, Kind.CAMERA}:
+            first = int(link.group_column[group]) + link.columns_of(key).start + 3
+            shift[first : first + 3] = problem.values.atPose3(key).rotation().matrix().T
+    if np.any(shift[[link.group_column[g] + c for g, columns in held.items() for c in columns]]):
+        return root
+    rows = []
+    for after, some in zip(st.after, root.rows, strict=True):
+        moves = np.concatenate([shift[link.group_column[h] : link.group_column[h + 1]] for h in after])
+        n_poses = float(np.sum(moves**2)) / 3
+        told = some[:, :-1] - (some[:, :-1] @ moves) @ moves.T / max(n_poses, 1.0)
+        rows.append(np.column_stack([told, some[:, -1]]))
+    return replace(root, rows=tuple(rows))
 
 
 def _rows(

@@ -137,7 +137,7 @@ def _optimum(at: Optimum) -> VerdictTest:
         return VerdictTest.of(name, np.nan, limit, text, text)
     # Landmarks at expected ranges are not where they fit best: only those fitted have a step of their own.
     alone = at.reduced.system.gain_alone if at.fitted.expected is None else 0.0
-    ahead = at.reduced.root.gain() + alone
+    ahead = at.reduced.gain + alone
     off = sigmas_left(at.fitted.outcome.costs, ahead)
     return VerdictTest.of(
         name,

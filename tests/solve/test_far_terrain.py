@@ -156,6 +156,12 @@ class TestRangePrior:
         # What is feigned is the square beyond the product with the truth.
         assert np.sum(centred**2) < 1.1 * np.sum(centred * true)
 
+    def test_a_range_far_from_all_others_is_borne(self) -> None:
+        noisy = np.append(np.full(20, 1e-3), 50.0)
+        variance = np.append(np.full(20, 1e-8), 1e-8)
+        expected = RangePrior().expected(noisy, variance, np.tile([1.0, 0.0, 0.0], (21, 1)))[0]
+        assert np.isfinite(expected).all()
+
     def test_ranges_may_depend_on_direction(self) -> None:
         rng = np.random.default_rng(1)
         azimuth = rng.uniform(-np.pi, np.pi, 1000)

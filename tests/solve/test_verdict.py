@@ -20,6 +20,8 @@ from support.solving import fitted
 from support.truth import errors_in_sigmas
 
 SMALL = SimulationOptions(stops=2, pans=9, points_per_image=20)
+FEW = SimulationOptions(stops=2, pans=4, sweep_rad=2.0, points_per_image=15)
+MANY = SimulationOptions(stops=2)
 
 
 def drive(seed: int = 3, rig: str = "mer-navcam", **options: object) -> Simulation:
@@ -77,6 +79,25 @@ def test_sigmas_that_are_too_large_are_said_with_the_factor_and_pass() -> None:
     assert solution.passed
     assert note.is_note
     assert note.value == pytest.approx(10.0, rel=0.1)
+
+
+def test_landmarks_move_on_where_cameras_have_nothing_to_gain() -> None:
+    """GTSAM expected no gain, and refused every step: landmarks stayed 0.3 sigma short, at infinity."""
+    solution = solve(with_sigmas(simulate(TEMPLATES["mer-navcam"](), MANY, seed=8007).traverse, 10.0))
+    assert solution.passed, failed(solution)
+    assert (named(solution)["optimum"].value or 0.0) < 0.01
+
+
+@pytest.mark.parametrize("sigma_m", [100.0, 1000.0])
+def test_where_nothing_but_weak_priors_holds_the_drive_it_is_as_sure_as_they_are(sigma_m: float) -> None:
+    """Rounding errors of the images' information took part: one sigma was 1 to 99 % too small."""
+    traverse = simulate(TEMPLATES["exomars-pancam"](), FEW, seed=3).traverse
+    stops = (replace(s, sigma_translation_m=sigma_m, sigma_rotation_rad=0.01) for s in traverse.stops)
+    solution = solve(replace(traverse, stops=tuple(stops)))
+    assert solution.passed, failed(solution)
+    for covariance in solution.stop_covariance:
+        sigmas = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:]))
+        np.testing.assert_allclose(sigmas, sigma_m / np.sqrt(2), rtol=1e-4)
 
 
 def test_estimated_noise_needs_no_sigmas() -> None:

@@ -18,7 +18,7 @@ from pancam_graph.data._noise import PixelNoise
 from pancam_graph.graph import Flex
 from pancam_graph.initialise import Start
 from pancam_graph.results._residuals import residual_columns
-from pancam_graph.rigs import Eye, Rig, mer_navcam
+from pancam_graph.rigs import Eye, Rig, exomars_pancam, mer_navcam
 from pancam_graph.simulate import Simulation
 from pancam_graph.smoother import solve_incrementally
 from pancam_graph.solve import prepare
@@ -356,16 +356,26 @@ def test_the_spread_is_as_the_covariance_says_and_larger_where_correlation_is_ig
     assert spread["sigma"] > 1.6 * spread["covariance"]
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_ellipses_10000_to_1_take_no_more_steps_than_round_ones(seed: int) -> None:
+@pytest.mark.parametrize(
+    ("rig", "options", "seed"),
+    [
+        (mer_navcam, SMALL, 0),
+        # Weak priors of landmarks held what the long axes tell of ranges, and it ended at the limit of 100.
+        (exomars_pancam, replace(SMALL, stops=1, pans=6, sweep_rad=2.5), 1),
+    ],
+)
+def test_ellipses_10000_to_1_take_few_steps(
+    rig: Callable[[], Rig], options: SimulationOptions, seed: int
+) -> None:
     """GTSAM's Cholesky calls such a system indeterminate; damped until it does not, the solve crawled."""
-    simulation = simulate(mer_navcam(), replace(SMALL, noise_stretch=1e4), seed=seed)
+    # Landmarks without a range may end behind a camera; a second fit does without these.
+    simulation = simulate(rig(), replace(options, noise_stretch=1e4), seed=seed)
     solution = solve(simulation.traverse, SolveOptions(rig="held", loss="none"))
     angles, stops = errors_in_sigmas(simulation, solution)
     assert solution.converged
-    assert solution.iterations <= 6
+    assert solution.iterations <= 8
     assert np.abs(angles).max() < 5
-    assert stops.max() < 2.5
+    assert np.max(stops, initial=0.0) < 2.5
 
 
 def told_and_true(sure_px: float, rough_px: float) -> Simulation:

@@ -33,7 +33,11 @@ __all__ = [
 ]
 
 WEAK_PRIOR = 1e-12
-"""Information of a landmark's weak prior, as a share of the trace of its information V."""
+"""Information of a landmark's weak prior, as a share of the trace of its information V ..."""
+_SAYS_NOTHING = 1e-2
+"""... and at most: a sigma of 10 rad says nothing of where a unit vector points ..."""
+_ROUNDING = 1e-15
+"""... but at least, as a share of the trace: it is to exceed the rounding errors of a pivot."""
 
 
 @part
@@ -318,7 +322,8 @@ def _cholesky(v: _Symmetric) -> tuple[_Symmetric, bool]:
     """
     v00, v10, v20, v11, v21, v22 = v
     trace = v00 + v11 + v22
-    floor, prior = UNDETERMINED * trace, WEAK_PRIOR * trace + 1e-300
+    prior = max(min(WEAK_PRIOR * trace, _SAYS_NOTHING), _ROUNDING * trace) + 1e-300
+    floor = prior * (UNDETERMINED / WEAK_PRIOR)
     l00 = np.sqrt(v00 if v00 > floor else v00 + prior)
     l10, l20 = v10 / l00, v20 / l00
     p1 = max(v11 - l10 * l10, 0.0)
