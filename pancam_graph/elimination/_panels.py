@@ -254,10 +254,14 @@ class Root:
     """Smallest pivot, as a share of its diagonal entry before elimination; 1 where no digits were lost."""
 
     @property
+    def leaves_free(self) -> bool:
+        """Whether a direction of some group is undetermined: fewer rows than columns."""
+        return any(len(rows) < n for rows, n in zip(self.rows, self.structure.dim, strict=True))
+
+    @property
     def is_rounded(self) -> bool:
-        """Whether rounding errors of the normal equations hold a direction, or next to nothing does."""
-        free = any(len(rows) < n for rows, n in zip(self.rows, self.structure.dim, strict=True))
-        return free or self.least_pivot < _ROUNDED
+        """Whether rounding errors of the normal equations may have a part in what holds some direction."""
+        return self.leaves_free or self.least_pivot < _ROUNDED
 
     def gain(self) -> float:
         """Decrease of the linearised cost by the step that solves the system: |e|^2 / 2."""

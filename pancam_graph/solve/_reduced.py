@@ -58,7 +58,7 @@ class ReducedSystem:
 
     def firm(self, problem: Problem) -> "ReducedSystem":
         """The same, or one by QR where a weak prior of the problem is lost in rounding errors of this one."""
-        if not self.root.is_rounded:
+        if not _loses_digits(problem, self.root):
             return self
         return replace(self, root=_root_by_qr(problem, self.system))
 
@@ -107,7 +107,7 @@ def loosened_root(problem: Problem, system: LandmarkSystem, factor: float) -> Ro
     add(factors.priors, factor**-2)
     panels.hold(held_columns(template))
     root = panels.root()
-    return _root_by_qr(problem, system, factor) if root.is_rounded else root
+    return _root_by_qr(problem, system, factor) if _loses_digits(problem, root) else root
 
 
 def _root_by_qr(problem: Problem, system: LandmarkSystem, factor: float = 1.0) -> Root:
@@ -123,28 +123,49 @@ def _root_by_qr(problem: Problem, system: LandmarkSystem, factor: float = 1.0) -
     panels.hold(held)
     more = _rows(link, graph_of((*factors.ties, *factors.seated)).linearize(values), held, 1.0)
     more += _rows(link, graph_of(factors.priors).linearize(values), held, 1 / factor)
-    return with_rows(_without_shift(problem, panels.root(), held), more)
+    root, motion = panels.root(), _common_motion(problem)
+    return with_rows(root if motion is None else _without_motion(root, motion, link), more)
 
 
-def _without_shift(problem: Problem, root: Root, held: Mapping[int, IntArray]) -> Root:
-    """The root of what images alone say, without what rounding says of a common shift of all poses.
+def _loses_digits(problem: Problem, root: Root) -> bool:
+    """Whether a weak prior of the problem is lost in rounding errors of a root, and QR would keep it."""
+    return root.leaves_free or (root.is_rounded and _common_motion(problem) is not None)
 
-    Images cannot tell it: each row's product with the shift is 0 but for rounding, and a row along the shift
-    is rounding itself.
+
+def _common_motion(problem: Problem) -> FloatArray | None:
+    """The tangents (columns, 6) of a common rotation and shift of all poses; None where some pose is held."""
+    template, link = problem.template, problem.template.linkage
+    kinds = [kind_of(key) for key in link.key]
+    moving = set(link.key)
+    t = template.traverse
+    stops_move = all(template.keys.mast(t.stops[s].id) in moving for s in np.unique(t.image_stop).tolist())
+    if Kind.PROJECTION in kinds or not (stops_move or template.has_cameras):
+        return None
+    of_poses = [i for i, kind in enumerate(kinds) if kind in {Kind.MAST, Kind.CAMERA}]
+    poses = [problem.values.atPose3(link.key[i]) for i in of_poses]
+    out = np.zeros((int(link.group_column[-1]), 6))
+    middle = np.mean([pose.translation() for pose in poses], axis=0) if poses else np.zeros(3)
+    for i, pose in zip(of_poses, poses, strict=True):
+        first = int(link.group_column[link.group[i]]) + link.columns_of(link.key[i]).start
+        inverse = pose.rotation().matrix().T
+        arm = pose.translation() - middle
+        out[first : first + 3, :3] = inverse
+        out[first + 3 : first + 6, :3] = inverse @ np.cross(np.eye(3), arm).T
+        out[first + 3 : first + 6, 3:] = inverse
+    held = [link.group_column[g] + columns for g, columns in held_columns(template).items()]
+    return None if any(np.any(out[columns]) for columns in held) else out
+
+
+def _without_motion(root: Root, motion: FloatArray, linkage: Linkage) -> Root:
+    """The root of what images alone say, without what rounding says of a common motion (columns, 6).
+
+    Images cannot tell it: the product of each row with it is 0 but for rounding, and a row along it is
+    rounding itself.
     """
-    link, st = problem.template.linkage, root.structure
-    shift = np.zeros((int(link.group_column[-1]), 3))
-    for key, group in zip(link.key, link.group, strict=True):
-        if kind_of(key) in {Kind.MAST, Kind.CAMERA}:
-            first = int(link.group_column[group]) + link.columns_of(key).start + 3
-            shift[first : first + 3] = problem.values.atPose3(key).rotation().matrix().T
-    if np.any(shift[[link.group_column[g] + c for g, columns in held.items() for c in columns]]):
-        return root
-    rows = []
-    for after, some in zip(st.after, root.rows, strict=True):
-        moves = np.concatenate([shift[link.group_column[h] : link.group_column[h + 1]] for h in after])
-        n_poses = float(np.sum(moves**2)) / 3
-        told = some[:, :-1] - (some[:, :-1] @ moves) @ moves.T / max(n_poses, 1.0)
+    rows, begin = [], linkage.group_column
+    for after, some in zip(root.structure.after, root.rows, strict=True):
+        moves = np.concatenate([motion[begin[h] : begin[h + 1]] for h in after])
+        told = some[:, :-1] - (some[:, :-1] @ moves) @ np.linalg.pinv(moves)
         rows.append(np.column_stack([told, some[:, -1]]))
     return replace(root, rows=tuple(rows))
 
