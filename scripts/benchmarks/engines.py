@@ -6,8 +6,10 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
+import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,8 @@ __all__ = [
 THREADS = 2
 """Threads of Ceres and COLMAP. This package takes as many as BLAS and its own solver choose."""
 
+_RUNS = 3
+"""Whole processes of which the fastest counts."""
 _SLOWS_BLAS = ("OPENBLAS_CORETYPE", "OPENBLAS_L2_SIZE")
 """Environment variables that slow OpenBLAS; they are removed for every engine."""
 _SCRIPTS = Path(__file__).resolve().parents[1]
@@ -53,6 +57,8 @@ class Measured:
     initialise_s: float | None = None
     """Seconds of preparation before a warm solve: triangulation and what `seconds` does not count."""
     read_s: float | None = None
+    process_s: float | None = None
+    """Seconds of a whole process as a user starts it, with reading and results; the fastest of some."""
     detail: str = ""
 
     @property
@@ -106,6 +112,9 @@ class Engine:
     """Name in the table."""
     command: Callable[[Files, Setting, int], list[str] | NotRun]
     """Makes the command (module of this package, arguments) of a case, a setting and a number of repeats."""
+    process: Callable[[Files, Path], list[str]] | None = None
+    """Makes the arguments of the package's command for a case and a folder of results; None: not measured, or
+    the module that solves measures it."""
     compiles: bool = False
     """Whether its first solve ever compiles code that later ones load from disk."""
     same_problem: bool = True
@@ -123,6 +132,11 @@ def _ours(landmarks: str) -> Callable[[Files, Setting, int], list[str] | NotRun]
         ]
 
     return command
+
+
+def _refine(files: Files, out: Path) -> list[str]:
+    options = ["--loss", "none", "--no-report", "--rig", files.rig, "--quiet"]
+    return ["pancam_graph", "refine", str(files.traverse), "--out", str(out), *options]
 
 
 def _ceres(files: Files, setting: Setting, repeats: int) -> list[str] | NotRun:
@@ -143,7 +157,13 @@ def _pycolmap(files: Files, setting: Setting, repeats: int) -> list[str] | NotRu
 ENGINES = {
     engine.name: engine
     for engine in (
-        Engine(name="eliminated", title="pancam_graph", command=_ours("eliminated"), compiles=True),
+        Engine(
+            name="eliminated",
+            title="pancam_graph",
+            command=_ours("eliminated"),
+            process=_refine,
+            compiles=True,
+        ),
         Engine(
             name="explicit",
             title="pancam_graph, explicit landmarks",
@@ -165,7 +185,36 @@ def measure(engine: Engine, files: Files, setting: Setting, repeats: int) -> Mea
     figures = run_module(command, setting.child_environment(engine.name))
     if isinstance(figures, NotRun):
         return figures
-    return Measured(**{**figures, "seconds": tuple(figures["seconds"])})
+    measured = Measured(**{**figures, "seconds": tuple(figures["seconds"])})
+    if engine.process is None:
+        return measured
+    environment, seconds = setting.child_environment(engine.name), []
+    for _ in range(_RUNS):
+        run_s = _process_s(engine.process, files, environment)
+        if isinstance(run_s, NotRun):
+            return run_s
+        seconds.append(run_s)
+    return replace(measured, process_s=min(seconds))
+
+
+def _process_s(
+    command: Callable[[Files, Path], list[str]], files: Files, environment: dict[str, str]
+) -> float | NotRun:
+    """Seconds from the start to the end of the command in a new process, with its results in a new folder."""
+    with tempfile.TemporaryDirectory(prefix="pancam-graph-benchmark-") as folder:
+        begin = time.perf_counter()
+        done = subprocess.run(
+            [sys.executable, "-m", *command(files, Path(folder) / "out")],
+            env=environment,
+            text=True,
+            capture_output=True,
+            check=False,
+        )
+        seconds = time.perf_counter() - begin
+    if done.returncode != 0:
+        lines = (done.stderr.strip() or done.stdout.strip()).splitlines() or ["no message"]
+        return NotRun(reason=f"refine: {lines[-1]} (status {done.returncode})", failed=True)
+    return seconds
 
 
 def solve_first_ever(engine: Engine, files: Files, setting: Setting) -> float | NotRun:

@@ -9,24 +9,28 @@ import json
 import os
 import sys
 import tempfile
+import time
 
 _FUNCTION_TOLERANCE = "1e-6"
 """The program's own default, which its next argument needs before it."""
 
 
 def solve(program: str, peer: str, solver: str, threads: int, rig: str) -> tuple[dict[str, float], float]:
-    """Run the program once: what it printed, and the most memory it took in megabytes."""
+    """Run the program once: what it printed and `process_s`, and the most memory it took in megabytes."""
     with tempfile.TemporaryFile() as output:
         command = [program, peer, solver, str(threads), _FUNCTION_TOLERANCE, rig]
         out = [(os.POSIX_SPAWN_DUP2, output.fileno(), 1)]
+        begin = time.perf_counter()
         child = os.posix_spawn(program, command, os.environ, file_actions=out)
         _, status, usage = os.wait4(child, 0)
+        process_s = time.perf_counter() - begin
         output.seek(0)
         text = output.read().decode()
     if status != 0:
         sys.stderr.write(f"{program}: ended with status {os.waitstatus_to_exitcode(status)}\n")
         sys.exit(2)
-    return json.loads(text), usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e6
+    memory_mb = usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e6
+    return {**json.loads(text), "process_s": process_s}, memory_mb
 
 
 def main() -> None:
@@ -56,6 +60,7 @@ def main() -> None:
         "iterations": fastest["iterations"],
         "cost_final": fastest["final_cost"],
         "memory_mb": memory_mb,
+        "process_s": min(r["process_s"] for r in (fastest, *again)),
         "detail": f"{best} Schur, {arguments.threads} threads" + (f"; {others}" if others else ""),
     }
     sys.stdout.write(json.dumps(measured) + "\n")

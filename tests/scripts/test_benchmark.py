@@ -329,8 +329,10 @@ def test_table_has_a_line_per_engine_that_ran() -> None:
             case_result(
                 "small",
                 {
-                    "eliminated": replace(measured(0.1), rms_px=0.587, first_s=0.9, initialise_s=0.02),
-                    "ceres": measured(0.4),
+                    "eliminated": replace(
+                        measured(0.1), rms_px=0.587, first_s=0.9, initialise_s=0.02, process_s=0.6
+                    ),
+                    "ceres": replace(measured(0.4), process_s=0.5),
                     "pycolmap": NotRun(reason="", failed=False),
                 },
                 12_345,
@@ -338,12 +340,13 @@ def test_table_has_a_line_per_engine_that_ran() -> None:
         )
     )
     head, rule, ours, ceres = report.markdown().splitlines()
-    assert head.count("|") == rule.count("|") == ours.count("|") == ceres.count("|") == 11
+    assert head.count("|") == rule.count("|") == ours.count("|") == ceres.count("|") == 13
     assert "12,345 observations" in ours
     assert [cell.strip() for cell in ours.split("|")[3:-1]] == [
-        "0.1 (0.2)", "0.25", "5", "1000.0", "0.587", "0.02", "0.9", "100",
+        "0.6", "1.20", "0.1 (0.2)", "0.25", "5", "1000.0", "0.587", "0.02", "0.9", "100",
     ]  # fmt: skip
-    assert [cell.strip() for cell in ceres.split("|")[1:5]] == ["", "Ceres, C++", "0.4 (0.8)", "1.00"]
+    assert [cell.strip() for cell in ceres.split("|")[1:5]] == ["", "Ceres, C++", "0.5", "1.00"]
+    assert report.ratios()["small: eliminated / ceres, whole process"] == pytest.approx(1.2)
 
 
 def test_baseline_complains_only_of_what_got_worse() -> None:
