@@ -195,11 +195,15 @@ class Pinhole(Camera):
     def project_with_jacobian(self, points_m: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Pixels, derivatives and validity; see `Camera.project_with_jacobian` (thesis eq. 2.2, 2.3)."""
         uv, xy, z, d_distort, valid = self._projected(points_m)
-        k = self.calibration_matrix
-        d_xy = np.zeros((len(z), 2, 3))
-        d_xy[:, 0, 0] = d_xy[:, 1, 1] = 1 / z
-        d_xy[:, :, 2] = -xy / z[:, None]
-        return uv, k[:2, :2] @ d_distort @ d_xy, valid
+        # Products of a few numbers at each point are several times as fast written out as by matrices.
+        k, d_point = self.calibration_matrix, np.empty((len(z), 2, 3))
+        for i in range(2):
+            along_x, along_y = (
+                (k[i, 0] * d_distort[:, 0, j] + k[i, 1] * d_distort[:, 1, j]) / z for j in range(2)
+            )
+            d_point[:, i, 0], d_point[:, i, 1] = along_x, along_y
+            d_point[:, i, 2] = -(along_x * xy[:, 0] + along_y * xy[:, 1])
+        return uv, d_point, valid
 
     def project_with_calibration_jacobian(
         self, points_m: FloatArray

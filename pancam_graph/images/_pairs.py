@@ -305,7 +305,8 @@ class PairGeometry:
         rays = self.camera_a.unproject((uv_px + shifts[:, None]).reshape(-1, 2))
         pixels, _ = self.transfer(rays.origin_m + FAR_M * rays.direction, self.b_T_a(self.no_correction))
         centre, right, down = pixels.reshape(3, -1, 2)
-        area = np.abs(np.linalg.det(np.stack([right - centre, down - centre], -1)))
+        (right_u, right_v), (down_u, down_v) = (right - centre).T, (down - centre).T
+        area = np.abs(right_u * down_v - right_v * down_u)
         return np.asarray(np.sqrt(np.where(np.isfinite(area), area, 1.0)))
 
     def elevation_rad(self, uv_px: FloatArray) -> FloatArray:
@@ -341,10 +342,9 @@ def _alike(points_m: FloatArray, b_T_a: Relative) -> BoolArray:
     """Whether points (n, 3) in the frame of camera a are seen from similar sides and distances, (n,)."""
     from_b = b_T_a.of(points_m)
     from_a = from_b - b_T_a.t
-    range_a, range_b = np.linalg.norm(from_a, axis=1), np.linalg.norm(from_b, axis=1)
-    cosine = np.einsum("ni,ni->n", from_a, from_b) / np.maximum(range_a * range_b, 1e-12)
-    near = (range_a < MAX_ZOOM * range_b) & (range_b < MAX_ZOOM * range_a)
-    return np.asarray(near & (cosine > np.cos(MAX_TURN_RAD)))
+    a2, b2, ab = (np.einsum("ni,ni->n", *p) for p in ((from_a, from_a), (from_b, from_b), (from_a, from_b)))
+    near = (a2 < MAX_ZOOM**2 * b2) & (b2 < MAX_ZOOM**2 * a2)
+    return np.asarray(near & (ab > np.cos(MAX_TURN_RAD) * np.sqrt(np.maximum(a2 * b2, 1e-24))))
 
 
 def inspected_depths_m(min_depth_m: float) -> FloatArray:
