@@ -1,32 +1,49 @@
-"""How loops are compiled to machine code, and how the compiled code is kept on disk.
+"""Loops that are compiled to machine code, kept on disk, and called without Numba.
 
-Three decorators: `entry` for functions that Python calls, `part` and `inlined` for functions that only other
-compiled functions call. Only entry points are kept on disk; each holds the code of its parts.
+Decorators: `entry` for functions that Python calls; `part`, `inlined` and `merged` for functions that only
+other compiled functions call. Numba makes the machine code of an entry point at its first call, for the types
+of its arguments (`by_numba`). The code is kept on disk (`kept_code`), and a later process links and calls it
+without Numba (`native_code`), whose import and start take longer than a small solve.
 
-Numba notices when the file of a function on disk has changed, but not when the file of a part has. An entry
-point is therefore kept under a name that ends in a digest of all source files of its folder: after an edit of
-any of them it is looked for under another name, and compiled anew. A folder whose entry points take parts
-from another one names that: `Compiling(parts_from=...)`.
+Code is kept under a digest of all source files of the folder of its entry point: after an edit of any of
+them it is looked for under another name, and compiled anew. A folder whose entry points take parts from
+another one names that: `Compiling(parts_from=...)`.
 
-`uncounted` has the same three decorators for functions that make no arrays. Numba counts references to arrays
+`uncounted` has the same decorators for functions that make no arrays. Numba counts references to arrays
 wherever a function hands them on, which costs half the time of a loop that hands on thirty of them; without
 counting, the caller must keep all arrays alive.
 """
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial, update_wrapper
 from hashlib import sha256
 from pathlib import Path
+from threading import RLock
 from typing import Any, TypeVar, cast
 
-import numba
+import numpy as np
 
-from pancam_graph.base.kept_code import KeptCode, kept_code
+from pancam_graph.base.kept_code import KeptCode
+from pancam_graph.base.native_code import NativeCode, NativeFunction, NotNativeError
+from pancam_graph.base.parts import Part
 
-__all__ = ["Compiling", "entry", "folder_digest", "inlined", "is_on_disk", "part", "uncounted"]
+__all__ = [
+    "Compiling",
+    "Entry",
+    "chosen",
+    "entry",
+    "folder_digest",
+    "inlined",
+    "is_on_disk",
+    "part",
+    "uncounted",
+]
 
 _F = TypeVar("_F", bound=Callable[..., Any])
+_LOCK = RLock()
+"""Held while code is compiled or linked: several threads may call an entry point for the first time."""
 
 
 @cache
@@ -40,6 +57,146 @@ def folder_digest(folder: Path) -> str:
         running.update(f"{path.name}\0".encode())
         running.update(path.read_bytes() + b"\0")
     return running.hexdigest()[:12]
+
+
+def _is_off() -> bool:
+    """Whether compilation is switched off: functions then are plain Python."""
+    return os.environ.get("NUMBA_DISABLE_JIT", "") not in {"", "0"}
+
+
+class _CallablePart(Part):
+    """A part that tests call."""
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call it from Python: it is compiled in every process."""
+        from pancam_graph.base.by_numba import dispatcher  # noqa: PLC0415  late: it imports Numba
+
+        return dispatcher(self.choose(self.plain), self.options, for_python=True)(*arguments)
+
+
+class Entry:
+    """A compiled function that Python calls: with arrays, numbers, and tuples of these.
+
+    Releases the interpreter's lock. A reference to each argument must be held until it returns.
+    """
+
+    def __init__(
+        self, function: Callable[..., Any], options: dict[str, Any], folders: Sequence[Path]
+    ) -> None:
+        """`options` are those of Numba; `folders` have the sources that the code depends on."""
+        update_wrapper(self, function)
+        self._function = function
+        self._options = options
+        self._kept = KeptCode(
+            folder=Path(function.__code__.co_filename).parent,
+            name=_name(function),
+            sources=partial(_digests, tuple(folders)),
+        )
+        self._linked = dict[tuple[Any, ...], NativeFunction]()
+        self._dispatcher: Any = None
+        """Numba's, where its code cannot be called without it."""
+        self.n_found = 0
+        """For how many types of arguments the code was on disk."""
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call the code for these types of arguments; the first call finds it on disk or compiles it.
+
+        Raises TypeError for arguments of other kinds, RuntimeError where the code runs out of memory.
+        """
+        if self._dispatcher is not None:
+            return self._dispatcher(*arguments)
+        kinds, words, numbers = list[Any](), list[int](), list[float]()
+        _flatten(arguments, kinds, words, numbers)
+        key = tuple(kinds)
+        native = self._linked.get(key) or self._ready(key, arguments)
+        return native(words, numbers) if native is not None else self(*arguments)
+
+    @property
+    def sources(self) -> str:
+        """The digests of the sources that the code depends on."""
+        return self._kept.sources()
+
+    @property
+    def is_on_disk(self) -> bool:
+        """Whether code of the present sources is on disk, for any types of arguments."""
+        return self._kept.is_there
+
+    def _ready(self, key: tuple[Any, ...], arguments: tuple[Any, ...]) -> NativeFunction | None:
+        """The code for some types of arguments; None where only Numba's dispatcher can call it."""
+        with _LOCK:
+            if key in self._linked or self._dispatcher is not None:
+                return self._linked.get(key)
+            name = " ".join(map(_word, key))
+            for code in self._kept.found(name):
+                try:
+                    self._linked[key] = code.linked()
+                except NotNativeError as error:
+                    self._kept.say_damaged(error)
+                else:
+                    self.n_found += 1
+                    return self._linked[key]
+            return self._compiled(key, name, arguments)
+
+    def _compiled(self, key: tuple[Any, ...], name: str, arguments: tuple[Any, ...]) -> NativeFunction | None:
+        from pancam_graph.base import by_numba  # noqa: PLC0415  late: it imports Numba
+
+        try:
+            code: NativeCode = by_numba.native_code(self._function, self._options, arguments)
+            linked = code.linked()
+        except NotNativeError as error:
+            self._kept.say_lost(f"cannot be called without Numba ({error})")
+            self._dispatcher = by_numba.dispatcher(self._function, self._options, for_python=True)
+            return None
+        self._kept.keep(name, code)
+        self._linked[key] = linked
+        return linked
+
+
+def _name(function: Callable[..., Any]) -> str:
+    """Module, qualified name, and the numbers that tell functions made by one function from each other."""
+    qualified = function.__qualname__.replace("<locals>.", "")
+    numbers = [cell.cell_contents for cell in function.__closure__ or ()]
+    own = [str(number) for number in numbers if isinstance(number, (int, float))]
+    return "-".join((f"{Path(function.__code__.co_filename).stem}.{qualified}", *own))
+
+
+def _digests(folders: tuple[Path, ...]) -> str:
+    return "-".join(folder_digest(folder) for folder in folders)
+
+
+def _word(kind: Any) -> str:
+    if isinstance(kind, np.dtype):
+        return kind.str
+    return kind.__qualname__ if isinstance(kind, type) else str(kind)
+
+
+def _flatten(values: Sequence[Any], kinds: list[Any], words: list[int], numbers: list[float]) -> None:
+    """Append what code is compiled for to `kinds`, arrays and whole numbers to `words`, others to `numbers`.
+
+    An array is handed on as the address of its object.
+    """
+    for value in values:
+        if isinstance(value, np.ndarray):
+            flags = value.flags
+            plain = flags.carray or (flags.c_contiguous and flags.aligned)
+            if not plain and not flags.aligned:
+                raise TypeError("compiled functions take aligned arrays")
+            kinds += (value.dtype, value.ndim, "C" if plain else "A")
+            words.append(id(value))
+        elif isinstance(value, tuple):
+            kinds += (type(value), len(value))
+            _flatten(value, kinds, words, numbers)
+        elif isinstance(value, (bool, np.bool_)):
+            kinds.append("bool")
+            words.append(bool(value))
+        elif isinstance(value, (int, np.integer)):
+            kinds.append("int")
+            words.append(int(value))
+        elif isinstance(value, (float, np.floating)):
+            kinds.append("float")
+            numbers.append(float(value))
+        else:
+            raise TypeError(f"compiled functions take arrays, numbers and tuples of them, not {type(value)}")
 
 
 @dataclass(frozen=True)
@@ -57,25 +214,21 @@ class Compiling:
 
     def entry(self, function: _F) -> _F:
         """Compile a function that Python calls, and keep the machine code on disk."""
+        if _is_off():
+            return function
         folders = (Path(function.__code__.co_filename).parent, *self.parts_from)
-        digest = "-".join(folder_digest(folder) for folder in folders)
-        function.__qualname__ = f"{function.__qualname__}-{digest}"  # Numba names files after it
-        compiled: Any = self._compile(function)
-        kept = kept_code(function) if hasattr(compiled, "stats") else None  # without: compilation is off
-        if kept is not None:
-            compiled._cache = kept  # as cache=True sets one that fails where no folder can be written to
-        return cast(_F, compiled)
+        return cast(_F, Entry(function, self._options(), folders))
 
     def part(self, function: _F) -> _F:
         """Compile a function that only compiled functions call."""
-        return self._compile(function)
+        return self._part(function)
 
     def inlined(self, function: _F) -> _F:
         """Copy the body of a function into each compiled function that calls it.
 
         For functions with so many arguments that a call would cost as much as their work.
         """
-        return self._compile(function, inline="always")
+        return self._part(function, inline="always")
 
     def merged(self, function: _F) -> _F:
         """Copy a function as `inlined` does, but not before LLVM: what is copied is not typed again.
@@ -83,13 +236,14 @@ class Compiling:
         For functions that other functions of this kind call, and that take many arrays: a call hands on each
         array as a dozen numbers.
         """
-        return self._compile(function, forceinline=True)
+        return self._part(function, forceinline=True)
 
-    def _compile(self, function: _F, **options: Any) -> _F:
-        if not self.counts_references:
-            options["_nrt"] = False
-        compiling = numba.njit(nogil=True, error_model="numpy", fastmath={"contract"}, **options)
-        return cast(_F, compiling(function))
+    def _part(self, function: _F, **more: Any) -> _F:
+        return function if _is_off() else cast(_F, _CallablePart(function, self._options(**more)))
+
+    def _options(self, **more: Any) -> dict[str, Any]:
+        counting = {} if self.counts_references else {"_nrt": False}
+        return {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}} | counting | more
 
 
 _counted = Compiling()
@@ -97,12 +251,22 @@ entry, part, inlined = _counted.entry, _counted.part, _counted.inlined
 uncounted = Compiling(counts_references=False)
 
 
+def chosen(choose: Callable[[_F], Callable[..., Any]]) -> Callable[[_F], _F]:
+    """Decorate a part whose form in compiled functions `choose` returns, given the function in plain Python.
+
+    It is asked when a function that calls the part is compiled.
+    """
+
+    def decorate(function: _F) -> _F:
+        part = _CallablePart(function, _counted._options(), choose)
+        return function if _is_off() else cast(_F, part)
+
+    return decorate
+
+
 def is_on_disk(function: Callable[..., Any]) -> bool:
     """Whether an entry point was compiled before, from the present sources: its first call then is quick.
 
     True where compilation is switched off (NUMBA_DISABLE_JIT).
     """
-    if not hasattr(function, "stats"):
-        return True
-    kept = cast(Any, function)._cache
-    return isinstance(kept, KeptCode) and kept.is_there
+    return not isinstance(function, Entry) or function.is_on_disk

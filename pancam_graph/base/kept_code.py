@@ -1,126 +1,182 @@
 """Where compiled code is kept on disk, and that trouble there is no trouble elsewhere.
 
-Numba keeps code beside the source, or in the user's folder of caches. In a container neither may be writable:
-then it goes into a folder of the user's among the temporary ones, or is not kept. Files that are empty, cut
-off, changed or of something else are made anew. Numba itself fails in both cases, at every start.
+Code lies beside the source, in the user's folder of caches, or in NUMBA_CACHE_DIR. In a container neither of
+the first two may be writable: then it goes into a folder of the user's among the temporary ones, or is not
+kept.
+Files that are empty, cut off, changed or of something else are made anew: each begins with a digest of the
+rest, and says for which function, arguments, sources, processor and versions it was made.
 """
 
+import json
 import logging
 import os
-import pickle
+import secrets
 import stat
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
 
-import numba
-import numba.core.caching
+from pancam_graph.base.native_code import NativeCode, environment
 
-__all__ = ["KeptCode", "kept_code"]
+__all__ = ["KeptCode"]
 
-_NUMBA: Any = numba
 _LOG = logging.getLogger(__name__)
 _DIGEST = 32
-"""Bytes of a digest, with which a file of code begins."""
+"""Bytes of a digest, with which a file begins; then come the label's length, the label, and the objects."""
+_ENDING = ".native"
 
 
-class _CheckedFiles(_NUMBA.core.caching.IndexDataCacheFile):  # type: ignore[misc]  # Numba has no types
-    """The index and the files of code of a function, each whole or as if it were not there."""
+@dataclass(frozen=True, kw_only=True)
+class KeptCode:
+    """The code of an entry point on disk; what cannot be read or written there is compiled anew."""
 
-    def __init__(self, **place: Any) -> None:
-        super().__init__(**place)
-        self._version = f"{numba.__version__} checked"  # an index of Numba's own is one of another version
-
-    def save(self, key: Any, data: Any) -> None:
-        """Keep code with its key: two processes at once may give two keys one file."""
-        super().save(key, (key, data))
-
-    def load(self, key: Any) -> Any:
-        """The code of a key; None where there is none, or none that is whole."""
-        try:
-            kept_key, data = super().load(key) or (key, None)
-        except Exception as error:  # whatever unpickling makes of other bytes
-            _say_damaged(self._cache_path, self._index_name, error)
-            return None
-        return data if kept_key == key else None
-
-    def _load_index(self) -> dict[Any, str]:
-        try:
-            return dict(super()._load_index())
-        except Exception as error:  # as above
-            _say_damaged(self._cache_path, self._index_name, error)
-            return {}
-
-    def _load_data(self, name: str) -> Any:
-        content = Path(self._data_path(name)).read_bytes()
-        if sha256(content[_DIGEST:]).digest() != content[:_DIGEST]:
-            raise ValueError(f"{name} is not whole")
-        return pickle.loads(content[_DIGEST:])
-
-    def _save_data(self, name: str, data: Any) -> None:
-        content = self._dump(data)
-        with self._open_for_write(self._data_path(name)) as file:
-            file.write(sha256(content).digest() + content)
-
-
-class KeptCode(_NUMBA.core.caching.FunctionCache):  # type: ignore[misc]  # as above
-    """The code of a function on disk; what cannot be read or written there is compiled anew."""
-
-    def __init__(self, function: Callable[..., Any]) -> None:
-        """Raises RuntimeError where no folder can be written to."""
-        super().__init__(function)
-        self._cache_file = _CheckedFiles(
-            cache_path=self._cache_path,
-            filename_base=self._impl.filename_base,
-            source_stamp=self._impl.locator.get_source_stamp(),
-        )
+    folder: Path
+    """Folder of its source."""
+    name: str
+    """Module and qualified name."""
+    sources: Callable[[], str]
+    """Returns the digest of the sources that it depends on."""
 
     @property
     def is_there(self) -> bool:
-        """Whether any code of the function's present source is on disk."""
-        return bool(self._cache_file._load_index())
+        """Whether any code of the present sources is on disk, for this processor and these versions."""
+        for folder in _folders(self.folder):
+            with suppress(OSError):
+                if any(self._read(p, None) is not None for p in folder.glob(f"{self._begin}-*{_ENDING}")):
+                    return True
+        return False
 
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """The code for types of arguments; None where there is none."""
+    def found(self, kinds: str) -> Iterator[NativeCode]:
+        """The code for types of arguments, in each folder that has it whole."""
+        for folder in _folders(self.folder):
+            code = self._read(folder / self._file(kinds), kinds)
+            if code is not None:
+                yield code
+
+    def keep(self, kinds: str, code: NativeCode) -> None:
+        """Keep code for types of arguments, in the first folder that takes it."""
+        label = json.dumps(
+            {
+                **self._what(kinds),
+                "outside": code.outside,
+                "returns": code.returns,
+                "sizes": [len(content) for content in code.objects],
+            }
+        ).encode()
+        content = b"".join((len(label).to_bytes(4), label, *code.objects))
+        content = sha256(content).digest() + content
+        folder = _place(self.folder)
+        if folder is None:
+            return
         try:
-            return super().load_overload(sig, target_context)
-        except Exception as error:  # code that this process cannot link
-            _say_damaged(self._cache_path, self._name, error)
+            _write(folder, self._file(kinds), content)
+        except OSError as error:
+            _LOG.debug("%s: %s", self.name, error)
+            _say_lost(f"cannot be written to {folder}")
+
+    def say_damaged(self, error: Exception) -> None:
+        """Say, once for all functions, that code on disk cannot be used."""
+        _say_damaged(self.folder, self.name, error)
+
+    def say_lost(self, why: str) -> None:
+        """Say, once for all functions, that code is not kept."""
+        _say_lost(why)
+
+    @property
+    def _begin(self) -> str:
+        return f"{self.name}-{self.sources()}"
+
+    def _file(self, kinds: str) -> str:
+        return f"{self._begin}-{sha256(f'{kinds} {environment()}'.encode()).hexdigest()[:16]}{_ENDING}"
+
+    def _what(self, kinds: str) -> dict[str, str]:
+        """What tells this code from all other."""
+        return {
+            "name": self.name,
+            "sources": self.sources(),
+            "environment": environment(),
+            "kinds": kinds,
+        }
+
+    def _read(self, path: Path, kinds: str | None) -> NativeCode | None:
+        """The code in a file, for types of arguments or for any; None where there is none, or not this."""
+        try:
+            content = path.read_bytes()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            _say_damaged(path.parent, path.name, error)
+            return None
+        try:
+            return self._taken(content, kinds)
+        except (ValueError, TypeError, KeyError, AttributeError) as error:  # a label of something else
+            _say_damaged(path.parent, path.name, error)
             return None
 
-    def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep the code for types of arguments, if there is room."""
-        try:
-            super().save_overload(sig, data)
-        except OSError as error:
-            _LOG.debug("%s: %s", self._name, error)
-            _say_lost(f"cannot be written to {self._cache_path}")
+    def _taken(self, content: bytes, kinds: str | None) -> NativeCode | None:
+        """As `_read`. Raises ValueError for content that is not whole."""
+        rest = memoryview(content)[_DIGEST:]
+        if len(rest) < 4 or sha256(rest).digest() != content[:_DIGEST]:
+            raise ValueError("is not whole")
+        length = int.from_bytes(rest[:4])
+        label = json.loads(bytes(rest[4 : 4 + length]))
+        if any(label.get(k) != v for k, v in self._what(kinds or label.get("kinds")).items()):
+            return None
+        objects, begin = list[bytes](), 4 + length
+        for size in label["sizes"]:
+            objects.append(bytes(rest[begin : begin + size]))
+            begin += size
+        return NativeCode(objects=tuple(objects), outside=tuple(label["outside"]), returns=label["returns"])
 
 
-def kept_code(function: Callable[..., Any]) -> KeptCode | None:
-    """Where the code of a function is kept; None where no folder can be written to."""
+def _write(folder: Path, name: str, content: bytes) -> None:
+    """Write a file whole, or raise OSError; several processes may write it at once."""
+    folder.mkdir(parents=True, exist_ok=True)
+    partial = folder / f"{name}.{secrets.token_hex(4)}"
     try:
-        return KeptCode(function)
-    except RuntimeError:
-        folder = _temporary_folder()
-    if folder is None:
-        return None
-    before, _NUMBA.config.CACHE_DIR = _NUMBA.config.CACHE_DIR, str(folder)
+        partial.write_bytes(content)
+        partial.replace(folder / name)
+    except OSError:
+        with suppress(OSError):
+            partial.unlink()
+        raise
+
+
+def _folders(source: Path) -> list[Path]:
+    """Where code of a folder of sources may lie, the best place first."""
+    folders, place = _usual(source), _place(source)
+    return folders if place is None or place in folders else [*folders, place]
+
+
+def _usual(source: Path) -> list[Path]:
+    named, caches = os.environ.get("NUMBA_CACHE_DIR", ""), os.environ.get("XDG_CACHE_HOME", "")
+    if named:
+        return [Path(named)]
     try:
-        return KeptCode(function)
-    except RuntimeError:
-        _say_lost(f"cannot be written to {folder}")
-        return None
-    finally:
-        _NUMBA.config.CACHE_DIR = before
+        home = Path(caches) if caches else Path.home() / ".cache"
+    except RuntimeError:  # a user without a home
+        return [source / "__pycache__"]
+    return [source / "__pycache__", home / "pancam-graph" / "compiled"]
+
+
+def _place(source: Path) -> Path | None:
+    """Where code of a folder of sources is written; None where no folder can be written to."""
+    return next((f for f in _usual(source) if _is_writable(f)), None) or _temporary_folder()
+
+
+def _is_writable(folder: Path) -> bool:
+    """Whether a folder, or the first one above it that there is, can be written to."""
+    there = next((f for f in (folder, *folder.parents) if f.exists()), folder)
+    return there.is_dir() and os.access(there, os.W_OK | os.X_OK)
 
 
 @cache
 def _temporary_folder() -> Path | None:
-    """A folder that nobody else can write to, for what is unpickled from there is run; None without one."""
+    """A folder that nobody else can write to, for the code in it is run; None without one."""
     try:
         folder = Path(tempfile.gettempdir()) / f"pancam-graph-{os.getuid()}"
         folder.mkdir(mode=0o700, exist_ok=True)
@@ -140,11 +196,11 @@ def _say_lost(why: str) -> None:
     _LOG.warning("compiled code %s: every run compiles anew; NUMBA_CACHE_DIR names another folder", why)
 
 
-def _say_damaged(folder: str, name: str, error: Exception) -> None:
+def _say_damaged(folder: Path, name: str, error: Exception) -> None:
     _say_folder_damaged(folder)
     _LOG.debug("%s: %s: %s", name, type(error).__name__, error)
 
 
 @cache
-def _say_folder_damaged(folder: str) -> None:
+def _say_folder_damaged(folder: Path) -> None:
     _LOG.warning("%s: compiled code that cannot be read is made anew", folder)

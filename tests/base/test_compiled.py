@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pancam_graph.base.compiled import folder_digest
+from pancam_graph.base.compiled import Entry, folder_digest
 from pancam_graph.cameras import LENS_SOURCES
 from pancam_graph.landmarks import kernel
 
@@ -30,7 +30,7 @@ PROGRAM = """
 from loops.caller import is_on_disk, plus_one
 
 before = is_on_disk(plus_one)
-print(before, plus_one(10.0), sum(plus_one.stats.cache_hits.values()), is_on_disk(plus_one))
+print(before, plus_one(10.0), plus_one.n_found, is_on_disk(plus_one))
 """
 
 
@@ -76,8 +76,8 @@ def test_nothing_must_be_compiled_where_compilation_is_off(monkeypatch: pytest.M
 @pytest.mark.skipif(bool(os.environ.get("NUMBA_DISABLE_JIT")), reason="nothing is compiled")
 def test_loops_on_disk_are_named_after_the_sources_of_lenses_too() -> None:
     """An edit of a lens, whose distortion they call, makes them stale."""
-    entries = [f for f in vars(kernel).values() if hasattr(f, "py_func")]
+    entries = [f for f in vars(kernel).values() if isinstance(f, Entry)]
     assert len(entries) > 10
     digest = folder_digest(LENS_SOURCES)
     assert (LENS_SOURCES / "_cahvore.py").exists()
-    assert all(digest in entry.py_func.__qualname__ for entry in entries)
+    assert all(digest in entry.sources for entry in entries)

@@ -151,7 +151,7 @@ def test_help_loads_no_library(words: list[str]) -> None:
     assert {m.split(".")[1] for m in loaded if m.startswith("pancam_graph.")} == {"base", "cli"}
 
 
-KERNEL = {"gtsam", "llvmlite", "numba", "numpy", "scipy"}
+KERNEL = {"gtsam", "numpy", "scipy"}
 """What the adjustment cannot do without; of SciPy only its top, whose parts load when they are called."""
 
 

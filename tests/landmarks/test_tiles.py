@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 from numba.extending import intrinsic
 
+from pancam_graph.base.compiled import entry
 from pancam_graph.base.geometry import FloatArray, IntArray
-from pancam_graph.landmarks.kernel import _tiles
-from pancam_graph.landmarks.kernel._tiles import row_subtraction, subtract_row, subtract_row_in_vectors
+from pancam_graph.landmarks.kernel import _vectors
+from pancam_graph.landmarks.kernel._tiles import subtract_row
+from pancam_graph.landmarks.kernel._vectors import row_subtraction, subtract_row_in_vectors
 
 PAIRS = pytest.mark.parametrize("pairs", [(0, 1, 2), (1, 4), (3,)])
 N_PAIRS = 5
+PLAIN: Any = getattr(subtract_row, "plain", subtract_row)  # itself where nothing is compiled
 
 
 def subtracted(
@@ -31,6 +34,7 @@ def subtracted(
 def test_all_forms_of_the_innermost_loop_subtract_products(pairs: tuple[int, ...]) -> None:
     """Plain Python, the plain form compiled, and what the elimination calls, which is in vectors."""
 
+    @entry
     def as_called(
         tiles: FloatArray, row: int, arms: FloatArray, first: int, last: int, pair: IntArray
     ) -> None:
@@ -43,14 +47,14 @@ def test_all_forms_of_the_innermost_loop_subtract_products(pairs: tuple[int, ...
         for q in range(p, len(pairs)):
             S[pairs[p], pairs[q]] -= arms_of[p].T @ arms_of[q]
     compiled: Any = numba.njit  # its types know only functions of nothing
-    for form in (subtract_row, compiled(subtract_row), compiled(as_called)):
+    for form in (PLAIN, compiled(PLAIN), as_called):
         assert subtracted(form, pairs, tiles, arms) == pytest.approx(S.ravel(), abs=1e-14)
 
 
 @pytest.mark.skipif(bool(os.environ.get("NUMBA_DISABLE_JIT")), reason="nothing is compiled")
 def test_vectors_are_used_unless_they_do_not_compile_or_are_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
     choose: Any = row_subtraction.__wrapped__  # not the choice that was made before
-    assert choose() is subtract_row_in_vectors
+    assert choose(PLAIN) is subtract_row_in_vectors
 
     def raises(typing: Any, *types: Any) -> Any:
         raise AttributeError("no VectorType")
@@ -59,5 +63,5 @@ def test_vectors_are_used_unless_they_do_not_compile_or_are_wrong(monkeypatch: p
         return numba.types.void(*types), lambda context, *_: context.get_dummy_value()
 
     for other in (raises, does_nothing):
-        monkeypatch.setattr(_tiles, "subtract_in_vectors", intrinsic(other))
-        assert choose() is subtract_row
+        monkeypatch.setattr(_vectors, "subtract_in_vectors", intrinsic(other))
+        assert choose(PLAIN) is PLAIN
