@@ -16,7 +16,14 @@ import numpy as np
 from llvmlite import ir
 from numba.core.runtime import nrtdynmod
 
-from pancam_graph.base.native_code import ARRAY_HEAD, NativeCode, NotNativeError
+from pancam_graph.base.native_code import (
+    ALIGNED,
+    ARRAY_FIELDS,
+    C_ORDER,
+    OTHER_ARRAYS,
+    NativeCode,
+    NotNativeError,
+)
 from pancam_graph.base.parts import Part
 
 __all__ = ["dispatcher", "native_code"]
@@ -144,12 +151,14 @@ def _call(made: Any, kinds: tuple[Any, ...], outside: set[str]) -> tuple[bytes, 
     loop = ir.Function(module, context.call_conv.get_function_type(result, kinds), made.fndesc.llvm_func_name)
     call = ir.Function(
         module,
-        ir.FunctionType(_INT, [_WORD.as_pointer(), _NUMBER.as_pointer(), _WORD.as_pointer()]),
+        ir.FunctionType(_INT, [a.as_pointer() for a in (_WORD, _NUMBER, _WORD, _WORD)]),
         "call",
     )
     builder = ir.IRBuilder(call.append_basic_block())
     returned, failed, *places = loop.args
-    values = list(_Unpacking(builder, call.args[0], call.args[1]).values(kinds))
+    unpacking = _Unpacking(builder, call.args[0], call.args[1])
+    unpacking.check(kinds, call.args[3])
+    values = list(unpacking.values(kinds))
     if len(values) != len(places):
         raise NotNativeError("Numba hands on arrays in another way")
     out = builder.alloca(returned.type.pointee)
@@ -181,6 +190,32 @@ class _Unpacking:
         self._builder, self._words, self._numbers = builder, words, numbers
         self._n_words = self._n_numbers = 0
 
+    def check(self, kinds: Any, expected: Any) -> None:
+        """Return from `call` if arrays are not of some types, unless `expected` is no address.
+
+        That is the address of those of their numbers' types (NumPy's objects).
+        """
+        builder, wrong = self._builder, ir.Constant(ir.IntType(1), 0)
+        with builder.if_then(builder.icmp_unsigned("!=", expected, ir.Constant(expected.type, None))):
+            for number, (place, kind) in enumerate(_arrays(kinds)):
+                address = builder.load(builder.gep(self._words, [_WORD(place)]))
+                dtype = builder.load(builder.gep(expected, [_WORD(number)]))
+                flags = self._field(address, "flags", _INT)
+                bits = _INT(ALIGNED | (C_ORDER if kind.layout == "C" else 0))
+                for is_wrong in (
+                    builder.icmp_unsigned("!=", self._field(address, "dtype", _WORD), dtype),
+                    builder.icmp_unsigned("!=", self._field(address, "ndim", _INT), _INT(kind.ndim)),
+                    builder.icmp_unsigned("!=", builder.and_(flags, bits), bits),
+                ):
+                    wrong = builder.or_(wrong, is_wrong)
+            with builder.if_then(wrong):
+                builder.ret(_INT(OTHER_ARRAYS))
+
+    def _field(self, address: Any, name: str, kind: Any) -> Any:
+        """A field of an array, by the address of its object."""
+        place = self._builder.add(address, _WORD(ARRAY_FIELDS[name]))
+        return self._builder.load(self._builder.inttoptr(place, kind.as_pointer()))
+
     def values(self, kinds: Any) -> Iterator[Any]:
         """The values of arguments of some types, in order."""
         for kind in kinds:
@@ -203,18 +238,33 @@ class _Unpacking:
     def _array(self, address: Any, kind: Any) -> Iterator[Any]:
         """Owner and Python object (none), entries, bytes of one, address, shape, strides."""
         builder = self._builder
-        fields = builder.inttoptr(builder.add(address, _WORD(ARRAY_HEAD)), _WORD.as_pointer())
 
-        def column(field: int) -> list[Any]:
-            first = builder.inttoptr(builder.load(builder.gep(fields, [_WORD(field)])), _WORD.as_pointer())
+        def column(name: str) -> list[Any]:
+            first = builder.inttoptr(self._field(address, name, _WORD), _WORD.as_pointer())
             return [builder.load(builder.gep(first, [_WORD(k)])) for k in range(kind.ndim)]
 
-        shape, strides = column(2), column(3)
+        shape, strides = column("shape"), column("strides")
         entries = _WORD(1)
         for extent in shape:
             entries = builder.mul(entries, extent)
         size = np.dtype(str(kind.dtype) if kind.dtype is not types.boolean else "?").itemsize
-        yield from (_WORD(0), _WORD(0), entries, _WORD(size), builder.load(fields), *shape, *strides)
+        data = self._field(address, "data", _WORD)
+        yield from (_WORD(0), _WORD(0), entries, _WORD(size), data, *shape, *strides)
+
+
+def _arrays(kinds: Any) -> list[tuple[int, Any]]:
+    """The types of all arrays among arguments of some types, each with its place among the words."""
+    out, n_words, waiting = list[tuple[int, Any]](), 0, list(kinds)[::-1]
+    while waiting:
+        kind = waiting.pop()
+        if isinstance(kind, types.BaseTuple):
+            waiting += list(kind.types)[::-1]
+        elif isinstance(kind, types.Array):
+            out.append((n_words, kind))
+            n_words += 1
+        else:
+            n_words += not isinstance(kind, types.Float)
+    return out
 
 
 def _fitted(builder: Any, value: Any, kind: Any) -> Any:

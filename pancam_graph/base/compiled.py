@@ -15,7 +15,8 @@ counting, the caller must keep all arrays alive.
 """
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, partial, update_wrapper
 from hashlib import sha256
@@ -26,7 +27,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from pancam_graph.base.kept_code import KeptCode
-from pancam_graph.base.native_code import NativeCode, NativeFunction, NotNativeError
+from pancam_graph.base.native_code import NativeCode, NativeFunction, NotNativeError, OtherArraysError
 from pancam_graph.base.parts import Part
 
 __all__ = [
@@ -93,6 +94,9 @@ class Entry:
             sources=partial(_digests, tuple(folders)),
         )
         self._linked = dict[tuple[Any, ...], NativeFunction]()
+        """Code by what it is compiled for."""
+        self._last = dict[tuple[Any, ...], NativeFunction]()
+        """The code that was called last for arguments of some classes."""
         self._dispatcher: Any = None
         """Numba's, where its code cannot be called without it."""
         self.n_found = 0
@@ -105,11 +109,18 @@ class Entry:
         """
         if self._dispatcher is not None:
             return self._dispatcher(*arguments)
-        kinds, words, numbers = list[Any](), list[int](), list[float]()
-        _flatten(arguments, kinds, words, numbers)
-        key = tuple(kinds)
-        native = self._linked.get(key) or self._ready(key, arguments)
-        return native(words, numbers) if native is not None else self(*arguments)
+        classes, words, numbers = list[Any](), list[int](), list[float]()
+        _spread(arguments, classes, words, numbers)
+        guess = tuple(classes)
+        native = self._last.get(guess)
+        if native is not None:
+            with suppress(OtherArraysError):
+                return native(words, numbers)
+        native = self._ready(arguments)
+        if native is None:
+            return self(*arguments)
+        self._last[guess] = native
+        return native(words, numbers, checked=True)
 
     @property
     def sources(self) -> str:
@@ -121,15 +132,16 @@ class Entry:
         """Whether code of the present sources is on disk, for any types of arguments."""
         return self._kept.is_there
 
-    def _ready(self, key: tuple[Any, ...], arguments: tuple[Any, ...]) -> NativeFunction | None:
-        """The code for some types of arguments; None where only Numba's dispatcher can call it."""
+    def _ready(self, arguments: tuple[Any, ...]) -> NativeFunction | None:
+        """The code for the types of some arguments; None where only Numba's dispatcher can call it."""
+        key = tuple(_kinds(arguments))
         with _LOCK:
             if key in self._linked or self._dispatcher is not None:
                 return self._linked.get(key)
             name = " ".join(map(_word, key))
             for code in self._kept.found(name):
                 try:
-                    self._linked[key] = code.linked()
+                    self._linked[key] = code.linked(_dtypes(key))
                 except NotNativeError as error:
                     self._kept.say_damaged(error)
                 else:
@@ -142,7 +154,7 @@ class Entry:
 
         try:
             code: NativeCode = by_numba.native_code(self._function, self._options, arguments)
-            linked = code.linked()
+            linked = code.linked(_dtypes(key))
         except NotNativeError as error:
             self._kept.say_lost(f"cannot be called without Numba ({error})")
             self._dispatcher = by_numba.dispatcher(self._function, self._options, for_python=True)
@@ -170,33 +182,47 @@ def _word(kind: Any) -> str:
     return kind.__qualname__ if isinstance(kind, type) else str(kind)
 
 
-def _flatten(values: Sequence[Any], kinds: list[Any], words: list[int], numbers: list[float]) -> None:
-    """Append what code is compiled for to `kinds`, arrays and whole numbers to `words`, others to `numbers`.
-
-    An array is handed on as the address of its object.
-    """
+def _spread(values: Sequence[Any], classes: list[Any], words: list[int], numbers: list[float]) -> None:
+    """Append the classes of values, and the values themselves: of arrays the addresses of their objects."""
     for value in values:
-        if isinstance(value, np.ndarray):
-            flags = value.flags
-            plain = flags.carray or (flags.c_contiguous and flags.aligned)
-            if not plain and not flags.aligned:
-                raise TypeError("compiled functions take aligned arrays")
-            kinds += (value.dtype, value.ndim, "C" if plain else "A")
+        own = type(value)
+        classes.append(own)
+        if own is np.ndarray:
             words.append(id(value))
+        elif own is int:
+            words.append(value)
+        elif own is float:
+            numbers.append(value)
         elif isinstance(value, tuple):
-            kinds += (type(value), len(value))
-            _flatten(value, kinds, words, numbers)
-        elif isinstance(value, (bool, np.bool_)):
-            kinds.append("bool")
-            words.append(bool(value))
-        elif isinstance(value, (int, np.integer)):
-            kinds.append("int")
+            classes.append(len(value))
+            _spread(value, classes, words, numbers)
+        elif isinstance(value, np.ndarray):
+            words.append(id(value))
+        elif isinstance(value, (bool, np.bool_, int, np.integer)):
             words.append(int(value))
         elif isinstance(value, (float, np.floating)):
-            kinds.append("float")
             numbers.append(float(value))
         else:
-            raise TypeError(f"compiled functions take arrays, numbers and tuples of them, not {type(value)}")
+            raise TypeError(f"compiled functions take arrays, numbers and tuples of these, not {own}")
+
+
+def _kinds(values: Sequence[Any]) -> Iterator[Any]:
+    """What code is compiled for: of an array its numbers' type, dimensions and order."""
+    for value in values:
+        if isinstance(value, np.ndarray):
+            if not value.flags.aligned:
+                raise TypeError("compiled functions take aligned arrays")
+            yield from (value.dtype, value.ndim, "C" if value.flags.c_contiguous else "A")
+        elif isinstance(value, tuple):
+            yield from (type(value), len(value), *_kinds(value))
+        elif isinstance(value, (bool, np.bool_)):
+            yield "bool"
+        else:
+            yield "int" if isinstance(value, (int, np.integer)) else "float"
+
+
+def _dtypes(key: tuple[Any, ...]) -> tuple[np.dtype[Any], ...]:
+    return tuple(kind for kind in key if isinstance(kind, np.dtype))
 
 
 @dataclass(frozen=True)

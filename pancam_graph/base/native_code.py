@@ -2,7 +2,8 @@
 
 The code of an entry point is two objects: its loop, as Numba compiles it, and a `call` that LLVM makes of the
 way Numba hands on arguments. `call` takes the addresses of arrays as Python objects and reads where their
-numbers are and how they lie from the head of NumPy's C struct; the layout is tried once in each process.
+numbers are and how they lie from NumPy's C struct; the layout of that is tried once in each process. It also
+sees whether the arrays are of the kinds that the code is for, in a tenth of the time that Python takes.
 llvmlite alone links the objects; ctypes calls them, outside the interpreter's lock.
 """
 
@@ -19,11 +20,27 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["ARRAY_HEAD", "NativeCode", "NativeFunction", "NotNativeError", "environment"]
+__all__ = [
+    "ALIGNED",
+    "ARRAY_FIELDS",
+    "C_ORDER",
+    "OTHER_ARRAYS",
+    "NativeCode",
+    "NativeFunction",
+    "NotNativeError",
+    "OtherArraysError",
+    "environment",
+]
 
-ARRAY_HEAD = object.__basicsize__
-"""Bytes in an array's object before its C struct: address of the numbers, an int, then addresses of its shape
-and its strides (`PyArrayObject_fields`)."""
+ARRAY_FIELDS = {
+    field: object.__basicsize__ + 8 * word
+    for word, field in enumerate(("data", "ndim", "shape", "strides", "base", "dtype", "flags"))
+}
+"""Bytes of an array's object before each field of its C struct (`PyArrayObject_fields`)."""
+C_ORDER, ALIGNED = 0x1, 0x100
+"""Bits of its flags."""
+OTHER_ARRAYS = -1000
+"""What `call` returns for arrays of other kinds; Numba has no status of this number."""
 _LOOPS = ("compiled.py", "by_numba.py", "native_code.py")
 """Files of this folder that decide what code is like."""
 _ENGINES = list[Any]()
@@ -32,6 +49,10 @@ _ENGINES = list[Any]()
 
 class NotNativeError(Exception):
     """Why code cannot be called without Numba."""
+
+
+class OtherArraysError(Exception):
+    """The code was called with arrays of other kinds than those that it was compiled for."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,8 +66,8 @@ class NativeCode:
     returns: str
     """"none", "int" or "float"."""
 
-    def linked(self) -> "NativeFunction":
-        """Bring the code into memory.
+    def linked(self, dtypes: Sequence[np.dtype[Any]]) -> "NativeFunction":
+        """Bring the code, for arrays of some types of numbers, into memory.
 
         Raises NotNativeError where something that it needs is not there.
         """
@@ -68,28 +89,41 @@ class NativeCode:
         if not address:
             raise NotNativeError("it has no function to call")
         _ENGINES.append(engine)
-        return NativeFunction(address, self.returns)
+        return NativeFunction(address, self.returns, dtypes)
 
 
 class NativeFunction:
     """Linked code of an entry point."""
 
-    def __init__(self, address: int, returns: str) -> None:
+    def __init__(self, address: int, returns: str, dtypes: Sequence[np.dtype[Any]]) -> None:
         self._function = _CALL(address)
         self._returns = returns
+        self._dtypes = tuple(dtypes)  # keeps their addresses
+        self._expected = _words(len(dtypes))(*map(id, dtypes))
 
-    def __call__(self, words: Sequence[int], numbers: Sequence[float]) -> int | float | None:
+    def __call__(
+        self, words: Sequence[int], numbers: Sequence[float], *, checked: bool = False
+    ) -> int | float | None:
         """Call it with addresses of arrays and whole numbers, and with other numbers, in order.
 
-        Raises RuntimeError where it ends with Numba's sign of an exception: it found no memory.
+        Raises OtherArraysError, unless the arrays were `checked`, and RuntimeError where the code ends with
+        Numba's sign of an exception: it found no memory.
         """
         result = ctypes.c_double() if self._returns == "float" else ctypes.c_int64()
-        if self._function(_words(len(words))(*words), _numbers(len(numbers))(*numbers), ctypes.byref(result)):
+        status = self._function(
+            _words(len(words))(*words),
+            _numbers(len(numbers))(*numbers),
+            ctypes.byref(result),
+            None if checked else self._expected,
+        )
+        if status == OTHER_ARRAYS:
+            raise OtherArraysError
+        if status:
             raise RuntimeError("compiled code failed, probably for want of memory")
         return None if self._returns == "none" else result.value
 
 
-_CALL = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)
+_CALL = ctypes.CFUNCTYPE(ctypes.c_int32, *[ctypes.c_void_p] * 4)
 
 
 @cache
@@ -151,12 +185,15 @@ def _address(name: str) -> int:
 @cache
 def _try_arrays() -> None:
     """Raise NotNativeError where an array's object is not laid out as `call` reads it."""
-    trial = np.empty((3, 4))[:, ::2]
-    word = ctypes.sizeof(ctypes.c_void_p)
-    fields = (ctypes.c_int64 * 5).from_address(id(trial) + ARRAY_HEAD)
-    if word != 8 or sys.implementation.name != "cpython" or trial.ctypes.data != fields[0]:
-        raise NotNativeError("arrays of this NumPy are laid out in another way")
-    shape = (ctypes.c_int64 * 2).from_address(fields[2])
-    strides = (ctypes.c_int64 * 2).from_address(fields[3])
-    if tuple(shape) != trial.shape or tuple(strides) != trial.strides:
-        raise NotNativeError("arrays of this NumPy are laid out in another way")
+    for trial in (np.empty((3, 4))[:, ::2], np.zeros((2, 5), dtype=np.int64)):
+        if ctypes.sizeof(ctypes.c_void_p) != 8 or sys.implementation.name != "cpython":
+            raise NotNativeError("objects of this Python are laid out in another way")
+        head = (ctypes.c_int64 * 7).from_address(id(trial) + ARRAY_FIELDS["data"])
+        data, ndim, shape, strides, _, dtype, flags = head
+        found = (data, ndim & 0xFFFFFFFF, dtype, bool(flags & C_ORDER), bool(flags & ALIGNED))
+        own = trial.flags
+        if found != (trial.ctypes.data, 2, id(trial.dtype), own.c_contiguous, own.aligned):
+            raise NotNativeError("arrays of this NumPy are laid out in another way")
+        extents = tuple((ctypes.c_int64 * 2).from_address(shape))
+        if (extents, tuple((ctypes.c_int64 * 2).from_address(strides))) != (trial.shape, trial.strides):
+            raise NotNativeError("arrays of this NumPy are laid out in another way")
