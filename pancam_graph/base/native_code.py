@@ -43,6 +43,9 @@ OTHER_ARRAYS = -1000
 """What `call` returns for arrays of other kinds; Numba has no status of this number."""
 _LOOPS = ("compiled.py", "by_numba.py", "native_code.py")
 """Files of this folder that decide what code is like."""
+_WORD, _NUMBER = ctypes.c_int64, ctypes.c_double
+_RESULTS: dict[str, Any] = {"none": lambda: None, "int": _WORD * 1, "float": _NUMBER * 1}
+"""Where a result is written, by what is returned."""
 _ENGINES = list[Any]()
 """What owns the linked code: it stays to the end of the process."""
 
@@ -99,7 +102,7 @@ class NativeFunction:
         self._function = _CALL(address)
         self._returns = returns
         self._dtypes = tuple(dtypes)  # keeps their addresses
-        self._expected = _words(len(dtypes))(*map(id, dtypes))
+        self._expected = (_WORD * len(dtypes))(*map(id, dtypes))
 
     def __call__(
         self, words: Sequence[int], numbers: Sequence[float], *, checked: bool = False
@@ -109,31 +112,21 @@ class NativeFunction:
         Raises OtherArraysError, unless the arrays were `checked`, and RuntimeError where the code ends with
         Numba's sign of an exception: it found no memory.
         """
-        result = ctypes.c_double() if self._returns == "float" else ctypes.c_int64()
+        result = _RESULTS[self._returns]()
         status = self._function(
-            _words(len(words))(*words),
-            _numbers(len(numbers))(*numbers),
-            ctypes.byref(result),
+            (_WORD * len(words))(*words),
+            (_NUMBER * len(numbers))(*numbers),
+            result,
             None if checked else self._expected,
         )
         if status == OTHER_ARRAYS:
             raise OtherArraysError
         if status:
             raise RuntimeError("compiled code failed, probably for want of memory")
-        return None if self._returns == "none" else result.value
+        return None if result is None else result[0]
 
 
 _CALL = ctypes.CFUNCTYPE(ctypes.c_int32, *[ctypes.c_void_p] * 4)
-
-
-@cache
-def _words(n: int) -> Any:
-    return ctypes.c_int64 * n
-
-
-@cache
-def _numbers(n: int) -> Any:
-    return ctypes.c_double * n
 
 
 @cache
