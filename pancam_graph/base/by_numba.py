@@ -26,7 +26,7 @@ from pancam_graph.base.native_code import (
 )
 from pancam_graph.base.parts import Part
 
-__all__ = ["dispatcher", "native_code"]
+__all__ = ["dispatcher", "native_code", "part_dispatcher"]
 
 types: Any = numba.types  # without types of their own
 _WORD, _INT = ir.IntType(64), ir.IntType(32)
@@ -91,19 +91,20 @@ def _type(value: Any) -> Any:
 
 
 @cache
-def _of_part(part: Part) -> Any:
+def part_dispatcher(part: Part, *, for_python: bool = False) -> Any:
     """Numba's compiler of a part, the same for all functions that call it."""
-    return dispatcher(part.choose(part.plain), part.options, for_python=False)
+    return dispatcher(part.choose(part.plain), part.options, for_python=for_python)
 
 
 def _with_parts(function: Callable[..., Any]) -> Callable[..., Any]:
     """A function that refers to Numba's compilers of its parts, where it referred to the parts."""
     assert isinstance(function, FunctionType)
     names = set(_names(function.__code__))
-    parts = {n: _of_part(v) for n, v in function.__globals__.items() if n in names and isinstance(v, Part)}
+    known = {n: v for n, v in function.__globals__.items() if n in names and isinstance(v, Part)}
+    parts = {name: part_dispatcher(part) for name, part in known.items()}
     cells = function.__closure__ or ()
     replaced = tuple(
-        CellType(_of_part(cell.cell_contents)) if isinstance(cell.cell_contents, Part) else cell
+        CellType(part_dispatcher(cell.cell_contents)) if isinstance(cell.cell_contents, Part) else cell
         for cell in cells
     )
     if not parts and replaced == cells:

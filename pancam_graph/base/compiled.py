@@ -70,9 +70,9 @@ class _CallablePart(Part):
 
     def __call__(self, *arguments: Any) -> Any:
         """Call it from Python: it is compiled in every process."""
-        from pancam_graph.base.by_numba import dispatcher  # noqa: PLC0415  late: it imports Numba
+        from pancam_graph.base.by_numba import part_dispatcher  # noqa: PLC0415  late: it imports Numba
 
-        return dispatcher(self.choose(self.plain), self.options, for_python=True)(*arguments)
+        return part_dispatcher(self, for_python=True)(*arguments)
 
 
 class Entry:
@@ -121,6 +121,11 @@ class Entry:
             return self(*arguments)
         self._last[guess] = native
         return native(words, numbers, checked=True)
+
+    @property
+    def signatures(self) -> list[tuple[Any, ...]]:
+        """The types of arguments for which the code is in memory."""
+        return list(self._linked)
 
     @property
     def sources(self) -> str:

@@ -414,7 +414,7 @@ def test_loops_are_compiled_once_whatever_arrays_come() -> None:
     for one, two in zip(first, second, strict=True):
         # NumPy before 2.3 rounds products of matrices of another layout otherwise.
         np.testing.assert_allclose(two, one, rtol=1e-12, atol=1e-9)
-    compiled: list[Any] = [  # Numba's functions are typed as what they were made from
+    compiled: list[Any] = [  # typed as what they were made from
         kernel.triangulate,
         kernel.evaluate,
         kernel.refine,
