@@ -72,21 +72,30 @@ class _Misfit:
     def of(geometry: PairGeometry, b_T_a: Relative, lines: _Lines, inverse_depth: FloatArray) -> "_Misfit":
         uv, d_uv, seen = geometry.camera_b.project_with_jacobian(b_T_a.of(lines.points_m(inverse_depth)))
         d_point = lines.direction @ b_T_a.R.T / np.maximum(inverse_depth, 1 / FAR_M)[:, None] ** 2
-        slope = np.einsum("nij,nj->ni", d_uv, d_point)
+        slope = (d_uv @ d_point[:, :, None])[:, :, 0]
         return _Misfit(residual_px=lines.uv_b - uv, d_uv=d_uv, slope=slope, seen=seen)
 
-    def across(self, inverse_depth: FloatArray, nearest: float) -> FloatArray:
-        """Projection (n, 2, 2) onto the part of a residual that no change of depth can reduce.
+    def along(self, inverse_depth: FloatArray, nearest: float) -> FloatArray:
+        """Direction (n, 2), of length 1, in which a change of depth can reduce a residual; see `_across`.
 
-        That is the component across the epipolar line; both components where the inverse depth is at the
-        end of its range, 0 to `nearest`, or moves nothing (no baseline).
+        That is along the epipolar line; 0 where the inverse depth is at the end of its range, 0 to `nearest`,
+        or moves nothing (no baseline).
         """
-        length = np.linalg.norm(self.slope, axis=1)
-        downhill = np.einsum("ni,ni->n", self.slope, self.residual_px)
+        length = np.sqrt(_dot(self.slope, self.slope))
+        downhill = _dot(self.slope, self.residual_px)
         stuck = ((inverse_depth <= 0) & (downhill > 0)) | ((inverse_depth >= nearest) & (downhill < 0))
         stuck |= length * nearest < _MIN_PARALLAX_PX
-        unit = np.where(stuck[:, None], 0.0, self.slope / np.maximum(length, 1e-12)[:, None])
-        return np.asarray(np.eye(2) - unit[:, :, None] * unit[:, None, :])
+        return np.where(stuck[:, None], 0.0, self.slope / np.maximum(length, 1e-12)[:, None])
+
+
+def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.asarray(a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1])
+
+
+def _across(along: FloatArray, values: FloatArray) -> FloatArray:
+    """The part (n, 2, ...) of values of that shape across directions (n, 2)."""
+    along = along.reshape(along.shape + (1,) * (values.ndim - 2))
+    return np.asarray(values - along * (along[:, :1] * values[:, :1] + along[:, 1:] * values[:, 1:]))
 
 
 def fit_pair(
@@ -119,15 +128,18 @@ def fit_pair(
     for scale in [*shrinking, *[_FINEST_SCALE_PX] * _FINAL_STEPS]:
         b_T_a = geometry.b_T_a(prior @ q)
         inverse_depth, misfit = _refine_depths(geometry, b_T_a, lines, inverse_depth, nearest, _DEPTH_STEPS)
-        across = misfit.across(inverse_depth, nearest) / lines.noise[:, None, None]
-        r = np.einsum("nij,nj->ni", across, misfit.residual_px)
-        J = -across @ move_pixels(lines.points_m(inverse_depth), misfit.d_uv, d_b_T_a)
-        weight = (scale**2 / (scale**2 + np.sum(r * r, axis=1))) ** 2 / _NOISE_PX**2
+        along = misfit.along(inverse_depth, nearest)
+        r = _across(along, misfit.residual_px) / lines.noise[:, None]
+        moved = move_pixels(lines.points_m(inverse_depth), misfit.d_uv, d_b_T_a)
+        J = -_across(along, moved) / lines.noise[:, None, None]
+        weight = (scale**2 / (scale**2 + _dot(r, r))) ** 2 / _NOISE_PX**2
         # A correction of many degrees may turn points behind b, where derivatives are huge and mean nothing:
         # with them the prior is lost to rounding and the system singular.
         weight = np.where(misfit.seen, weight, 0.0)
-        information = np.eye(columns) + np.einsum("n,nik,nil->kl", weight, J, J)
-        gradient = q + np.einsum("n,nik,ni->k", weight, J, r)
+        rows = J.reshape(-1, columns)
+        weighted = (weight[:, None, None] * J).reshape(-1, columns).T
+        information = np.eye(columns) + weighted @ rows
+        gradient = q + weighted @ r.ravel()
         q = q - np.linalg.solve(information, gradient)
     return PairFit(p=prior @ q, root=prior @ np.linalg.inv(np.linalg.cholesky(information)).T)
 
@@ -146,8 +158,8 @@ def epipolar_px(
     b_T_a, nearest = geometry.b_T_a(p), 1 / options.min_depth_m
     inverse_depth = _nearest_candidate(geometry, b_T_a, lines, nearest)
     inverse_depth, misfit = _refine_depths(geometry, b_T_a, lines, inverse_depth, nearest, _FINAL_DEPTH_STEPS)
-    missed = np.einsum("nij,nj->ni", misfit.across(inverse_depth, nearest), misfit.residual_px)
-    return np.where(misfit.seen, np.linalg.norm(missed, axis=1) / lines.noise, np.inf), inverse_depth
+    missed = _across(misfit.along(inverse_depth, nearest), misfit.residual_px)
+    return np.where(misfit.seen, np.sqrt(_dot(missed, missed)) / lines.noise, np.inf), inverse_depth
 
 
 def _nearest_candidate(geometry: PairGeometry, b_T_a: Relative, lines: _Lines, nearest: float) -> FloatArray:
@@ -156,7 +168,8 @@ def _nearest_candidate(geometry: PairGeometry, b_T_a: Relative, lines: _Lines, n
     for candidate in np.linspace(0, 1, _DEPTH_CANDIDATES) ** 2 * nearest:
         trial = np.full(len(best), candidate)
         pixel, seen = geometry.transfer(lines.points_m(trial), b_T_a)
-        distance = np.where(seen, np.linalg.norm(lines.uv_b - pixel, axis=1), np.inf)
+        off = lines.uv_b - pixel
+        distance = np.where(seen, _dot(off, off), np.inf)
         better = distance < best_distance
         best[better], best_distance[better] = candidate, distance[better]
     return best
@@ -174,8 +187,8 @@ def _refine_depths(
     misfit = _Misfit.of(geometry, b_T_a, lines, inverse_depth)
     for _ in range(steps):
         slope = misfit.slope
-        length2 = np.maximum(np.einsum("ni,ni->n", slope, slope), 1e-12)
-        step = np.where(misfit.seen, -np.einsum("ni,ni->n", slope, misfit.residual_px) / length2, 0.0)
+        length2 = np.maximum(_dot(slope, slope), 1e-12)
+        step = np.where(misfit.seen, -_dot(slope, misfit.residual_px) / length2, 0.0)
         inverse_depth = np.clip(inverse_depth + np.clip(step, -nearest / 3, nearest / 3), 0.0, nearest)
         misfit = _Misfit.of(geometry, b_T_a, lines, inverse_depth)
     return inverse_depth, misfit
