@@ -1,5 +1,6 @@
 """Where a stop stands relative to another, from terrain points of the one and pixels of the other."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -31,6 +32,12 @@ _FINAL_STEPS = 6
 _AGREE_SIGMAS = 3.0
 _ROUNDS = 2
 _CONTRADICTED_SIGMAS = 3.0
+_WIDE_PX = 40.0
+"""Median half width of windows from which several starts are tried."""
+_START_WINDOW = 0.5
+"""Sigmas of telemetry about each start, as a share of its own."""
+_RINGS = ((0.0, 1), (3.5, 8))
+"""Rings of starts: radius in sigmas of telemetry, and how many stand on it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -119,12 +126,13 @@ def align_stops(
 
     Each point of a's terrain is looked for among the first sightings of b's, around where telemetry has it;
     what most of these matches say corrects the pose, and the search is repeated in the smaller windows. Where
-    they contradict telemetry, it is repeated with a telemetry that pulls less (see `believed`).
+    they contradict telemetry, it is repeated with a telemetry that pulls less (see `believed`). Where
+    telemetry leaves wide windows open, the search begins where most matches agree (see `_begun`).
     `feature_of` is the feature of each of the terrain's observations.
     """
     telemetry = telemetry_alignment(terrain, a, b)
-    prior = correction = telemetry
-    rounds = _ROUNDS
+    correction = _begun(terrain, features, feature_of, (a, b), telemetry, options)
+    prior, rounds = believed(telemetry, correction), _ROUNDS
     while rounds:
         rounds -= 1
         ties, half_width = _matched(terrain, features, feature_of, (a, b), correction, options)
@@ -141,6 +149,43 @@ def align_stops(
         if prior is telemetry and loosened is not telemetry:
             prior, rounds = loosened, _ROUNDS
     return correction
+
+
+def _begun(
+    terrain: StopTerrain,
+    features: list[Features],
+    feature_of: IntArray,
+    stops: tuple[int, int],
+    telemetry: Alignment,
+    options: FrontEndOptions,
+) -> Alignment:
+    """Where a search begins: telemetry, or of several starts about it the one that most matches agree with.
+
+    Far terrain agrees with every start, and in wide windows near terrain finds what looks like it: a fit from
+    one start may end metres off. Where windows are wide, each start has windows of half that width, and the
+    pose that its own matches say is the candidate. The starts stand in rings on level ground.
+    """
+    widths = [sought.radius_px[sought.usable] for sought in _windows(terrain, stops, telemetry, options)]
+    if np.median(np.concatenate([np.zeros(1), *widths])) < _WIDE_PX:
+        return telemetry
+    sigma_m = float(np.sqrt(np.diag(telemetry.covariance)[3:].max()))
+    up = telemetry.world_T_mast.rotation().matrix()[2]
+    east, north = np.linalg.svd(up[None])[2][1:]
+    best, most = telemetry, 0.0
+    for radius, number in _RINGS:
+        for angle in 2 * np.pi * np.arange(number) / number:
+            shift = radius * sigma_m * (np.cos(angle) * east + np.sin(angle) * north)
+            place = telemetry.world_T_mast.compose(gtsam.Pose3(gtsam.Rot3(), shift))
+            start = Alignment(world_T_mast=place, root=_START_WINDOW * telemetry.root)
+            ties, half_width = _matched(terrain, features, feature_of, stops, start, options)
+            if len(ties) < options.min_pair_matches:
+                continue
+            found = fit_pose(terrain, ties, start, start, float(np.median(half_width)))
+            agree = whitened_distance(terrain, ties, found.world_T_mast) < _AGREE_SIGMAS
+            surplus = float(np.sum(agree - np.minimum(1.0, (_AGREE_SIGMAS / half_width) ** 2)))
+            if surplus > most:
+                best, most = found, surplus
+    return best
 
 
 def believed(telemetry: Alignment, found: Alignment) -> Alignment:
@@ -163,38 +208,62 @@ def _matched(
     options: FrontEndOptions,
 ) -> tuple[Ties, FloatArray]:
     """Points of the first stop matched with first sightings of the second's; their windows' half widths."""
+    parts, widths = [], []
+    for sought in _windows(terrain, stops, at, options):
+        seen, radius = sought.seen, sought.radius_px
+        segments = Segments(
+            far_px=seen.uv_px,
+            near_px=seen.uv_px,
+            far_radius_px=radius,
+            near_radius_px=radius,
+            magnification=seen.zoom,
+            valid=sought.usable,
+        )
+        of_terrain = features[sought.own].select(feature_of[terrain.row[sought.rows]])
+        theirs = np.flatnonzero(terrain.image == sought.image)
+        other = features[sought.image].select(feature_of[terrain.row[theirs]])
+        matches = match_in_windows(of_terrain, other, segments, options)
+        parts.append(
+            Ties(
+                row=sought.rows[matches.a],
+                image=np.full(len(matches), sought.image, dtype=np.int64),
+                uv_px=other.uv_px[matches.b],
+                covariance_px2=np.maximum(seen.zoom[matches.a], 1.0)[:, None, None] ** 2 * np.eye(2),
+            )
+        )
+        widths.append(radius[matches.a])
+    return Ties.concatenate(parts), np.concatenate([np.empty(0), *widths])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Windows:
+    """Points of one image of the first stop, and where an image of the second may show them."""
+
+    own: int
+    """Image that saw the points first."""
+    image: int
+    rows: IntArray
+    """(n,) rows of the points."""
+    seen: Sighting
+    radius_px: FloatArray
+    """(n,) half widths of the windows about them."""
+    usable: BoolArray
+    """(n,) whether the image can show each alike."""
+
+
+def _windows(
+    terrain: StopTerrain, stops: tuple[int, int], at: Alignment, options: FrontEndOptions
+) -> Iterator[_Windows]:
+    """The windows of all pairs of images of two stops that may share enough points."""
     rows_of = {i: np.flatnonzero(terrain.image == i) for i in np.unique(terrain.image).tolist()}
     ours, theirs = ([i for i in rows_of if terrain.traverse.image_stop[i] == s] for s in stops)
-    parts, widths = [], []
     for i in ours:
-        rows = rows_of[i]
-        of_terrain = features[i].select(feature_of[terrain.row[rows]])
         for j in theirs:
-            seen = terrain.sighting(rows, j, at.world_T_mast)
-            radius = _radius_px(terrain, rows, seen, at, options)
+            seen = terrain.sighting(rows_of[i], j, at.world_T_mast)
+            radius = _radius_px(terrain, rows_of[i], seen, at, options)
             usable = _comparable(terrain, j, seen, radius)
-            if np.count_nonzero(usable) < _LEAST_SEEN:
-                continue
-            segments = Segments(
-                far_px=seen.uv_px,
-                near_px=seen.uv_px,
-                far_radius_px=radius,
-                near_radius_px=radius,
-                magnification=seen.zoom,
-                valid=usable,
-            )
-            other = features[j].select(feature_of[terrain.row[rows_of[j]]])
-            matches = match_in_windows(of_terrain, other, segments, options)
-            parts.append(
-                Ties(
-                    row=rows[matches.a],
-                    image=np.full(len(matches), j, dtype=np.int64),
-                    uv_px=other.uv_px[matches.b],
-                    covariance_px2=np.maximum(seen.zoom[matches.a], 1.0)[:, None, None] ** 2 * np.eye(2),
-                )
-            )
-            widths.append(radius[matches.a])
-    return Ties.concatenate(parts), np.concatenate([np.empty(0), *widths])
+            if np.count_nonzero(usable) >= _LEAST_SEEN:
+                yield _Windows(own=i, image=j, rows=rows_of[i], seen=seen, radius_px=radius, usable=usable)
 
 
 def _radius_px(
