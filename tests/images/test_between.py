@@ -29,7 +29,7 @@ from pancam_graph.base.geometry import HEAD_R_FORWARD_CAMERA, FloatArray
 from pancam_graph.base.threads import n_workers
 from pancam_graph.cameras import Pinhole
 from pancam_graph.data import Refusal, StopMatching
-from pancam_graph.images import FrontEndOptions, _refine, _steps
+from pancam_graph.images import FrontEndOptions, _alignment, _refine, _steps
 from pancam_graph.images._alignment import Alignment, Ties, believed, fit_pose, telemetry_alignment
 from pancam_graph.images._between import StopMatcher, StopTies, agreeing
 from pancam_graph.images._local_map import local_map
@@ -149,6 +149,42 @@ def test_telemetry_that_ties_contradict_pulls_less(
     for off, grown in ((2.0, 1.0), (6.0, 6.0)):
         found = replace(telemetry, world_T_mast=moved_by(telemetry.world_T_mast, off * sigma))
         assert believed(telemetry, found).root == pytest.approx(grown * telemetry.root)
+
+
+@pytest.mark.slow
+def test_a_search_begins_where_most_matches_agree(
+    simulated: tuple[StopTerrain, tuple[gtsam.Pose3, ...]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Telemetry 5 sigma off: in its own windows near terrain is not, and matches there are wrong."""
+    terrain, masts = simulated
+    true = terrain.traverse.stops[0].world_T_mast.compose(masts[0].between(masts[1]))
+    ties, rng, sigma_m = seen_rows(terrain, true), np.random.default_rng(0), 0.15
+
+    def matched(*given: Any) -> tuple[Ties, FloatArray]:
+        at = given[4]
+        seen = terrain.sighting(ties.row, ties.image, at.world_T_mast)
+        spread = seen.covariance_px2(at.covariance, terrain.sigma_inverse_m[ties.row])
+        half = QUICK.search_sigmas * np.sqrt(np.linalg.eigvalsh(spread)[:, 1]) + QUICK.search_slack_px
+        there = np.linalg.norm(ties.uv_px - seen.uv_px, axis=1) < half
+        chance = seen.uv_px + half[:, None] * rng.uniform(-1, 1, (len(ties), 2))
+        found = replace(ties, uv_px=np.where(there[:, None], ties.uv_px, chance))
+        return found.select(seen.valid), half[seen.valid]
+
+    monkeypatch.setattr(_alignment, "_matched", matched)
+    for angle in np.deg2rad([75.0, 200.0]):
+        off = 5 * sigma_m * np.array([np.cos(angle), np.sin(angle), 0.0])
+        told = Alignment(
+            world_T_mast=true.compose(gtsam.Pose3(gtsam.Rot3(), off)),
+            root=np.diag([2e-3] * 3 + [sigma_m] * 3),
+        )
+        begun = {}
+        for wide_px in (10.0, np.inf):
+            monkeypatch.setattr(_alignment, "_WIDE_PX", wide_px)
+            none = np.zeros(0, dtype=np.int64)
+            begun[wide_px] = _alignment._begun(terrain, [], none, (0, 1), told, QUICK)
+        assert begun[np.inf] is told
+        apart = true.between(begun[10.0].world_T_mast).translation()
+        assert np.linalg.norm(apart) < 0.5 * sigma_m
 
 
 def moved_by(pose: gtsam.Pose3, forward_m: float) -> gtsam.Pose3:
