@@ -6,7 +6,6 @@ import shlex
 import sys
 import tempfile
 import traceback
-from importlib import metadata
 from pathlib import Path
 
 from pancam_graph import __version__
@@ -64,6 +63,8 @@ def _report(error: BaseException) -> str:
 
 
 def _version(name: str) -> str:
+    from importlib import metadata  # it takes as long as the rest of the command to import
+
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:

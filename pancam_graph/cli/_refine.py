@@ -141,16 +141,13 @@ def _add_options(parser: CommandParser) -> None:
 
 def _work(call: Invocation) -> int:
     """Read, match images where observations are missing, solve, write."""
-    from pancam_graph import SolveOptions, cross_validate, find_observations, read_input, solve
+    from pancam_graph import SolveOptions, read_input, solve
     from pancam_graph.cli._resumable import resumable
     from pancam_graph.cli._summary import print_summary
     from pancam_graph.data import parse_sharing
-    from pancam_graph.images import cache_folder
     from pancam_graph.io import use_rig
     from pancam_graph.landmarks.kernel import must_compile
-    from pancam_graph.mosaic import MosaicOptions
     from pancam_graph.results import check_exports, check_out, write_results
-    from pancam_graph.smoother import solve_incrementally
     from pancam_graph.solve import COMPILING, criteria
 
     arguments, progress = call.arguments, call.progress
@@ -173,6 +170,9 @@ def _work(call: Invocation) -> int:
         check_exports(traverse, arguments.export)
         options = replace(options, sharing=parse_sharing(arguments.sharing, traverse.sharing))
         if traverse.observations is None:
+            from pancam_graph import find_observations
+            from pancam_graph.images import cache_folder
+
             traverse = find_observations(
                 traverse, progress=progress.counted, cache=cache_folder(arguments.out)
             )
@@ -180,6 +180,8 @@ def _work(call: Invocation) -> int:
         if must_compile():
             progress.say(COMPILING)
         if arguments.incremental:
+            from pancam_graph.smoother import solve_incrementally
+
             n_stops = len(traverse.stops)
             solution = solve_incrementally(
                 traverse, options, on_stop=lambda update: progress.stop(update, n_stops)
@@ -188,16 +190,20 @@ def _work(call: Invocation) -> int:
             solution = solve(traverse, options, on_iteration=progress.iteration)
         solution = solution.with_seconds(read=read_s)
         if arguments.cross_validate:
+            from pancam_graph import cross_validate
+
             validated = cross_validate(traverse, options, solution=solution, progress=progress.counted)
             solution = solution.with_cross_validation(validated)
         progress.say("writing the results")
-        mosaics = MosaicOptions() if arguments.mosaic else None
-        results = {
+        results: dict[str, Any] = {
             "report": arguments.report,
             "csv": arguments.csv,
             "exports": arguments.export,
-            "mosaics": mosaics,
         }
+        if arguments.mosaic:
+            from pancam_graph.mosaic import MosaicOptions
+
+            results["mosaics"] = MosaicOptions()
         solution = write_results(solution, arguments.out, **results, progress=progress.counted)
     print_summary(solution, str(arguments.out), quiet=arguments.quiet)
     return 0 if solution.passed else 1

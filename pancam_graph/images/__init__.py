@@ -1,11 +1,34 @@
-"""From image files to observations: reading, features, matching, tracks."""
+"""From image files to observations: reading, features, matching, tracks.
+
+All but the folder of the cache is imported when it is asked for: a solve of observations needs no OpenCV.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
 
 from pancam_graph.images._cache_folder import CACHE as CACHE
 from pancam_graph.images._cache_folder import cache_folder as cache_folder
 from pancam_graph.images._cache_folder import is_cache as is_cache
-from pancam_graph.images._front_end import find_masks as find_masks
-from pancam_graph.images._front_end import find_observations as find_observations
-from pancam_graph.images._front_end_options import FrontEndOptions as FrontEndOptions
-from pancam_graph.images._masks import ImageMask as ImageMask
-from pancam_graph.images._masks import Reason as Reason
-from pancam_graph.images._normalise import usable_mask as usable_mask
+
+if TYPE_CHECKING:
+    from pancam_graph.images._front_end import find_masks as find_masks
+    from pancam_graph.images._front_end import find_observations as find_observations
+    from pancam_graph.images._front_end_options import FrontEndOptions as FrontEndOptions
+    from pancam_graph.images._masks import ImageMask as ImageMask
+    from pancam_graph.images._masks import Reason as Reason
+    from pancam_graph.images._normalise import usable_mask as usable_mask
+else:
+    _LATE = {
+        "find_masks": "_front_end",
+        "find_observations": "_front_end",
+        "FrontEndOptions": "_front_end_options",
+        "ImageMask": "_masks",
+        "Reason": "_masks",
+        "usable_mask": "_normalise",
+    }
+
+    def __getattr__(name: str) -> object:
+        if name not in _LATE:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        value = globals()[name] = getattr(import_module(f"{__name__}.{_LATE[name]}"), name)
+        return value

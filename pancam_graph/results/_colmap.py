@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -220,6 +219,8 @@ def _write_images(
     brightness: Brightness,
 ) -> list[int]:
     """Write the images that have a readable file; returns their rows."""
+    import cv2  # noqa: PLC0415  late: other results do without it
+
     folder.mkdir()
     written = []
     previous, lookup = None, None
@@ -244,6 +245,8 @@ def _resampled(image: NDArray[Any], lookup: FloatArray) -> NDArray[np.float32]:
 
     OpenCV rounds the pixels to a 32nd.
     """
+    import cv2  # noqa: PLC0415  late: other results do without it
+
     height, width = image.shape
     within = np.all(
         (lookup > -_FIRST_PIXEL) & (lookup < [width - _FIRST_PIXEL, height - _FIRST_PIXEL]), axis=-1

@@ -1,6 +1,7 @@
 """The public names of the package, and what an import of them loads."""
 
 import ast
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +10,7 @@ from types import ModuleType
 import pytest
 
 import pancam_graph
+from pancam_graph.rigs import mer_navcam
 
 PUBLIC = {
     "CrossValidation",
@@ -179,3 +181,25 @@ def test_a_public_name_loads_what_it_needs_and_no_more(
     assert {m.split(".")[1] for m in loaded if m.startswith("pancam_graph.")} <= rooms
     parts = {m.split(".")[1] for m in loaded if m.startswith("scipy.")}
     assert not parts & {"fft", "interpolate", "linalg", "ndimage", "optimize", "sparse", "spatial", "special"}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(bool(os.environ.get("NUMBA_DISABLE_JIT")), reason="nothing is compiled")
+def test_a_solve_of_observations_loads_nothing_for_pictures_reports_or_compiling(tmp_path: Path) -> None:
+    """A whole command, whose loops were compiled before."""
+    options = pancam_graph.SimulationOptions(stops=1, pans=7, points_per_image=15)
+    pancam_graph.write_traverse(
+        pancam_graph.simulate(mer_navcam(), options, seed=2).traverse, tmp_path / "in"
+    )
+    words = ["refine", str(tmp_path / "in"), "--out", str(tmp_path / "out"), "--no-report"]
+    code = f"""
+from pancam_graph.cli import main
+assert main({words}) == 0
+"""
+    python(code)  # compiles what is not on disk
+    loaded = loaded_by(code)
+    assert loaded & {"cv2", "numba", "plotly", "pvl", "rich", "shtab"} == set()
+    rooms = {m.split(".")[1] for m in loaded if m.startswith("pancam_graph.")}
+    assert not rooms & {"mosaic", "report", "simulate", "smoother"}
+    parts = {m.split(".")[1] for m in loaded if m.startswith("scipy.")}
+    assert not parts & {"fft", "interpolate", "ndimage", "optimize", "spatial", "stats"}
