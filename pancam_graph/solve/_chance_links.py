@@ -7,7 +7,7 @@ from pancam_graph.base.geometry import BoolArray, IntArray
 from pancam_graph.solve._diagnose import shared_landmarks
 from pancam_graph.solve._problem import Problem
 
-__all__ = ["chance_links"]
+__all__ = ["accident", "chance_links"]
 
 _LEAST_CHANCE = 0.01
 """Probability of so many accidental agreements, from which on a link is not believed."""
@@ -33,7 +33,7 @@ def chance_links(problem: Problem, cutoff_px: float) -> BoolArray:
     if len(a) == 0:
         return outside
     n_rejected = np.asarray(shared[a, b]).ravel() - n_accepted
-    expected = np.maximum(n_rejected * _accident(problem, cutoff_px), 1e-300)
+    expected = np.maximum(n_rejected * accident(problem, cutoff_px), 1e-300)
     # The upper tail of a Poisson distribution is an incomplete gamma function.
     weak = scipy.special.gammainc(n_accepted, expected) > _LEAST_CHANCE
     links = set(zip(a[weak].tolist(), b[weak].tolist(), strict=True))
@@ -45,7 +45,7 @@ def chance_links(problem: Problem, cutoff_px: float) -> BoolArray:
     return outside
 
 
-def _accident(problem: Problem, cutoff_px: float) -> float:
+def accident(problem: Problem, cutoff_px: float) -> float:
     """Probability that a wrong track comes within the cutoff of its epipolar line."""
     rig = problem.template.traverse.rig
     narrowest = min(min(eye.camera.width_px, eye.camera.height_px) for eye in rig.eyes)

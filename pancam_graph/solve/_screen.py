@@ -9,6 +9,7 @@ import numpy as np
 from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.landmarks import loss_of, refine
 from pancam_graph.solve._chance_links import chance_links
+from pancam_graph.solve._chance_points import chance_points
 from pancam_graph.solve._pointing_again import pointing_again
 from pancam_graph.solve._prepare import Prepared, solver_for, triangulated
 from pancam_graph.solve._problem import Problem, Solver
@@ -169,13 +170,12 @@ class ScreeningRounds:
         return float(np.mean(self.problem.accepted != before))
 
     def to_the_end(self) -> Screened:
-        """Second passes until chance explains no link any more."""
+        """Second passes until chance explains no link and no point any more."""
         cutoff, scale = self._prepared.options.outlier_sigma, self._scale
         for _ in range(_CHANCE_ROUNDS):
             scale = self._second_pass(scale, cutoff)
-            by_chance = chance_links(
-                self.problem, cutoff * scale * self.problem.measurements.typical_sigma_px
-            )
+            cutoff_px = cutoff * scale * self.problem.measurements.typical_sigma_px
+            by_chance = chance_links(self.problem, cutoff_px) | chance_points(self.problem, cutoff_px)
             if not by_chance.any():
                 break
             self._banned |= by_chance

@@ -9,6 +9,7 @@ from pancam_graph import SimulationOptions, SolveOptions, simulate, solve
 from pancam_graph.rigs import TEMPLATES
 from pancam_graph.solve import prepare, screen, screened_again
 from pancam_graph.solve._chance_links import chance_links
+from pancam_graph.solve._chance_points import chance_points
 from support.truth import require_right
 
 DRIVE = SimulationOptions(stops=2)
@@ -42,9 +43,21 @@ def test_drives_are_solved_over_seeds(rig: str, stops: int) -> None:
             require_right(simulation, solve(simulation.traverse))
 
 
-def test_a_drive_without_outliers_has_no_link_by_chance() -> None:
+def test_a_drive_without_outliers_has_no_link_and_no_point_by_chance() -> None:
     simulation = simulate(TEMPLATES["mer-navcam"](), DRIVE, seed=3)
-    assert not chance_links(prepare(simulation.traverse, SolveOptions()).problem, CUTOFF_PX).any()
+    problem = prepare(simulation.traverse, SolveOptions()).problem
+    assert not chance_links(problem, CUTOFF_PX).any()
+    assert not chance_points(problem, CUTOFF_PX).any()
+
+
+def test_two_wrong_sights_that_meet_before_the_terrain_are_not_believed() -> None:
+    """Two points 0.26 and 0.44 m from the cameras moved the tilt axis by 9 mm, ten times what is allowed."""
+    options = replace(DRIVE, stops=1, pans=8, points_per_image=25, min_views=2, outliers=0.33)
+    simulation = simulate(TEMPLATES["exomars-pancam"](), options, seed=341)
+    solution = solve(simulation.traverse)
+    require_right(simulation, solution)
+    away_m = np.linalg.norm(solution.final.landmarks_m - solution.final.world_t_camera.mean(axis=0), axis=1)
+    assert np.nanmin(away_m) > 1.5
 
 
 def test_a_link_of_one_track_among_many_that_were_rejected_is_not_believed() -> None:
