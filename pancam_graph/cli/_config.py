@@ -77,8 +77,10 @@ def _converted(where: str, key: str, action: argparse.Action, value: object) -> 
         if not isinstance(value, bool):
             raise InputError(f"{where}: expected true or false, found {_described(value)}")
         return value != key.startswith("no-")
-    if isinstance(action, Several) or action.nargs == "+":
+    if isinstance(action, Several) or action.nargs == "+" or isinstance(action.nargs, int):
         items = value if isinstance(value, list) else [value]
+        if isinstance(action.nargs, int) and len(items) != action.nargs:
+            raise InputError(f"{where}: expected a list of {action.nargs}, found {_described(value)}")
         if not items:
             raise InputError(f"{where}: expected one entry or more, found an empty list")
         return tuple(_single(where, action, item) for item in items)

@@ -6,10 +6,13 @@ from pancam_graph.cli._check import CHECK
 from pancam_graph.cli._command import Command
 from pancam_graph.cli._completion import COMPLETION
 from pancam_graph.cli._drive import DRIVE
+from pancam_graph.cli._init import INIT
 from pancam_graph.cli._refine import REFINE
 from pancam_graph.cli._render import RENDER
 from pancam_graph.cli._simulate import SIMULATE
 
 __all__ = ["COMMANDS"]
 
-COMMANDS: Mapping[str, Command] = {c.name: c for c in (REFINE, CHECK, SIMULATE, RENDER, DRIVE, COMPLETION)}
+COMMANDS: Mapping[str, Command] = {
+    c.name: c for c in (REFINE, INIT, CHECK, SIMULATE, RENDER, DRIVE, COMPLETION)
+}

@@ -1,5 +1,6 @@
 """Image files as 2-D grey arrays: PDS .IMG through its label, anything else through OpenCV."""
 
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from pancam_graph.base.errors import ImageError
 from pancam_graph.base.regular_files import instead_of_file
 from pancam_graph.io._pds_samples import read_pds_image, read_samples
 from pancam_graph.io._picture_size import PICTURE_FORMATS, WantedSize, picture_size, require_size
+from pancam_graph.io._tiff_entries import ORIENTATION, TIFF_STARTS, first_entries
 
 __all__ = ["GreyImage", "ImageContent", "read_content", "read_image"]
 
@@ -122,11 +124,25 @@ def _decode(data: bytes) -> NDArray[Any] | None:
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         # From memory: OpenCV cannot open every path that the system can.
-        return cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+        return cv2.imdecode(np.frombuffer(_unturned(data), dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         return None
     finally:
         cv2.utils.logging.setLogLevel(level)
+
+
+def _unturned(data: bytes) -> bytes:
+    """The file; of a TIFF with the orientation 1, as OpenCV turns a TIFF by it even where it is told not to.
+
+    By EXIF in files of other formats OpenCV turns no picture that is read unchanged.
+    """
+    if not data.startswith(TIFF_STARTS):
+        return data
+    found = next((entry for entry in first_entries(data) if entry.tag == ORIENTATION), None)
+    if found is None or (found.kind, found.count) != (3, 1) or found.numbers(data) == (1,):
+        return data
+    upright = struct.pack(f"{found.order}H", 1)
+    return b"".join([data[: found.value_at], upright, data[found.value_at + 2 :]])
 
 
 def _require_whole(path: Path, data: bytes) -> None:

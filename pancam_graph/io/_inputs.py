@@ -1,11 +1,13 @@
 """The formats of input folders there are. To add one: a module with its reader, and a line in `FORMATS`."""
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from pancam_graph.base.errors import InputError
 from pancam_graph.data import Traverse
 from pancam_graph.io._input_format import InputFormat
 from pancam_graph.io._pds import PDS3
+from pancam_graph.io._picture_size import looks_like_picture
 from pancam_graph.io._traverse_json import TRAVERSE_FOLDER
 
 __all__ = ["FORMATS", "read_input"]
@@ -33,5 +35,21 @@ def read_input(path: Path | str) -> Traverse:
     for known in FORMATS:
         if known.matches(names):
             return known.read(path)
+    pictures = sum(looks_like_picture(name) for name in _names_within(path, names))
+    if pictures:
+        raise InputError(
+            f"{expected}, found {pictures} pictures without; pancam-graph init "
+            f"{path} makes a traverse.json of them"
+        )
     content = f"{names[0]} and {len(names) - 1} more" if len(names) > 1 else "".join(names)
     raise InputError(f"{expected}, found {content or 'an empty folder'}")
+
+
+def _names_within(folder: Path, names: Sequence[str]) -> Iterator[str]:
+    """Names of what lies in a folder and in the folders in it; of those that cannot be read, none."""
+    yield from names
+    for name in names:
+        try:
+            yield from (path.name for path in (folder / name).iterdir())
+        except (OSError, ValueError):
+            continue

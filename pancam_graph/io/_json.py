@@ -13,12 +13,14 @@ from pancam_graph.base.errors import InputError, PancamGraphError
 from pancam_graph.base.regular_files import instead_of_file
 
 __all__ = [
+    "any_json_object",
     "entry_name",
     "json_object",
     "prefixed",
     "read_bytes",
     "read_json",
     "refused_by_schema",
+    "require_format",
     "short",
     "validated",
 ]
@@ -117,10 +119,28 @@ def read_json(path: Path, format_name: str, version: int) -> dict[str, Any]:
 def json_object(content: bytes, path: Path, format_name: str, version: int) -> dict[str, Any]:
     """The object in JSON text of one of our formats; `path` is the file that errors name.
 
+    Raises InputError as `any_json_object` does, and for another format or version.
+    """
+    data = any_json_object(content, path)
+    require_format(data, path, format_name, version)
+    return data
+
+
+def require_format(data: dict[str, Any], path: Path, format_name: str, version: int) -> None:
+    """Raise InputError unless an object of JSON says that it is of this format and version."""
+    for key, expected in (("format", format_name), ("version", version)):
+        if key not in data:
+            raise InputError(f"{path}: {key}: expected {short(expected)}, found no such key")
+        if data[key] != expected or type(data[key]) is not type(expected):
+            raise InputError(f"{path}: {key}: expected {short(expected)}, found {short(data[key])}")
+
+
+def any_json_object(content: bytes, path: Path) -> dict[str, Any]:
+    """The object in JSON text of any format; `path` is the file that errors name.
+
     NaN and infinite numbers are let through: the schema refuses them and names the entry.
 
-    Raises InputError for what is not JSON, for anything else than an object, for a key that stands twice, and
-    for another format or version.
+    Raises InputError for what is not JSON, for anything else than an object, and for a key that stands twice.
     """
     doubled: dict[int, str] = {}
     kept: list[
@@ -153,11 +173,6 @@ def json_object(content: bytes, path: Path, format_name: str, version: int) -> d
         raise InputError(f"{path}: expected a JSON object, found {short(data)}")
     if entry is not None:
         raise InputError(f"{path}: {entry}: expected each key once in an object, found it twice")
-    for key, expected in (("format", format_name), ("version", version)):
-        if key not in data:
-            raise InputError(f"{path}: {key}: expected {short(expected)}, found no such key")
-        if data[key] != expected or type(data[key]) is not type(expected):
-            raise InputError(f"{path}: {key}: expected {short(expected)}, found {short(data[key])}")
     return data
 
 

@@ -5,7 +5,6 @@ Columns `image` (row in the traverse's images), `track`, `uv_px` (n, 2; in CSV `
 agree. Rows count from 0; other columns are ignored.
 """
 
-import csv
 import io
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +16,8 @@ from numpy.typing import NDArray
 from pancam_graph.base.arrays import float_array, int_array
 from pancam_graph.base.errors import InputError
 from pancam_graph.data import Observations, mean_sigma_px
-from pancam_graph.io._json import prefixed, read_bytes, short
+from pancam_graph.io._csv_table import CsvTable, read_csv_table
+from pancam_graph.io._json import prefixed, short
 from pancam_graph.io._npz import NpzFile
 
 __all__ = ["observations_npz", "read_observations"]
@@ -95,24 +95,14 @@ def _array(archive: NpzFile, name: str) -> NDArray[Any]:
 
 
 def _read_csv(path: Path) -> Observations:
-    try:
-        text = read_bytes(path).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: expected CSV in UTF-8, found other bytes at {error.start}") from error
-    lines = csv.reader(io.StringIO(text, newline=""), strict=True)
+    csv_table = read_csv_table(path)
+    rows = csv_table.rows
     with prefixed(path):
-        try:
-            header = [name.strip() for name in next(lines, [])]
-            where = _csv_columns(header)
-            rows = [(lines.line_num, cells) for cells in lines if cells]
-        except csv.Error as error:
-            raise InputError(f"line {lines.line_num}: expected CSV, found an error: {error}") from error
+        where = _csv_columns(csv_table)
         table: dict[str, NDArray[Any]] = {
             name: np.zeros(len(rows), np.int64 if name in _INTEGERS else np.float64) for name in where
         }
         for row, (line, cells) in enumerate(rows):
-            if len(cells) != len(header):
-                raise InputError(f"row {row} (line {line}): expected {len(header)} cells, found {len(cells)}")
             for name, column in where.items():
                 convert = int if name in _INTEGERS else float
                 table[name][row] = _number(cells[column], convert, f"{name}, row {row} (line {line})")
@@ -124,20 +114,16 @@ def _read_csv(path: Path) -> Observations:
     return _observations(columns)
 
 
-def _csv_columns(header: list[str]) -> dict[str, int]:
+def _csv_columns(table: CsvTable) -> dict[str, int]:
     """Indices of the columns that are read: with sigma, the three of a covariance, or both."""
-    has_covariance = any(name in header for name in _COVARIANCE)
+    has_covariance = any(name in table.header for name in _COVARIANCE)
     wanted = [*_CSV_COLUMNS, *(_COVARIANCE if has_covariance else ())]
-    if not has_covariance or "sigma_px" in header:
+    if not has_covariance or "sigma_px" in table.header:
         wanted.append("sigma_px")
     expected = ", ".join(wanted)
-    if not header:
+    if not table.header:
         raise InputError(f"line 1: expected the column names {expected}, found an empty line")
-    for name in wanted:
-        if header.count(name) != 1:
-            found = "none of this name" if name not in header else f"it {header.count(name)} times"
-            raise InputError(f"{name}: expected one such column (of {expected}), found {found}")
-    return {name: header.index(name) for name in wanted}
+    return {name: table.column(name, expected) for name in wanted}
 
 
 def _number(cell: str, convert: Callable[[str], float], where: str) -> float:

@@ -12,12 +12,22 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pancam_graph.base.errors import ImageError
+from pancam_graph.io._tiff_entries import TIFF_STARTS, first_entries
 
-__all__ = ["MAX_PIXELS", "PICTURE_FORMATS", "WantedSize", "picture_size", "require_size"]
+__all__ = [
+    "MAX_PIXELS",
+    "PICTURE_FORMATS",
+    "WantedSize",
+    "looks_like_picture",
+    "picture_size",
+    "require_size",
+]
 
 MAX_PIXELS = 1 << 27
 """Pixels of the largest picture that is decoded: 134 million."""
 PICTURE_FORMATS = "PNG, TIFF, JPEG, PGM, BMP, WebP, JPEG 2000"
+_SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".jpe", ".bmp", ".webp", ".jp2", ".j2k")
+_NETPBM_SUFFIXES = (".pgm", ".ppm", ".pnm", ".pbm")
 
 Size = tuple[int, int]
 
@@ -26,7 +36,7 @@ _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_ALONE = frozenset(range(0xD0, 0xDA)) | {0x01}
 """Markers of JPEG without a length: restarts, start, end, temporary."""
 _PNM = re.compile(rb"P[1-6]((?:\s|#[^\n\r]*)+)(\d{1,9})((?:\s|#[^\n\r]*)+)(\d{1,9})\s")
-_TIFF_SIZES = {3: "H", 4: "I", 16: "Q"}
+_TIFF_SIZES = frozenset({3, 4, 16})
 """Types of TIFF entries that may hold a width or a height."""
 
 
@@ -38,6 +48,11 @@ class WantedSize:
     height_px: int
     words: str
     """What is expected, with the size, as error messages say it."""
+
+
+def looks_like_picture(path: Path | str) -> bool:
+    """Whether a file has the name of a picture of these formats."""
+    return Path(path).suffix.lower() in {*_SUFFIXES, *_NETPBM_SUFFIXES}
 
 
 def require_size(path: Path, size: Size, wanted: WantedSize | None) -> None:
@@ -89,18 +104,10 @@ def _jpeg(data: bytes) -> Size | None:
 
 
 def _tiff(data: bytes) -> Size | None:
-    order = "<" if data.startswith(b"II") else ">"
-    if struct.unpack_from(f"{order}H", data, 2)[0] == 42:
-        (at,) = struct.unpack_from(f"{order}I", data, 4)
-        (count,), at, step, value_at = struct.unpack_from(f"{order}H", data, at), at + 2, 12, 8
-    else:  # BigTIFF
-        (at,) = struct.unpack_from(f"{order}Q", data, 8)
-        (count,), at, step, value_at = struct.unpack_from(f"{order}Q", data, at), at + 8, 20, 12
     sides: dict[int, int] = {}
-    for entry in range(at, min(at + count * step, len(data)), step):
-        tag, kind = struct.unpack_from(f"{order}HH", data, entry)
-        if tag in {256, 257} and kind in _TIFF_SIZES:
-            (sides[tag],) = struct.unpack_from(order + _TIFF_SIZES[kind], data, entry + value_at)
+    for entry in first_entries(data):
+        if entry.tag in {256, 257} and entry.kind in _TIFF_SIZES:
+            (sides[entry.tag],) = entry.numbers(data)
     return (sides[256], sides[257]) if len(sides) == 2 else None
 
 
@@ -138,8 +145,7 @@ def _jpeg2000(data: bytes) -> Size | None:
 _READERS: tuple[tuple[bytes, Callable[[bytes], Size | None]], ...] = (
     (b"\x89PNG\r\n\x1a\n", _png),
     (b"\xff\xd8\xff", _jpeg),
-    (b"II", _tiff),
-    (b"MM", _tiff),
+    *((start, _tiff) for start in TIFF_STARTS),
     (b"BM", _bmp),
     (b"RIFF", _webp),
     (b"\x00\x00\x00\x0cjP  \r\n\x87\n", _jpeg2000),

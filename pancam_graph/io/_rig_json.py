@@ -10,13 +10,13 @@ import numpy as np
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import compose, so3_log
 from pancam_graph.data import Traverse
-from pancam_graph.io._entries import RIG_FORMAT, VERSION, Entry, Text
-from pancam_graph.io._json import prefixed, read_json, validated
-from pancam_graph.io._schema import OwnRigEntry, rig_entry
+from pancam_graph.io._entries import RIG_FORMAT, TRAVERSE_FORMAT, VERSION, Entry, Text
+from pancam_graph.io._json import any_json_object, prefixed, read_bytes, read_json, require_format, validated
+from pancam_graph.io._schema import AnyRigEntry, OwnRigEntry, TraverseFile, rig_entry
 from pancam_graph.io._seen_pictures import require_other_pictures
 from pancam_graph.rigs import Eye, Rig, RigUncertainty
 
-__all__ = ["read_rig", "rig_json", "use_rig"]
+__all__ = ["read_any_rig", "read_rig", "rig_json", "use_rig"]
 
 
 _FARTHEST_SIGMAS = 8.0
@@ -58,6 +58,30 @@ def read_rig(path: Path | str) -> Rig:
                 f"{entries.name}, which did not"
             )
         return entries.rig.rig()
+
+
+class _RigAlone(Entry):
+    """What stands in a file that has nothing but a rig, under the name that a traverse has it under."""
+
+    rig: AnyRigEntry
+
+
+def read_any_rig(path: Path | str) -> Rig:
+    """The rig of a JSON file: of a `rig.json`, of a `traverse.json`, or the entry `rig` of one by itself.
+
+    Raises InputError naming file and entry for what is malformed, and as `read_rig` does.
+    """
+    path = Path(path)
+    data = any_json_object(read_bytes(path), path)
+    if data.get("format") == RIG_FORMAT:
+        return read_rig(path)
+    if "format" in data:
+        require_format(data, path, TRAVERSE_FORMAT, VERSION)
+        entry = validated(TraverseFile, data, path).rig
+    else:
+        entry = validated(_RigAlone, {"rig": data}, path).rig
+    with prefixed(path):
+        return entry.rig()
 
 
 def use_rig(traverse: Traverse, path: Path | str) -> Traverse:

@@ -16,6 +16,7 @@ from pancam_graph.io._json import prefixed
 from pancam_graph.rigs import Rig, RigCovariance, RigEntry, RigUncertainty, rig_template
 
 __all__ = [
+    "AnyRigEntry",
     "FrameEntry",
     "ImageEntry",
     "OwnRigEntry",
@@ -155,6 +156,13 @@ def _rig_tag(value: Any) -> str:
     return "<template>" if template else "<own>"
 
 
+AnyRigEntry = Annotated[
+    Annotated[TemplateRigEntry, Tag("<template>")] | Annotated[OwnRigEntry, Tag("<own>")],
+    Discriminator(_rig_tag),
+]
+"""A template or an own rig, as the type of an entry."""
+
+
 class StopEntry(Entry):
     """One place of the mast."""
 
@@ -242,10 +250,7 @@ class TraverseFile(Entry):
     format: Literal["pancam-graph/traverse"] = "pancam-graph/traverse"
     version: Literal[1] = 1
     name: Text | None = None
-    rig: Annotated[
-        Annotated[TemplateRigEntry, Tag("<template>")] | Annotated[OwnRigEntry, Tag("<own>")],
-        Discriminator(_rig_tag),
-    ]
+    rig: AnyRigEntry
     stops: list[StopEntry]
     frames: list[FrameEntry]
     images: list[ImageEntry]

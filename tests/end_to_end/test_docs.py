@@ -193,6 +193,15 @@ def test_pictures_of_own_rig_are_solved(tmp_path: Path, monkeypatch: pytest.Monk
     assert (tmp_path / "out" / "pictures" / "report.html").exists()
 
 
+@pytest.mark.slow
+def test_the_python_of_own_pictures_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From rendered pictures without their traverse to refined pointing; the page asserts its numbers."""
+    monkeypatch.chdir(tmp_path)
+    names = run(python_of("own_pictures.md"), "own_pictures.md")
+    assert names["solution"]["converged"]
+    assert (tmp_path / "out" / "pictures" / "report.html").exists()
+
+
 def test_one_version_everywhere() -> None:
     """The version is in pancam_graph/__init__.py; what repeats it for readers is the same."""
     version = re.escape(pancam_graph.__version__)

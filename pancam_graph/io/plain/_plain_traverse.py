@@ -1,0 +1,111 @@
+"""From a folder of plain pictures to a traverse."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from pancam_graph.base.errors import InputError
+from pancam_graph.base.text import visible
+from pancam_graph.data import Traverse
+from pancam_graph.io.plain._eyes import told_rig
+from pancam_graph.io.plain._find_pictures import find_pictures
+from pancam_graph.io.plain._frames import frames_of
+from pancam_graph.io.plain._made_rig import made_rig
+from pancam_graph.io.plain._options import POINTING_COLUMNS, PlainOptions
+from pancam_graph.io.plain._pointing import read_pointing
+from pancam_graph.io.plain._stops import stops_of
+from pancam_graph.rigs import PointingSigma
+
+__all__ = ["PlainTraverse", "plain_traverse"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlainTraverse:
+    """A traverse of plain pictures, and where its numbers come from."""
+
+    traverse: Traverse
+    """Without observations; its warnings say what was left out."""
+    sources: tuple[str, ...]
+    """A sentence about the source of each kind of numbers, for who wants to change them."""
+
+
+def plain_traverse(folder: Path | str, options: PlainOptions) -> PlainTraverse:
+    """The traverse of plain pictures in a folder, or in folders below it, with what is told of them.
+
+    Only headers of pictures are read. Pan and tilt of the table become those of the package's conventions; a
+    single stop is the world's origin. Pictures that do not fit are left out with a warning.
+
+    Raises InputError with one sentence naming file, line or option: where the pointing is not told, for
+    tables and rigs that are malformed, and if no picture is left.
+    """
+    folder = Path(folder)
+    _require_sense(options)
+    told = [path for path in (options.pointing, options.stops) if path is not None]
+    if options.rig is not None:
+        told.append(Path(options.rig))
+    pictures, warnings = find_pictures(folder, told)
+    if options.pointing is None:
+        raise InputError(
+            f"{folder}: expected --pointing FILE.csv with the columns {POINTING_COLUMNS}, a line for each of "
+            f"the {len(pictures)} pictures; found none, and pointing that is not known cannot be solved"
+        )
+    pointed, more = read_pointing(options.pointing, folder, pictures, clockwise=options.clockwise)
+    warnings += more
+    if options.rig is None:
+        rigged = made_rig(pointed, options, options.pointing)
+    else:
+        rigged = told_rig(pointed, options.rig, options.pointing)
+    usual = rigged.rig.pointing_sigma
+    if options.sigma_rad is not None:
+        usual = replace(usual, pan_rad=options.sigma_rad, tilt_rad=options.sigma_rad)
+    frames, images = frames_of(rigged.pictures, usual, options.pointing)
+    names = list(dict.fromkeys(frame.stop for frame in frames))
+    stops, more = stops_of(names, options.stops, folder, clockwise=options.clockwise)
+    traverse = Traverse(
+        name=visible(folder.resolve().name),
+        rig=rigged.rig,
+        stops=stops,
+        frames=frames,
+        images=images,
+        folder=folder,
+        warnings=(*warnings, *rigged.warnings, *more),
+    )
+    return PlainTraverse(traverse=traverse, sources=(*rigged.sources, *_pointing_sources(options, usual)))
+
+
+def _require_sense(options: PlainOptions) -> None:
+    """Raise InputError for options that contradict each other, and for numbers that make no sense."""
+    made = {
+        "--focal-px": options.focal_px,
+        "--field-deg": options.field_rad,
+        "--focal-sigma": options.focal_sigma,
+        "--arms": options.arms_m,
+        "--arms-sigma": options.arms_sigma_m,
+    }
+    given = [name for name, value in made.items() if value is not None]
+    if options.rig is not None and given:
+        raise InputError(f"expected --rig or {given[0]}, found both: a rig has its own numbers")
+    if options.focal_px is not None and options.field_rad is not None:
+        raise InputError("expected --focal-px or --field-deg, found both")
+    sigmas = {
+        "--sigma-deg": options.sigma_rad,
+        "--focal-sigma": options.focal_sigma,
+        "--arms-sigma": options.arms_sigma_m,
+    }
+    for name, sigma in sigmas.items():
+        if sigma is not None and not (np.isfinite(sigma) and sigma >= 0):
+            raise InputError(f"{name}: expected 0 (exact) or a positive number, found {sigma:g}")
+
+
+def _pointing_sources(options: PlainOptions, usual: PointingSigma) -> tuple[str, ...]:
+    sense = "clockwise seen from above, turned to anticlockwise" if options.clockwise else "anticlockwise"
+    pan_deg, tilt_deg = np.rad2deg([usual.pan_rad, usual.tilt_rad])
+    places = "the single stop is the origin of the world"
+    if options.stops is not None:
+        places = f"places of stops by {options.stops}, the first held unless its sigmas are told"
+    return (
+        f"pointing: by {options.pointing}, pans {sense}; where it tells no sigmas, {pan_deg:.3g} degrees of "
+        f"pan and {tilt_deg:.3g} of tilt",
+        places,
+    )
