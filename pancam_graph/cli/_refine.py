@@ -14,10 +14,10 @@ __all__ = ["REFINE"]
 _DESCRIPTION = """\
 Refine a rover traverse: mast poses, pointing and terrain points from images taken by a camera mast.
 
-FOLDER has a traverse.json, or rover images with PDS labels (MER, MSL, Mars 2020). OUT gets solution.json,
-points.ply, residuals.npz and report.html, and with --mosaic a folder of mosaics; an older OUT is replaced
-once the new results are complete. OUT/cache keeps what was found in images: the same command goes on after
-an interrupt, and again only with what has changed.
+FOLDER has a traverse.json, which pancam-graph init makes of plain pictures, or rover images with PDS labels
+(MER, MSL, Mars 2020). OUT gets solution.json, points.ply, residuals.npz and report.html, and with --mosaic a
+folder of mosaics; an older OUT is replaced once the new results are complete. OUT/cache keeps what was found
+in images: the same command goes on after an interrupt, and again only with what has changed.
 
 Exit status: 0 solved and passed its tests, 1 not converged or a test failed (results are written, and say
 which), 2 bad input or a fault (nothing is written), 130 interrupted.

@@ -20,10 +20,11 @@ from pancam_graph import SimulationOptions, Traverse, TraverseSmoother, simulate
 from pancam_graph.data import Freedom, Sharing
 from pancam_graph.images._cache import Cache
 from pancam_graph.io import read_image, read_input, read_mask, read_pds, read_traverse, rig_json, use_rig
+from pancam_graph.io.plain import PlainOptions, plain_traverse, write_plain
 from pancam_graph.rigs import mer_navcam
 from pancam_graph.smoother import SmootherOptions
 from pancam_graph.smoother._incremental import stops_of
-from support import io_samples
+from support import io_samples, plain_pictures
 from support.fuzzing import (
     claiming,
     dumped,
@@ -304,6 +305,62 @@ def pictures(folder: Path) -> Case:
         return said or outcome(lambda: read_image(file), folder)
 
     return case
+
+
+# --- plain pictures ---
+
+
+@kind_of_case
+def plain_pointing(folder: Path) -> Case:
+    return plain_tables(folder, "pointing.csv")
+
+
+@kind_of_case
+def plain_stops(folder: Path) -> Case:
+    return plain_tables(folder, "stops.csv")
+
+
+def plain_tables(folder: Path, damaged: str) -> Case:
+    plain_pictures.pictures(folder, ["s1/a.png", "s1/b.png", "s2/a.png"])
+    lines = "s1/a.png,-20,1,0.1,x,f0", "s1/b.png,0,2.5,0.1,x,f1", "s2/a.png,20,-3,,y,f2"
+    plain_pictures.table(folder / "pointing.csv", "file,pan_deg,tilt_deg,sigma_pan_deg,camera,frame", *lines)
+    plain_pictures.table(
+        folder / "stops.csv", "stop,x_m,y_m,z_m,yaw_deg,sigma_m", "s1,0,0,0,0,", "s2,4.5,1,-1,20,0.2"
+    )
+    path = folder / damaged
+    good = path.read_bytes()
+
+    def case(rng: np.random.Generator) -> str:
+        path.write_bytes(
+            mutated_bytes(rng, good)
+            if rng.random() < 0.3
+            else mutated_text(rng, good.decode()).encode("utf-8", "replace")
+        )
+        return outcome(lambda: plain_way(folder), folder)
+
+    return case
+
+
+@kind_of_case
+def plain_exif(folder: Path) -> Case:
+    exif = plain_pictures.tiff({plain_pictures.MODEL: "Phone 7", plain_pictures.FOCAL_35MM: 26})
+    good = plain_pictures.picture(".jpg", exif=exif)
+    plain_pictures.table(folder / "pointing.csv", "file,pan_deg,tilt_deg", "a.jpg,0,0")
+
+    def case(rng: np.random.Generator) -> str:
+        (folder / "a.jpg").write_bytes(mutated_bytes(rng, good, 120))
+        return outcome(lambda: plain_way(folder), folder)
+
+    return case
+
+
+def plain_way(folder: Path) -> Traverse:
+    """From pictures to what refine reads."""
+    stops = folder / "stops.csv" if (folder / "stops.csv").exists() else None
+    focal_px = None if stops is None else 20.0
+    options = PlainOptions(pointing=folder / "pointing.csv", stops=stops, focal_px=focal_px)
+    write_plain(plain_traverse(folder, options), folder, overwrite=True)
+    return read_input(folder)
 
 
 # --- what the package has written itself ---

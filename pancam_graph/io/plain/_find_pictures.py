@@ -27,6 +27,8 @@ class PlainPicture:
 
     file: str
     """Path in the folder, with / between names."""
+    path: Path
+    """The file."""
     width_px: int
     height_px: int
     """As the pixels are stored, whatever EXIF says of turning them."""
@@ -49,14 +51,14 @@ def find_pictures(folder: Path, others: Collection[Path]) -> tuple[dict[str, Pla
     if not folder.is_dir():
         found = "a file" if folder.exists() else "nothing there"
         raise InputError(f"{folder}: expected a folder with pictures, found {found}")
-    known = {path.resolve() for path in others}
+    known = {_resolved(path) for path in others} - {None}
     root = folder.resolve()
     pictures: dict[str, PlainPicture] = {}
     warnings: list[str] = []
     foreign: list[str] = []
     for path in _files(folder, _DEPTH):
         name = path.relative_to(folder).as_posix()
-        if name in _OURS or path.resolve() in known:
+        if name in _OURS or _resolved(path) in known:
             continue
         if not looks_like_picture(path):
             foreign.append(name)
@@ -77,6 +79,14 @@ def find_pictures(folder: Path, others: Collection[Path]) -> tuple[dict[str, Pla
     if foreign:
         warnings.append(f"files that are no pictures are left alone: {some_of(foreign)}")
     return pictures, warnings
+
+
+def _resolved(path: Path) -> Path | None:
+    """The path without links; None for a ring of links, and for what the system refuses."""
+    try:
+        return path.resolve()
+    except (OSError, RuntimeError, ValueError):
+        return None
 
 
 def _files(folder: Path, depth: int) -> Iterator[Path]:
@@ -102,7 +112,8 @@ def _picture(path: Path, name: str, root: Path) -> PlainPicture | str:
     if other is not None:
         return f"expected an image file, found {other}"
     try:
-        if not path.resolve().is_relative_to(root):
+        resolved = _resolved(path)
+        if resolved is None or not resolved.is_relative_to(root):
             return "expected a file inside the folder, found a link that leads out of it"
         data = path.read_bytes()
     except OSError as error:
@@ -114,4 +125,4 @@ def _picture(path: Path, name: str, root: Path) -> PlainPicture | str:
         )
     if size[0] * size[1] > MAX_PIXELS:
         return f"expected a picture of at most {MAX_PIXELS} pixels, found {size[0]} x {size[1]}"
-    return PlainPicture(file=name, width_px=size[0], height_px=size[1], exif=read_exif(data))
+    return PlainPicture(file=name, path=path, width_px=size[0], height_px=size[1], exif=read_exif(data))

@@ -52,7 +52,7 @@ def focal_of(picture: PlainPicture, options: PlainOptions) -> Focal:
     found = _by_exif(picture)
     if isinstance(found, str):
         raise InputError(
-            f"{picture.file}: expected EXIF that tells the focal length, found {found}; --focal-px or "
+            f"{picture.path}: expected EXIF that tells the focal length, found {found}; --focal-px or "
             "--field-deg tells it, or --rig a rig"
         )
     if options.focal_sigma:
@@ -64,7 +64,7 @@ def _checked(focal_px: float, sigma: float, option: str, picture: PlainPicture) 
     if not _believed(focal_px, picture):
         raise InputError(
             f"{option}: expected a focal length of {_WIDEST:g} to {_NARROWEST:g} times the longer side of "
-            f"{picture.file} ({max(picture.size_px)} px), found {focal_px:g} px"
+            f"{picture.path} ({max(picture.size_px)} px), found {focal_px:g} px"
         )
     return Focal(focal_px=focal_px, sigma=sigma, source=f"as told by {option}")
 

@@ -8,7 +8,7 @@ import numpy as np
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.text import visible
 from pancam_graph.data import Traverse
-from pancam_graph.io.plain._eyes import told_rig
+from pancam_graph.io.plain._eyes import RiggedPictures, told_rig
 from pancam_graph.io.plain._find_pictures import find_pictures
 from pancam_graph.io.plain._frames import frames_of
 from pancam_graph.io.plain._made_rig import made_rig
@@ -18,6 +18,9 @@ from pancam_graph.io.plain._stops import stops_of
 from pancam_graph.rigs import PointingSigma
 
 __all__ = ["PlainTraverse", "plain_traverse"]
+
+_FEWEST_PANS = 4
+"""Different pans from which a small span of them is odd."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -69,7 +72,7 @@ def plain_traverse(folder: Path | str, options: PlainOptions) -> PlainTraverse:
         frames=frames,
         images=images,
         folder=folder,
-        warnings=(*warnings, *rigged.warnings, *more),
+        warnings=(*warnings, *rigged.warnings, *more, *_small_turns(rigged, options.pointing)),
     )
     return PlainTraverse(traverse=traverse, sources=(*rigged.sources, *_pointing_sources(options, usual)))
 
@@ -96,6 +99,20 @@ def _require_sense(options: PlainOptions) -> None:
     for name, sigma in sigmas.items():
         if sigma is not None and not (np.isfinite(sigma) and sigma >= 0):
             raise InputError(f"{name}: expected 0 (exact) or a positive number, found {sigma:g}")
+
+
+def _small_turns(rigged: RiggedPictures, table: Path) -> tuple[str, ...]:
+    """A warning where the pans of a table look like radians: many, and all within a bit of one picture."""
+    pans_rad = [row.pan_rad for row, _ in rigged.pictures]
+    camera = rigged.rig.eyes[0].camera.pinhole
+    field_rad = 2 * np.arctan(0.5 * camera.width_px / camera.fx_px)
+    span_rad = max(pans_rad) - min(pans_rad)
+    if len(set(pans_rad)) < _FEWEST_PANS or np.rad2deg(span_rad) > 2 * np.pi or span_rad > field_rad / 4:
+        return ()
+    return (
+        f"{table}: pans span {np.rad2deg(span_rad):.3g} degrees, where a picture has "
+        f"{np.rad2deg(field_rad):.3g}; degrees are expected: are these radians?",
+    )
 
 
 def _pointing_sources(options: PlainOptions, usual: PointingSigma) -> tuple[str, ...]:
