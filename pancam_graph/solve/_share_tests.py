@@ -25,6 +25,11 @@ _FAIR_LET_GO = 0.95
 """The same of a frame whose telemetry was let go: its pointing is then right, or something else is wrong."""
 _OBSERVATIONS = 12
 """Images, frames and stops with fewer observations are not tested alone ..."""
+_APART = 0.1
+"""Largest share of sights by two eyes that may be lost by both, beyond what eyes lose one by one: half of the
+points that join frames to others would be a quarter of it."""
+_SIGHTS = 50
+"""Sights by two eyes below which that is not tested."""
 _LINKS = 4
 """... nor are frames and stops that share fewer points with others."""
 
@@ -104,6 +109,39 @@ def shares_in_use(problem: Problem) -> Iterator[VerdictTest]:
         what = f"points shared with another {name}"
         test = _Fairness(name=f"{name} links", owner=name, what=what, least=_LINKS, fair=_FAIR_LINKS, ids=ids)
         yield test.of(InUse.links(problem, owner, len(ids)))
+    yield _frames_apart(problem)
+
+
+def _frames_apart(problem: Problem) -> VerdictTest:
+    """That two eyes of a frame are not left out together more often than each alone.
+
+    Outliers hit the eyes of a frame one by one, and a point that two eyes see is then lost by both at the
+    product of their shares. Frames that point elsewhere than told keep what their own eyes see, and points
+    lose all their sights in other frames.
+    """
+    m, frame = problem.measurements, problem.template.traverse.image_frame
+    key = m.landmark * len(problem.template.traverse.frames) + frame[m.image]
+    order = slice(None) if np.all(np.diff(key) >= 0) else np.argsort(key, kind="stable")
+    key, kept = key[order], problem.kept[order]
+    starts = np.flatnonzero(np.diff(key, prepend=-1))
+    n, used = np.diff(starts, append=len(key)), np.add.reduceat(kept.astype(np.int64), starts)
+    landmark = key[starts] // max(len(problem.template.traverse.frames), 1)
+    is_shared, in_use = np.bincount(landmark) >= 2, np.bincount(landmark, used) > 0
+    of_two = used[(n == 2) & is_shared[landmark] & in_use[landmark]]
+    name, what = "frames apart", "points shared by frames"
+    if len(of_two) < _SIGHTS:
+        return VerdictTest.of(name, None, _APART, f"too few {what} to compare the eyes of a frame", "")
+    lost = float(np.mean(of_two == 0))
+    value = lost - (1 - float(np.mean(of_two)) / 2) ** 2
+    says = f"of {what}, {lost:.0%} are lost by both eyes of a frame, {value:+.0%} more than by chance"
+    return VerdictTest.of(
+        name,
+        value,
+        _APART,
+        says,
+        f"{says}: frames do not point where they are told to, or matches between frames are wrong; check pan "
+        "and tilt (their sense, order and unit), or widen their sigmas",
+    )
 
 
 def let_go_links(problem: Problem) -> Iterator[VerdictTest]:

@@ -53,6 +53,22 @@ def test_a_right_drive_passes(rig: str, outliers: float) -> None:
     assert not solution.verdict.notes
 
 
+@pytest.mark.parametrize("outliers", [pytest.param(0.0, marks=pytest.mark.slow), 0.6])
+def test_outliers_do_not_tear_frames_apart(outliers: float) -> None:
+    solution = solve(drive(outliers=outliers).traverse)
+    apart = named(solution)["frames apart"]
+    assert apart.value is not None
+    assert apart.value < apart.limit / 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rig", ["mer-navcam", "exomars-pancam"])
+def test_pans_in_the_other_sense_tear_frames_apart(rig: str) -> None:
+    t = drive(rig=rig).traverse
+    turned = replace(t, frames=tuple(replace(f, pan_rad=-f.pan_rad) for f in t.frames))
+    assert "frames apart" in failed(solve(turned))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["circle", "free", "projective"])
 def test_a_right_drive_passes_in_other_models(model: str) -> None:
