@@ -27,6 +27,8 @@ _ARMS_TOLD_M, _ARMS_UNTOLD_M = 0.01, 0.05
 _MOUNT_RAD, _TILT_AXIS_RAD, _FLEX_RAD = 0.02, 0.01, 1e-3
 _SCALE = 5e-3
 """Of pans and tilts over their readings, as a share: servos have one, gears with encoders do not."""
+_ASPECT = 2e-3
+"""Of fy / fx, as a share: sensors have square pixels, pictures that were projected anew not always."""
 _PRINCIPAL_POINT, _FIELD = 1e-2, 1e-3
 """Shares of the longer side of a picture: principal point, and what lens and processing distort."""
 _MOST_ARM_M = 100.0
@@ -86,6 +88,7 @@ def _uncertainty(rig: Rig, focal: float, arms_sigma_m: float) -> RigUncertainty:
     side_px = rig.longest_side_px
     return RigUncertainty(
         focal=focal,
+        aspect=_ASPECT,
         principal_point_px=_PRINCIPAL_POINT * side_px,
         skew_px=RigUncertainty.usual(side_px).skew_px,
         field_px=_FIELD * side_px,
