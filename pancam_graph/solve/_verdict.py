@@ -291,6 +291,16 @@ def _let_go(at: Optimum) -> VerdictTest:
     says = f"{len(parts)} part{'s' if len(parts) > 1 else ''} of telemetry let go: {some}"
     if len(parts) > _NAMED:
         says += f"; and {len(parts) - _NAMED} more"
+    exact = _held_against(at)
+    if exact:
+        return VerdictTest.of(
+            "let go",
+            float(len(parts)),
+            0.0,
+            "",
+            f"{says}: but {exact} is said to be exact, and all others of its stop went along with it; "
+            "give it a sigma",
+        )
     if len(parts) <= most:
         return VerdictTest.note("let go", float(len(parts)), 0.0, "", f"{says}; look where it came from")
     return VerdictTest.of(
@@ -300,6 +310,19 @@ def _let_go(at: Optimum) -> VerdictTest:
         "",
         f"{says}: too many to believe the rest; check telemetry, its sigmas, and the rig",
     )
+
+
+def _held_against(at: Optimum) -> str:
+    """A pan or tilt that telemetry holds at a stop where that of all frames was let go; empty: there is none.
+
+    The others then agree with each other and not with it, and it may as well be the one that is wrong.
+    """
+    t, common = at.traverse, at.fitted.problem.template.let_go.common_rad
+    for row, frame in enumerate(t.frames):
+        for k, (what, sigma) in enumerate((("pan", frame.sigma_pan_rad), ("tilt", frame.sigma_tilt_rad))):
+            if sigma == 0 and common[t.frame_stop[row], k] > 0:
+                return f"the {what} of {frame.id}"
+    return ""
 
 
 def _describe(c: Correction, t: Traverse) -> str:

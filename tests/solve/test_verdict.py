@@ -61,6 +61,15 @@ def test_outliers_do_not_tear_frames_apart(outliers: float) -> None:
     assert apart.value < apart.limit / 2
 
 
+def test_a_wrong_pan_that_is_said_to_be_exact_fails_where_the_others_went_along() -> None:
+    made = drive()
+    frames = list(made.traverse.frames)
+    frames[4] = replace(frames[4], pan_rad=float(made.truth.pan_tilt_rad[4, 0]) + 0.01, sigma_pan_rad=0.0)
+    solution = solve(replace(made.traverse, frames=tuple(frames)))
+    assert "let go" in failed(solution)
+    assert f"the pan of {frames[4].id} is said to be exact" in named(solution)["let go"].says
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("rig", ["mer-navcam", "exomars-pancam"])
 def test_pans_in_the_other_sense_tear_frames_apart(rig: str) -> None:
