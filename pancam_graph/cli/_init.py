@@ -112,10 +112,9 @@ def _work(call: Invocation) -> int:
     for source in plain.sources:
         call.say(source)
     traverse = plain.traverse
-    call.say(
-        f"{told.folder / 'traverse.json'}: {len(traverse.stops)} stops, {len(traverse.frames)} frames, "
-        f"{len(traverse.images)} images; traverse.txt explains it"
-    )
+    counts = {"stop": traverse.stops, "frame": traverse.frames, "image": traverse.images}
+    found = ", ".join(f"{len(of)} {name}{'' if len(of) == 1 else 's'}" for name, of in counts.items())
+    call.say(f"{told.folder / 'traverse.json'}: {found}; traverse.txt explains it")
     return 0
 
 

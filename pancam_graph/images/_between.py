@@ -30,7 +30,7 @@ from pancam_graph.images._patches import MAX_REACH_PX, QUALITIES, Coefficients, 
 from pancam_graph.images._splines import Splines
 from pancam_graph.images._terrain import Sighting, StopTerrain
 
-__all__ = ["StopMatcher", "StopTies", "agreeing", "joined", "near_stops", "on_terrain", "stereo_stops"]
+__all__ = ["StopMatcher", "StopTies", "agreeing", "joined", "on_terrain", "stereo_stops"]
 
 _CELL_PX = 64.0
 _PER_CELL = 2
@@ -60,13 +60,6 @@ def stereo_stops(traverse: Traverse, pairs: Sequence[tuple[int, int]]) -> BoolAr
         if traverse.image_frame[a] == traverse.image_frame[b]:
             in_stereo[traverse.image_stop[a]] = True
     return in_stereo
-
-
-def near_stops(traverse: Traverse, options: FrontEndOptions) -> BoolArray:
-    """Which stops (stops, stops) stand near enough to another one to see the same terrain."""
-    place = np.array([s.world_T_mast.translation() for s in traverse.stops])
-    apart_m = np.linalg.norm(place[:, None] - place, axis=2)
-    return np.asarray((apart_m <= options.max_stop_distance_m) & ~np.eye(len(place), dtype=bool))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -38,7 +38,7 @@ class FrontEndOptions:
     min_overlap_between_stops: float = 0.25
     """The same for images of two stops, whose terrain may lie at any depth: most that can overlap do not."""
     max_stop_distance_m: float = 20.0
-    """Images of stops further apart are not compared."""
+    """Images of stops further apart are not compared, telemetry off by two of its sigmas at most."""
     search_sigmas: float = 4.0
     """How many standard deviations of the telemetry the search window reaches."""
     search_slack_px: float = 3.0

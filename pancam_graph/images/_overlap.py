@@ -11,10 +11,11 @@ from pancam_graph.data import Traverse
 from pancam_graph.images._front_end_options import FrontEndOptions
 from pancam_graph.images._pairs import MAX_TURN_RAD, MAX_ZOOM, PairGeometry, inspected_depths_m
 
-__all__ = ["overlap_cells", "overlapping_pairs"]
+__all__ = ["near_stops", "overlap_cells", "overlapping_pairs"]
 
 _GRID = 5
 _CELLS = 32
+_OFF_SIGMAS = 2.0
 
 
 def overlapping_pairs(
@@ -52,6 +53,20 @@ def _share(pair: PairGeometry, options: FrontEndOptions) -> float:
     return share if share > least else 0.0
 
 
+def near_stops(traverse: Traverse, options: FrontEndOptions) -> BoolArray:
+    """Which stops (stops, stops) may stand near enough to another one to see the same terrain.
+
+    They count as near where errors of telemetry of two sigmas may have put them further apart than they are,
+    by no more than the distance that is near itself.
+    """
+    most_m = options.max_stop_distance_m
+    place = np.array([s.world_T_mast.translation() for s in traverse.stops])
+    sigma = np.array([s.sigma_translation_m for s in traverse.stops])
+    off_m = np.minimum(_OFF_SIGMAS * np.hypot(sigma[:, None], sigma), most_m)
+    apart_m = np.linalg.norm(place[:, None] - place, axis=2)
+    return np.asarray((apart_m - off_m <= most_m) & ~np.eye(len(place), dtype=bool))
+
+
 def _cones_meet(traverse: Traverse, options: FrontEndOptions) -> BoolArray:
     """Which images (images, images) may see a common point: a quick test with cones around their fields."""
     R, centre = traverse.camera_poses()
@@ -63,7 +78,7 @@ def _cones_meet(traverse: Traverse, options: FrontEndOptions) -> BoolArray:
     turn = np.array([s.sigma_rotation_rad for s in traverse.stops])[stop]
     shift = np.array([s.sigma_translation_m for s in traverse.stops])[stop]
     slack = np.hypot(pointing[traverse.image_frame], turn * np.sqrt(3)) + options.mount_sigma_rad
-    place = np.array([s.world_T_mast.translation() for s in traverse.stops])[stop]
+    near = near_stops(traverse, options) | np.eye(len(traverse.stops), dtype=bool)
     meet = np.zeros((len(R), len(R)), dtype=bool)
     depths = inspected_depths_m(options.min_depth_m)
     for a, eye in enumerate(traverse.image_eye):
@@ -73,7 +88,7 @@ def _cones_meet(traverse: Traverse, options: FrontEndOptions) -> BoolArray:
         direction = camera.unproject(np.column_stack([u.ravel(), v.ravel()])).direction @ R[a].T
         points = (centre[a] + depths[:, None, None] * direction).reshape(-1, 3)
         gap = half[a] / (_GRID - 1)
-        close = np.linalg.norm(place - place[a], axis=1) <= options.max_stop_distance_m
+        close = near[stop[a], stop]
         to_point = points[:, None] - centre
         range_m = np.maximum(np.linalg.norm(to_point, axis=2), 1e-6)
         angle = np.arccos(np.clip(np.einsum("kni,ni->kn", to_point, axis) / range_m, -1.0, 1.0))

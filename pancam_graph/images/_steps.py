@@ -26,7 +26,6 @@ from pancam_graph.images._between import (
     StopTies,
     agreeing,
     joined,
-    near_stops,
     on_terrain,
     stereo_stops,
 )
@@ -35,7 +34,7 @@ from pancam_graph.images._features import Features, find_features
 from pancam_graph.images._front_end_options import FrontEndOptions
 from pancam_graph.images._masks import ImageMask, Reason, elevation_rad, mask_image, pixels_at
 from pancam_graph.images._match_pair import PairMatches, match_pair
-from pancam_graph.images._overlap import overlap_cells, overlapping_pairs
+from pancam_graph.images._overlap import near_stops, overlap_cells, overlapping_pairs
 from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._patch_noise import shared_by_tracks
 from pancam_graph.images._read import Pictures, image_name, read_pictures

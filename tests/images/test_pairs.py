@@ -3,12 +3,13 @@
 from collections.abc import Callable
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 import pytest
 
 from pancam_graph import SimulationOptions, Traverse, simulate
 from pancam_graph.images import FrontEndOptions
-from pancam_graph.images._overlap import overlapping_pairs
+from pancam_graph.images._overlap import near_stops, overlapping_pairs
 from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.rigs import Rig, exomars_pancam, mer_navcam
 
@@ -36,3 +37,17 @@ def test_pixels_are_left_out_at_once_only_where_they_have_no_window(rig: Callabl
             assert np.array_equal(getattr(found, name)[whole.valid], column[whole.valid]), name
         quick += int(not pair._near(uv, *window).all())
     assert quick > 3
+
+
+@pytest.mark.parametrize(
+    ("apart_m", "sigma_m", "near"), [(19, 0, True), (21, 0, False), (24, 2, True), (60, 99, False)]
+)
+def test_stops_that_telemetry_may_have_put_too_far_apart_are_near(
+    apart_m: float, sigma_m: float, near: bool
+) -> None:
+    t = traverse(mer_navcam())
+    pose = gtsam.Pose3(gtsam.Rot3(), np.array([apart_m, 0.0, 0.0]))
+    first = replace(t.stops[0], world_T_mast=gtsam.Pose3(), sigma_translation_m=0.0)
+    second = replace(t.stops[1], world_T_mast=pose, sigma_translation_m=sigma_m)
+    found = near_stops(replace(t, stops=(first, second)), OPTIONS)
+    assert found.tolist() == [[False, near], [near, False]]

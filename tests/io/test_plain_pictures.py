@@ -473,7 +473,7 @@ def test_the_command_writes_once_and_says_what_it_did(
     out, err = capsys.readouterr()
     assert (
         out.splitlines()[-1]
-        == f"{folder}/traverse.json: 1 stops, 2 frames, 2 images; traverse.txt explains it"
+        == f"{folder}/traverse.json: 1 stop, 2 frames, 2 images; traverse.txt explains it"
     )
     assert err.splitlines()[-1] == f"warning: pictures without a line in {pointing} are left out: c.png"
     before = (folder / "traverse.json").read_bytes()
