@@ -38,6 +38,8 @@ _UNEVEN = 2.0
 """Largest ratio of an image's, or a camera's, residuals to those of all."""
 _NAMED = 6
 """Parts of telemetry let go that are named."""
+_FAR_OFF = 10.0
+"""Sigmas beyond which odometry may as well be right, and the rig wrong, where all of it is let go."""
 _BEATEN = 3.0
 """Change of an entry of the rig in sigmas of its prior from which it is said."""
 _FIELD_BEATEN = 2.0
@@ -301,6 +303,15 @@ def _let_go(at: Optimum) -> VerdictTest:
             f"{says}: but {exact} is said to be exact, and all others of its stop went along with it; "
             "give it a sigma",
         )
+    if _no_place_left(at):
+        return VerdictTest.of(
+            "let go",
+            float(len(parts)),
+            0.0,
+            "",
+            f"{says}: nothing of where stops stand is left, and the rig alone tells how long all is; check "
+            "odometry and the distance of the eyes (baseline)",
+        )
     if len(parts) <= most:
         return VerdictTest.note("let go", float(len(parts)), 0.0, "", f"{says}; look where it came from")
     return VerdictTest.of(
@@ -310,6 +321,15 @@ def _let_go(at: Optimum) -> VerdictTest:
         "",
         f"{says}: too many to believe the rest; check telemetry, its sigmas, and the rig",
     )
+
+
+def _no_place_left(at: Optimum) -> bool:
+    """Whether the places of all stops that telemetry does not hold were let go, by many sigmas each."""
+    t, let_go = at.traverse, at.let_go
+    free = np.array([s.sigma_translation_m > 0 for s in t.stops])
+    went = np.any(at.fitted.problem.template.let_go.stops[free, 3:], axis=1)
+    sizes = [abs(part.size) / part.sigma for part in let_go if part.is_length]
+    return bool(free.any() and np.all(went) and min(sizes, default=0.0) > _FAR_OFF)
 
 
 def _held_against(at: Optimum) -> str:

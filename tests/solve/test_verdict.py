@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Literal
 
+import gtsam
 import numpy as np
 import pytest
 
@@ -59,6 +60,18 @@ def test_outliers_do_not_tear_frames_apart(outliers: float) -> None:
     apart = named(solution)["frames apart"]
     assert apart.value is not None
     assert apart.value < apart.limit / 2
+
+
+@pytest.mark.parametrize("rig", slow_for("exomars-pancam", ["mer-navcam", "exomars-pancam"]))
+def test_a_wrong_baseline_is_not_odometry_that_is_wrong(rig: str) -> None:
+    t = drive(rig=rig).traverse
+    eyes = [
+        replace(e, head_T_camera=gtsam.Pose3(e.head_T_camera.rotation(), 2 * e.head_T_camera.translation()))
+        for e in t.rig.eyes
+    ]
+    solution = solve(replace(t, rig=replace(t.rig, eyes=tuple(eyes))))
+    assert "let go" in failed(solution)
+    assert "baseline" in named(solution)["let go"].says
 
 
 def test_a_wrong_pan_that_is_said_to_be_exact_fails_where_the_others_went_along() -> None:
