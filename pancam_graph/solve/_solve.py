@@ -22,7 +22,7 @@ from pancam_graph.solve._solution_of import solution_of
 __all__ = ["COMPILING", "SolveOptions", "solve"]
 
 _LOG = logging.getLogger(__name__)
-COMPILING = "compiling the kernel for this machine: about 20 seconds, once"
+COMPILING = "compiling the kernel for this machine: about half a minute, once"
 """What the first solve of an installation logs."""
 
 
