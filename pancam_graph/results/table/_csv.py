@@ -4,6 +4,7 @@ import csv
 import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -82,12 +83,11 @@ def _block(
 ) -> bytes:
     """Rows as text, in the memory `out`."""
     late, late_number = np.empty(numbers.size, dtype=np.int64), np.empty(numbers.size)
-    n, n_late = write_rows(kind, whole, numbers, text, begin, out, late, late_number)
-    for at, x in zip(late[:n_late].tolist(), late_number[:n_late].tolist(), strict=True):
+    n = write_rows(kind, whole, numbers, text, begin, out, late, late_number)
+    for at, x in takewhile(lambda cell: cell[0] >= 0, zip(late, late_number, strict=True)):
         written = f"{x:.10g}".encode()
         out[at : at + len(written)] = np.frombuffer(written, dtype=np.uint8)
-    block = out[:n].tobytes()
-    return block.replace(b"\0", b"") if n_late else block
+    return out[:n].tobytes().replace(b"\0", b"")
 
 
 def _line(cells: Sequence[str]) -> bytes:

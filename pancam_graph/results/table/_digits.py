@@ -112,13 +112,13 @@ def write_rows(
     out: Bytes,
     late: IntArray,
     late_number: FloatArray,
-) -> tuple[int, int]:
+) -> int:
     """Write rows of cells with commas between and line feeds after into `out`; returns how many bytes.
 
     `kind` (columns,) is NAME, WHOLE or NUMBER. `whole` (rows, of these columns) has for a name its row among
     the texts that `begin` (texts + 1,) cuts `text` into; `numbers` (rows, the other columns) is empty text
     where it is not finite. Numbers left to Python have ROOM bytes of 0; `late` and `late_number` get the
-    places and values of these. The second value returned is how many they are.
+    places and values of these, and then a place of -1 where there is room for more.
     """
     at = n_late = 0
     for i in range(whole.shape[0]):
@@ -156,4 +156,6 @@ def write_rows(
                     at += ROOM
         out[at] = 10
         at += 1
-    return at, n_late
+    if n_late < len(late):
+        late[n_late] = -1
+    return at
