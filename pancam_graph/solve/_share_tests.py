@@ -25,13 +25,13 @@ _FAIR_LET_GO = 0.95
 """The same of a frame whose telemetry was let go: its pointing is then right, or something else is wrong."""
 _OBSERVATIONS = 12
 """Images, frames and stops with fewer observations are not tested alone ..."""
+_LINKS = 4
+"""... nor are frames and stops that share fewer points with others."""
 _APART = 0.1
 """Largest share of sights by two eyes that may be lost by both, beyond what eyes lose one by one: half of the
 points that join frames to others would be a quarter of it."""
 _SIGHTS = 50
 """Sights by two eyes below which that is not tested."""
-_LINKS = 4
-"""... nor are frames and stops that share fewer points with others."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

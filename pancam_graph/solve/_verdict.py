@@ -293,34 +293,21 @@ def _let_go(at: Optimum) -> VerdictTest:
     says = f"{len(parts)} part{'s' if len(parts) > 1 else ''} of telemetry let go: {some}"
     if len(parts) > _NAMED:
         says += f"; and {len(parts) - _NAMED} more"
-    exact = _held_against(at)
+    exact, limit = _held_against(at), 0.0
     if exact:
-        return VerdictTest.of(
-            "let go",
-            float(len(parts)),
-            0.0,
-            "",
-            f"{says}: but {exact} is said to be exact, and all others of its stop went along with it; "
-            "give it a sigma",
+        why = (
+            f"but {exact} is said to be exact, and all others of its stop went along with it; give it a sigma"
         )
-    if _no_place_left(at):
-        return VerdictTest.of(
-            "let go",
-            float(len(parts)),
-            0.0,
-            "",
-            f"{says}: nothing of where stops stand is left, and the rig alone tells how long all is; check "
-            "odometry and the distance of the eyes (baseline)",
+    elif _no_place_left(at):
+        why = (
+            "nothing of where stops stand is left, and the rig alone tells how long all is; check odometry "
+            "and the distance of the eyes (baseline)"
         )
-    if len(parts) <= most:
+    elif len(parts) > most:
+        limit, why = float(most), "too many to believe the rest; check telemetry, its sigmas, and the rig"
+    else:
         return VerdictTest.note("let go", float(len(parts)), 0.0, "", f"{says}; look where it came from")
-    return VerdictTest.of(
-        "let go",
-        float(len(parts)),
-        float(most),
-        "",
-        f"{says}: too many to believe the rest; check telemetry, its sigmas, and the rig",
-    )
+    return VerdictTest.of("let go", float(len(parts)), limit, "", f"{says}: {why}")
 
 
 def _no_place_left(at: Optimum) -> bool:
@@ -338,10 +325,9 @@ def _held_against(at: Optimum) -> str:
     The others then agree with each other and not with it, and it may as well be the one that is wrong.
     """
     t, common = at.traverse, at.fitted.problem.template.let_go.common_rad
-    for row, frame in enumerate(t.frames):
-        for k, (what, sigma) in enumerate((("pan", frame.sigma_pan_rad), ("tilt", frame.sigma_tilt_rad))):
-            if sigma == 0 and common[t.frame_stop[row], k] > 0:
-                return f"the {what} of {frame.id}"
+    sigmas = np.array([frame.sigmas_rad for frame in t.frames]).reshape(-1, 2)
+    for row, k in np.argwhere((sigmas == 0) & (common[t.frame_stop] > 0)):
+        return f"the {('pan', 'tilt')[k]} of {t.frames[row].id}"
     return ""
 
 
