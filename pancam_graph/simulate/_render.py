@@ -181,6 +181,50 @@ class Rendering:
         hit = np.isfinite(distance) & rays.valid
         return origin + np.where(hit, distance, 0.0)[:, None] * direction, hit
 
+    def depth_m(self, row: int) -> FloatArray:
+        """Depth (height, width) of what each pixel of an image sees: along the camera's axis, metres.
+
+        NaN in the sky and outside the camera's domain. Truth for a dense match: see `points`.
+        """
+        rotation, centre = self._camera(row)
+        camera = self.truth.rig.eyes[int(self.traverse.image_eye[row])].camera
+        v, u = np.mgrid[: camera.height_px, : camera.width_px].astype(float)
+        depth = np.empty(v.shape)
+
+        def band(begin: int, end: int) -> None:
+            pixels = np.stack([u[begin:end].ravel(), v[begin:end].ravel()], axis=1)
+            points, hit = self.points(row, pixels)
+            along = (points - centre) @ rotation[:, 2]
+            depth[begin:end] = np.where(hit, along, np.nan).reshape(end - begin, -1)
+
+        in_parallel(band, camera.height_px, grain=_BAND_PX)
+        return depth
+
+    def heights_m(self, xy_m: FloatArray, footprint_m: float) -> FloatArray:
+        """Height of the ground (n,) in the world at x and y (n, 2), rocks and stones on it included.
+
+        The deck is no ground. Stones smaller than `footprint_m`, metres, are left out, as a pixel of that
+        width leaves them out. NaN beyond the world's edge. Raises InputError for a footprint that is not
+        above 0.
+        """
+        if not footprint_m > 0:
+            raise InputError(f"rendering: footprint_m: expected a number above 0, found {footprint_m}")
+        places = np.asarray(xy_m, dtype=float).reshape(-1, 2)
+        above = max(self._scene.top_m, self._scene.rock_top_m) + 1.0
+        down, deck = np.array([0.0, 0.0, -1.0]), self._deck(0, seen=False)
+        heights = np.empty(len(places))
+
+        def some(begin: int, end: int) -> None:
+            n = end - begin
+            ground = _rays.heights(self._scene, places[begin:end])
+            from_m = np.column_stack([places[begin:end], np.full(n, above)])
+            width = footprint_m / np.maximum(above - ground, 1e-3)
+            distance = _trace(self._scene, deck, from_m, np.tile(down, (n, 1)), width, lit=False).distance_m
+            heights[begin:end] = np.where(np.isfinite(distance), above - distance, np.nan)
+
+        in_parallel(some, len(places), grain=_BAND_PX * _BAND_PX)
+        return heights
+
     def _camera(self, row: int) -> tuple[FloatArray, FloatArray]:
         """world_R_camera and the camera's place, in truth."""
         true = replace(self.traverse, rig=self.truth.rig)
@@ -189,10 +233,10 @@ class Rendering:
         )
         return np.ascontiguousarray(rotation[row]), np.ascontiguousarray(centre[row])
 
-    def _deck(self, row: int) -> Deck:
+    def _deck(self, row: int, *, seen: bool = True) -> Deck:
         stop = int(self.traverse.frame_stop[self.traverse.image_frame[row]])
         pose = self.truth.world_T_mast[stop]
-        return make_deck(self.truth.rig.mast_height_m, pose, seen=self.options.deck)
+        return make_deck(self.truth.rig.mast_height_m, pose, seen=seen and self.options.deck)
 
     def _band_rays(self, eye: int, rows: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Lines of sight of whole rows, a margin on both sides included, in the camera frame.

@@ -130,6 +130,32 @@ def test_what_a_pixel_sees_projects_back_into_it(stereo: Rendering) -> None:
     np.testing.assert_allclose(pixels(stereo, 3, points[hit]), uv[hit], atol=1e-7)
 
 
+def test_depths_and_heights_are_of_the_surface_that_pixels_see(small_world: None) -> None:
+    rendering = render(
+        coarse(rig_template("mer-navcam"), 0.0625), replace(STEREO, rock_abundance=0.1), seed=4
+    )
+    rotation, centre = poses(rendering)
+    depth = rendering.depth_m(0)
+    assert 0.02 < np.isnan(depth).mean() < 0.6  # the horizon is in the picture
+    v, u = np.nonzero(depth < 4)
+    camera = rendering.truth.rig.eyes[0].camera
+    rays = camera.unproject(np.column_stack([u, v]).astype(float)).direction
+    seen = centre[0] + rays / rays[:, 2:] * depth[v, u][:, None] @ rotation[0].T
+    again, _ = rendering.points(0, np.column_stack([u, v]).astype(float))
+    np.testing.assert_allclose(seen, again, atol=1e-9)
+    # A place that is seen from the mast is on top, but for stones and flanks: heights from above are no lower.
+    above = rendering.heights_m(seen[:, :2], 0.01)
+    assert np.all(above > seen[:, 2] - 1e-3)
+    assert np.median(above - seen[:, 2]) < 1e-3
+    bare = render(coarse(rig_template("mer-navcam"), 0.0625), replace(STEREO, rock_abundance=0.0), seed=4)
+    xy = np.random.default_rng(1).uniform(-3, 3, (500, 2))
+    stones = bare.heights_m(xy, 0.001) - bare.heights_m(xy, 1.0)
+    assert stones.min() > -1e-9
+    assert 0.005 < stones.max() < 0.03  # pebbles of up to 4 cm, partly buried; wide footprints show none
+    with pytest.raises(InputError, match="footprint_m: expected a number above 0, found 0"):
+        bare.heights_m(xy, 0.0)
+
+
 @pytest.mark.parametrize("template", TEMPLATES)
 def test_any_rig_renders(template: str) -> None:
     options = RenderOptions(stops=1, pans=1, tilts_rad=(-0.5,), rock_abundance=0.0)

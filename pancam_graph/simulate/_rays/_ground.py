@@ -59,12 +59,16 @@ def height_at(scene: Scene, level: int, x: float, y: float) -> float:
 
 
 @entry
-def heights(scene: Scene, xy_m: FloatArray) -> FloatArray:
-    """Height of the ground (n,) at x and y (n, 2)."""
-    out = np.empty(len(xy_m))
+def _heights(scene: Scene, xy_m: FloatArray, out: FloatArray) -> None:
     for i in range(len(xy_m)):
         x, y = xy_m[i, 0], xy_m[i, 1]
         out[i] = height_at(scene, level_at(scene, x, y), x, y)
+
+
+def heights(scene: Scene, xy_m: FloatArray) -> FloatArray:
+    """Height of the ground (n,) at x and y (n, 2), without rocks and stones."""
+    out = np.empty(len(xy_m))
+    _heights(scene, np.ascontiguousarray(xy_m, dtype=float), out)
     return out
 
 

@@ -73,6 +73,24 @@ def noise_in_space(x: float, y: float, z: float, key: int) -> tuple[float, float
 
 
 @entry
+def _noises(
+    lattice: Grids,
+    x: FloatArray,
+    y: FloatArray,
+    longest_m: float,
+    shortest_m: float,
+    gain: float,
+    key: int,
+    out: FloatArray,
+) -> None:
+    for n in range(len(x)):
+        length, size, px, py, k = longest_m, 1.0, x[n], y[n], key
+        while length >= shortest_m:
+            out[n] += size * noise(lattice, px / length, py / length, k)[0]
+            px, py = 0.8 * px - 0.6 * py + 17.3, 0.6 * px + 0.8 * py - 9.1
+            length, size, k = 0.5 * length, gain * size, k + 1
+
+
 def noises(
     lattice: Grids,
     x: FloatArray,
@@ -87,10 +105,5 @@ def noises(
     Each octave is rotated against the one before, so that the lattice of the noise does not show.
     """
     out = np.zeros(len(x))
-    for n in range(len(x)):
-        length, size, px, py, k = longest_m, 1.0, x[n], y[n], key
-        while length >= shortest_m:
-            out[n] += size * noise(lattice, px / length, py / length, k)[0]
-            px, py = 0.8 * px - 0.6 * py + 17.3, 0.6 * px + 0.8 * py - 9.1
-            length, size, k = 0.5 * length, gain * size, k + 1
+    _noises(lattice, x, y, longest_m, shortest_m, gain, key, out)
     return out
