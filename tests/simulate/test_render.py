@@ -143,7 +143,7 @@ def test_depths_and_heights_are_of_the_surface_that_pixels_see(small_world: None
     seen = centre[0] + rays / rays[:, 2:] * depth[v, u][:, None] @ rotation[0].T
     again, _ = rendering.points(0, np.column_stack([u, v]).astype(float))
     np.testing.assert_allclose(seen, again, atol=1e-9)
-    # A place that is seen from the mast is on top, but for stones and flanks: heights from above are no lower.
+    # Heights from above are no lower than what the mast sees, and most of what it sees is on top.
     above = rendering.heights_m(seen[:, :2], 0.01)
     assert np.all(above > seen[:, 2] - 1e-3)
     assert np.median(above - seen[:, 2]) < 1e-3
