@@ -33,10 +33,11 @@ class Pattern:
     """For each group the first column of each of these in its panel, and the number of columns."""
 
 
-def pattern(dim: IntArray, cliques: Iterable[Iterable[int]]) -> Pattern:
+def pattern(dim: IntArray, cliques: Iterable[Iterable[int]], *, last: int | None = None) -> Pattern:
     """Order of elimination by minimum degree, counted in columns, and its fill-in.
 
-    `cliques` are sets of groups that some factor joins.
+    `cliques` are sets of groups that some factor joins; `last` is a group that is eliminated after all others
+    whatever its degree.
     """
     n = len(dim)
     near: list[set[int]] = [set() for _ in range(n)]
@@ -47,7 +48,9 @@ def pattern(dim: IntArray, cliques: Iterable[Iterable[int]]) -> Pattern:
     left = np.ones(n, dtype=bool)
     order: list[int] = []
     reach: list[set[int]] = [set() for _ in range(n)]
-    for _ in range(n):
+    for i in range(n):
+        if last is not None:
+            left[last] = i == n - 1
         g = int(np.argmin(np.where(left, degree, np.iinfo(np.int64).max)))
         left[g] = False
         order.append(g)
@@ -333,18 +336,18 @@ class Root:
             x[of_group] = np.linalg.solve(rows[:, :n], x[of_group] - rows[:, n:-1] @ rest)
         return x
 
-    def marginal(self, g: int) -> tuple[FloatArray, FloatArray]:
-        """Covariance (n, n) of group g in the inverse of R'R, and its part (n,) of `step`.
+    def last_information(self) -> tuple[FloatArray, FloatArray]:
+        """Information (n, n) of the group eliminated last, all others marginalised, and its gradient (n,).
 
-        Cheaper than `covariance` the later the group was eliminated. Raises FreeDirectionError where R leaves
-        a direction free.
+        Raises FreeDirectionError where R leaves a direction free.
         """
         st = self.structure
-        begin = np.concatenate([[0], np.cumsum(st.dim)])
-        unit = np.zeros((int(begin[-1]), int(st.dim[g])))
-        unit[begin[g] : begin[g + 1]] = np.eye(unit.shape[1])
-        half = self.forward(unit)
-        return half.T @ half, -half.T @ np.concatenate([rows[:, -1] for rows in self.rows])
+        for g in st.order:
+            n = int(st.dim[g])
+            if len(self.rows[g]) < n:
+                raise FreeDirectionError(g, _loosest(self.rows[g][:, :n]))
+        rows = self.rows[st.order[-1]]
+        return rows[:, :-1].T @ rows[:, :-1], rows[:, :-1].T @ rows[:, -1]
 
     def covariance(self) -> "Covariance":
         """The blocks of the inverse of R'R where R is filled.

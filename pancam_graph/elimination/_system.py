@@ -111,12 +111,14 @@ class LandmarkSystem:
         loss: Loss = SQUARED,
         *,
         cliques: Iterable[Iterable[int]] = (),
+        last: int | None = None,
         refined: bool = False,
         room: Room | None = None,
     ) -> None:
         """Arrange observations and landmarks; `cliques` are groups that other factors join.
 
-        `refined`: after a step all landmarks are refined, not only strays.
+        `last` is the group that is eliminated last; None: the one that leaves the least work. `refined`:
+        after a step all landmarks are refined, not only strays.
         """
         self.linkage, self.loss, self._refined = linkage, loss, refined
         self._measurements = measurements
@@ -127,7 +129,7 @@ class LandmarkSystem:
         self.vector = landmarks.vector[self.landmark_row]
         """(landmarks, 4) at the point of linearisation"""
         self.origin_m = landmarks.origin_m[self.landmark_row]
-        self.structure = pattern(linkage.group_dim, [*reach.values(), *cliques])
+        self.structure = pattern(linkage.group_dim, [*reach.values(), *cliques], last=last)
         self._panels = Panels(self.structure)
         self._layout = Layout.of(linkage)
         edges = np.flatnonzero(np.diff(first[self.landmark_row], prepend=-1, append=-1))

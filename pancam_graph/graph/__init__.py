@@ -24,6 +24,7 @@ from pancam_graph.graph._keys import read_variable as read_variable
 from pancam_graph.graph._landmarks import ExplicitLandmarks as ExplicitLandmarks
 from pancam_graph.graph._let_go import LetGo as LetGo
 from pancam_graph.graph._projective import ProjectiveTemplate as ProjectiveTemplate
+from pancam_graph.graph._rig_variables import RigVariable as RigVariable
 from pancam_graph.graph._rig_variables import RigVariables as RigVariables
 from pancam_graph.graph._soft import SoftTemplate as SoftTemplate
 from pancam_graph.graph._template import FactorTemplate as FactorTemplate

@@ -2,27 +2,27 @@
 
 A rig that states an uncertainty P and is held counts as exact (H0). Had its numbers errors drawn from P
 (H1), the images would say so with the odds of the two marginal likelihoods. With C the covariance of the
-rig's numbers once images and P are together, and d the step to their best values, all else marginalised,
+rig's numbers once images and P are together, and g the gradient of the cost by them, all else marginalised,
 
-    log p(images | H0) - log p(images | H1)  =  1/2 log det(P C^-1) - 1/2 d' C^-1 d
+    log p(images | H0) - log p(images | H1)  =  1/2 log det(P C^-1) - 1/2 g' C g
 
 (Kass and Raftery, Bayes factors, 1995, in the linearised system). Under H1 the solution has the variance of a
 solve that estimates the rig, or more.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy
 
 from pancam_graph.base.errors import SolveError
-from pancam_graph.data import FIXED, sharing_within
+from pancam_graph.base.geometry import FloatArray
 from pancam_graph.elimination import relative_pose_covariance
-from pancam_graph.graph import HardTemplate
+from pancam_graph.graph import HardTemplate, RigVariable, RigVariables
 from pancam_graph.solve._covariance import Uncertainty, covariance_of
 from pancam_graph.solve._problem import Problem
 from pancam_graph.solve._reduced import ReducedSystem
-from pancam_graph.solve._rig_score import part_of
+from pancam_graph.solve._rig_told import RigTold, reduced_to_rig, stated_sharing
 
 __all__ = ["HeldRig", "held_rig"]
 
@@ -49,48 +49,68 @@ class HeldRig:
         return float(np.sqrt(1 + chance * (self.growth**2 - 1)))
 
 
-def held_rig(problem: Problem, held: Uncertainty) -> HeldRig | None:
+def held_rig(problem: Problem, held: Uncertainty, told: RigTold | None) -> HeldRig | None:
     """What images say of a problem's held rig; `held` are the problem's uncertainties.
 
-    None for models but the rigid mast, for a rig that is exact or of which anything is free, and where the
-    system is not determined.
+    `told` is `rig_told` of the problem. None for models but the rigid mast, for a rig that is exact or of
+    which anything is free, and where the system is not determined.
     """
-    template = problem.template
-    if not isinstance(template, HardTemplate) or template.rig_variables.sharing.any_free:
-        return None
-    # A head's flex is one with its pan and tilt, and no number of the rig.
-    sharing = replace(sharing_within(template.traverse.rig.uncertainty, "mast"), flex=FIXED)
-    if not sharing.any_free:
+    sharing = stated_sharing(problem)
+    if told is None or not sharing.any_free:
         return None
     try:
-        odds = _log_odds(part_of(problem, sharing))
+        odds = _log_odds_of_part(told, RigVariables(told.rig.traverse, sharing))
         if odds > _CONFIRMED:
             return HeldRig(log_odds=odds, growth=1.0, what="")
-        wide = problem.on(HardTemplate(template.traverse, sharing))
-        reduced = ReducedSystem.of(wide)
+        wide = problem.on(HardTemplate(problem.template.traverse, sharing))
+        reduced = reduced_to_rig(wide)
         growth, what = _growth(problem, held, wide, reduced)
-        return HeldRig(log_odds=_log_odds(wide, reduced), growth=growth, what=what)
+        return HeldRig(log_odds=_log_odds_of_whole(wide, reduced), growth=growth, what=what)
     except SolveError:
         return None
 
 
-def _log_odds(wide: Problem, reduced: ReducedSystem | None = None) -> float:
+def _log_odds_of_part(told: RigTold, stated: RigVariables) -> float:
+    """Of what a part of the images tells, with the priors of the rig's own uncertainty."""
+    columns = np.array([told.column[v.quantity, v.eye, e] for v in _numbers(stated) for e in v.entries])
+    return _log_odds(told.without_priors(columns) + _prior(stated), told.gradient[columns], stated)
+
+
+def _log_odds_of_whole(wide: Problem, reduced: ReducedSystem) -> float:
     """Of a problem whose rig is free with its own uncertainty, at the values of the rig as told."""
-    reduced = reduced or ReducedSystem.of(wide)
-    free, link = wide.template.rig_variables, wide.template.linkage
-    covariance, step = reduced.root.marginal(len(wide.template.traverse.stops))
-    variables = free.of_stop(None)
-    order = np.concatenate([np.arange(c.start, c.stop) for c in (link.columns_of(v.key) for v in variables)])
-    sigma = np.concatenate([v.sigma for v in variables])
-    prior = np.diag(sigma**2)
-    if free.keys:
-        n = sum(len(v.entries) for v in free.numbers)
-        prior[:n, :n] = np.linalg.inv(free.prior_information())
-    scaled = covariance[np.ix_(order, order)] / np.outer(sigma, sigma)
-    root = np.linalg.cholesky((scaled + scaled.T) / 2)
-    gained = np.linalg.slogdet(prior / np.outer(sigma, sigma))[1] - 2 * np.log(np.diag(root)).sum()
-    pull = scipy.linalg.solve_triangular(root, step[order] / sigma, lower=True)
+    rig, link = wide.template.rig_variables, wide.template.linkage
+    information, gradient = reduced.root.last_information()
+    of_variables = (link.columns_of(v.key) for v in _numbers(rig))
+    columns = np.concatenate([np.arange(c.start, c.stop) for c in of_variables])
+    return _log_odds(information[np.ix_(columns, columns)], gradient[columns], rig)
+
+
+def _log_odds(information: FloatArray, gradient: FloatArray, rig: RigVariables) -> float:
+    """The formula above, of the information C^-1 (n, n) and the gradient (n,) in the order of `_numbers`."""
+    sigma = np.concatenate([v.sigma for v in _numbers(rig)])
+    unit = np.outer(sigma, sigma)
+    try:
+        root = np.linalg.cholesky(unit * information)
+    except np.linalg.LinAlgError as error:
+        raise SolveError("nothing holds a number of the rig") from error
+    gained = 2 * np.log(np.diag(root)).sum() - np.linalg.slogdet(unit * _prior(rig))[1]
+    pull = scipy.linalg.solve_triangular(root, sigma * gradient, lower=True)
     return float(0.5 * gained - 0.5 * pull @ pull)
+
+
+def _numbers(rig: RigVariables) -> list[RigVariable]:
+    """What stops share: first the numbers of `RigVariables.prior_information`, then all others."""
+    shared = rig.of_stop(None)
+    return [*rig.numbers, *(v for v in shared if v.key not in rig.keys)]
+
+
+def _prior(rig: RigVariables) -> FloatArray:
+    """Information (n, n) of the priors of `_numbers`."""
+    out = np.diag(np.concatenate([v.sigma for v in _numbers(rig)]) ** -2.0)
+    if rig.keys:
+        n = sum(len(v.entries) for v in rig.numbers)
+        out[:n, :n] = rig.prior_information()
+    return out
 
 
 def _growth(problem: Problem, held: Uncertainty, wide: Problem, reduced: ReducedSystem) -> tuple[float, str]:

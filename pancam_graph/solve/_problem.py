@@ -139,12 +139,16 @@ class Solver(ABC):
 
 
 def system_of(
-    problem: Problem, loss: Loss = SQUARED, cliques: Iterable[Iterable[int]] = ()
+    problem: Problem,
+    loss: Loss = SQUARED,
+    cliques: Iterable[Iterable[int]] = (),
+    *,
+    last: int | None = None,
 ) -> tuple[LandmarkSystem, IntArray]:
     """The landmark system of the observations that take part, and the rows of its landmarks among all.
 
-    `cliques` are further sets of groups between which its square root shall have blocks. Raises SolveError
-    where no observation takes part.
+    `cliques` are further sets of groups between which its square root shall have blocks; `last` is a group
+    that is eliminated last. Raises SolveError where no observation takes part.
     """
     m = problem.measurements
     take = problem.kept
@@ -157,4 +161,5 @@ def system_of(
     template = problem.template
     cliques = [*template.cliques, *problem.factors.joined(template.linkage), *cliques]
     refined = template.refines_landmarks
-    return LandmarkSystem(template.linkage, m, landmarks, loss, cliques=cliques, refined=refined), rows
+    system = LandmarkSystem(template.linkage, m, landmarks, loss, cliques=cliques, last=last, refined=refined)
+    return system, rows

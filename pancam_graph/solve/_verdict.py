@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pancam_graph.base.errors import SolveError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.cameras import FIELD_PER_COEFFICIENT
 from pancam_graph.data import Refined, Traverse, Verdict, VerdictTest
@@ -22,6 +23,7 @@ from pancam_graph.solve._noise_tests import Residuals
 from pancam_graph.solve._problem import Problem
 from pancam_graph.solve._reduced import ReducedSystem
 from pancam_graph.solve._rig_score import HeldEntry, held_entries
+from pancam_graph.solve._rig_told import RigTold, rig_told
 from pancam_graph.solve._share_tests import let_go_links, shares_in_use
 from pancam_graph.solve._stopping import sigmas_left
 from pancam_graph.solve._telemetry_tests import Correction, Suspected, total
@@ -411,7 +413,13 @@ def _held(at: Optimum) -> Iterator[VerdictTest]:
     """The held number of the rig whose freedom would lower the cost by most."""
     if at.reduced is None or not at.fitted.outcome.converged:
         return
-    held = held_entries(at.fitted.problem if at.fitted.expected is None else at.problem)
+    try:
+        told = rig_told(at.problem)
+    except SolveError:  # images do not determine the system with these numbers free
+        return
+    # Explicit landmarks have cameras of their own: only what they were fitted with is scored.
+    scored = told is not None and isinstance(at.fitted.problem.template, HardTemplate)
+    held = held_entries(told) if told is not None and scored else []
     if held:
         cost = at.fitted.problem.cost()
         best = max(held, key=lambda e: e.gain)
@@ -425,12 +433,12 @@ def _held(at: Optimum) -> Iterator[VerdictTest]:
             f"no held number of the rig would lower the cost by much{exact if treatment == 'held' else ''}",
             _advice(best, cost),
         )
-    yield from _unconfirmed(at)
+    yield from _unconfirmed(at, told)
 
 
-def _unconfirmed(at: Optimum) -> Iterator[VerdictTest]:
+def _unconfirmed(at: Optimum, told: RigTold | None) -> Iterator[VerdictTest]:
     """A rig that is held, of which images do not say that it is exact, against what hangs on it."""
-    found = held_rig(at.problem, at.uncertainty)
+    found = held_rig(at.problem, at.uncertainty, told)
     if found is None:
         return
     for_it = found.log_odds >= 0

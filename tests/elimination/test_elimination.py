@@ -43,12 +43,14 @@ GRAPHS: dict[str, tuple[list[int], Cliques]] = {
 class Random:
     """A random system: the sum of one dense piece per clique."""
 
-    def __init__(self, name: str, *, rows: int = 60, scaled: bool = False, seed: int = 0) -> None:
+    def __init__(
+        self, name: str, *, rows: int = 60, scaled: bool = False, seed: int = 0, last: int | None = None
+    ) -> None:
         rng = np.random.default_rng(seed)
         dims, self.cliques = GRAPHS[name]
         self.dim: IntArray = np.array(dims, dtype=np.int64)
         self.begin = np.concatenate([[0], np.cumsum(self.dim)])
-        self.panels = Panels(pattern(self.dim, self.cliques))
+        self.panels = Panels(pattern(self.dim, self.cliques, last=last))
         n = int(self.begin[-1])
         scale = 10.0 ** rng.uniform(-4, 4, n) if scaled else np.ones(n)
         self.S, self.s = np.zeros((n, n)), np.zeros(n)
@@ -487,18 +489,18 @@ def test_columns_of_the_inverse_are_those_of_a_dense_one(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", GRAPHS)
-def test_the_marginal_of_a_group_is_that_of_a_dense_inverse(name: str) -> None:
-    """Covariance and step, whichever group was eliminated last."""
-    random = Random(name, scaled=True)
-    inverse = np.asarray(np.linalg.inv(random.S), dtype=float)
-    step, size = -inverse @ random.s, np.sqrt(np.diag(inverse))
-    root = random.panels.root()
-    for g in range(len(random.dim)):
-        covariance, change = root.marginal(g)
-        of_group = size[random.columns(g)]
-        expected = random.of(inverse, g, g)
-        assert np.abs((covariance - expected) / np.outer(of_group, of_group)).max() < 1e-9
-        assert np.abs((change - step[random.columns(g)]) / of_group).max() < 1e-9
+def test_the_information_of_the_last_group_is_that_of_a_dense_inverse(name: str) -> None:
+    """Information and gradient, whichever group is to be eliminated last."""
+    for last in range(len(Random(name, scaled=True).dim)):
+        random = Random(name, scaled=True, last=last)
+        inverse = np.asarray(np.linalg.inv(random.S), dtype=float)
+        step, size = -inverse @ random.s, np.sqrt(np.diag(inverse))[random.columns(last)]
+        assert random.panels.structure.order[-1] == last
+        information, gradient = random.panels.root().last_information()
+        covariance = np.linalg.inv(information)
+        expected = random.of(inverse, last, last)
+        assert np.abs((covariance - expected) / np.outer(size, size)).max() < 1e-9
+        assert np.abs((-covariance @ gradient - step[random.columns(last)]) / size).max() < 1e-9
 
 
 def test_forward_substitution_gives_the_variance_of_any_sum() -> None:
@@ -576,5 +578,5 @@ def test_covariances_of_a_long_road_keep_their_digits() -> None:
     root = panels.root()
     covariance = root.covariance()
     for g in range(n):
-        expected = root.marginal(g)[0]
-        np.testing.assert_allclose(np.diag(covariance.block(g, g)), np.diag(expected), rtol=1e-8)
+        own = root.inverse_columns(g, slice(0, dim))[dim * g : dim * (g + 1)]
+        np.testing.assert_allclose(np.diag(covariance.block(g, g)), np.diag(own), rtol=1e-8)

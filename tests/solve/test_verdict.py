@@ -12,9 +12,11 @@ from pancam_graph.data import FIXED, Solution, VerdictTest, sharing_within
 from pancam_graph.rigs import TEMPLATES, RigUncertainty
 from pancam_graph.simulate import Simulation
 from pancam_graph.smoother._incremental import solve_incrementally
-from pancam_graph.solve import _rig_score, judge
+from pancam_graph.solve import _rig_told, judge
 from pancam_graph.solve._held_sureness import held_rig
-from pancam_graph.solve._rig_score import held_entries
+from pancam_graph.solve._problem import Problem
+from pancam_graph.solve._rig_score import HeldEntry, held_entries
+from pancam_graph.solve._rig_told import rig_told
 from pancam_graph.solve._telemetry_tests import entry_errors, leg_errors, telemetry_of, total
 from support.parameters import slow_for
 from support.solving import fitted
@@ -185,10 +187,16 @@ def test_corrections_over_their_sigmas_are_standard_normal() -> None:
     assert np.std(sums) == pytest.approx(1.0, abs=0.35)
 
 
+def scored(problem: Problem) -> list[HeldEntry]:
+    told = rig_told(problem)
+    assert told is not None
+    return held_entries(told)
+
+
 def test_the_score_of_a_held_number_is_what_freeing_it_gains() -> None:
     traverse = drive(focal_error=2e-3).traverse
     options = SolveOptions(loss="none", rig="held")
-    held = {(e.camera, e.entry): e for e in held_entries(fitted(traverse, options).problem)}
+    held = {(e.camera, e.entry): e for e in scored(fitted(traverse, options).problem)}
     sharing = Sharing(calibration=Freedom(scope="eye", free=("focal",)))
     freed = fitted(traverse, replace(options, sharing=sharing))
     gain = fitted(traverse, options).problem.cost() - freed.problem.cost()
@@ -204,11 +212,11 @@ def test_the_score_of_a_long_drive_comes_from_part_of_its_stops(monkeypatch: pyt
     problem = fitted(
         drive(focal_error=2e-3, stops=8, pans=6).traverse, SolveOptions(rig="held", loss="none")
     ).problem
-    monkeypatch.setattr(_rig_score, "_ENOUGH", 10**9)
-    whole = max(held_entries(problem), key=lambda e: e.gain)
-    monkeypatch.setattr(_rig_score, "_ENOUGH", 300)
-    part = max(held_entries(problem), key=lambda e: e.gain)
-    few = _rig_score.part_of(problem, problem.template.rig_variables.sharing)
+    monkeypatch.setattr(_rig_told, "_ENOUGH", 10**9)
+    whole = max(scored(problem), key=lambda e: e.gain)
+    monkeypatch.setattr(_rig_told, "_ENOUGH", 300)
+    part = max(scored(problem), key=lambda e: e.gain)
+    few = _rig_told.part_of(problem, problem.template.rig_variables.sharing)
     assert len(few.template.traverse.stops) == 3
     assert 250 < few.kept.sum() < 700
     assert np.abs(few.residuals[0]).mean() < 2 * np.abs(problem.residuals[0]).mean()
@@ -271,7 +279,7 @@ def test_odds_of_a_held_rig_are_those_of_two_solves() -> None:
     own = SolveOptions(loss="none", relative_decrease=1e-12)
     both = replace(own, rig="held"), replace(own, sharing=within)
     held, free = (judge(fitted(traverse, options)) for options in both)
-    found = held_rig(held.regular, held.uncertainty)
+    found = held_rig(held.regular, held.uncertainty, rig_told(held.regular))
     assert found is not None
     problem = free.fitted.problem
     entries = problem.template.rig_variables
