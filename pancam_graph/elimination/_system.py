@@ -54,8 +54,13 @@ _REFINED = 0.1
 """Refinement of a stray ends when its expected decrease is at most this share of its cost."""
 _STRAY_GRAIN = 256
 """Strays that one thread takes at once."""
+_COST_GRAIN = 8192
+"""Landmarks whose cost one thread computes at once."""
 _SMALLEST_SUM = 200_000
 """Entries of dense systems from which on several threads sum them up."""
+_SMALLEST_FILL = 1_000_000
+"""Entries of dense systems from which on several threads clear them: after each clearing a thread waits for
+the interpreter's lock."""
 _SMALLEST_CHUNK = 4000
 """Least observations of a chunk, below which its overhead dominates."""
 _ENTRIES_PER_OBSERVATION = 25
@@ -246,7 +251,13 @@ class LandmarkSystem:
         self._panels.clear()
         for wave in self._waves:
             systems = self._room(wave)
+            n_entries = sum(len(S) for S, _ in systems)
+            by_chunk = n_entries >= _SMALLEST_FILL
             parts = self._field_parts(wave, posture.views)
+            if not by_chunk:
+                for S, s in systems:
+                    S.fill(0.0)
+                    s.fill(0.0)
 
             def eliminated(
                 first: int,
@@ -254,10 +265,12 @@ class LandmarkSystem:
                 wave: _Wave = wave,
                 systems: _Systems = systems,
                 parts: Sequence[tuple[kernel.FieldSights, FieldPart]] = parts,
+                by_chunk: bool = by_chunk,
             ) -> None:
                 for chunk, (S, s) in zip(wave[first:last], systems[first:last], strict=True):
-                    S.fill(0.0)
-                    s.fill(0.0)
+                    if by_chunk:
+                        S.fill(0.0)
+                        s.fill(0.0)
                     eliminate(sights, bearings, *self._of_chunk(chunk), S, s)
                 for chunk, (seen, part) in zip(wave[first:last], parts[first:last], strict=False):
                     kernel.eliminate_fields(sights, bearings, seen, *self._of_chunk(chunk), *part)
@@ -273,7 +286,7 @@ class LandmarkSystem:
                             kernel.add_to_panel(S, s, *rows, block.row, block.panel_column[i], panel)
 
             in_parallel(eliminated, len(wave), grain=1)
-            n_groups, n_entries = self.linkage.n_groups, sum(len(S) for S, _ in systems)
+            n_groups = self.linkage.n_groups
             grain = max(n_groups, 1) if n_entries < _SMALLEST_SUM else 1 + n_groups // 8
             in_parallel(summed, n_groups, grain=grain)
             for chunk, (_, part) in zip(wave, parts, strict=False):
@@ -414,7 +427,7 @@ class LandmarkSystem:
                 cost[begin:end],
             )
 
-        in_parallel(work, len(cost), grain=_STRAY_GRAIN)
+        in_parallel(work, len(cost), grain=_COST_GRAIN)
         return float(cost.sum())
 
     def _replace_strays(self, views: CameraViews, bearings: kernel.Bearings) -> None:

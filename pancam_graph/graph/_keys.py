@@ -45,8 +45,8 @@ _LETTER = 56
 
 
 def key_of(kind: Kind, index: int) -> int:
-    """Key of a variable, by its kind and its number among those of its kind."""
-    return int(gtsam.symbol(kind.value, index))
+    """Key of a variable, by its kind and its number among those of its kind: as gtsam.symbol has it."""
+    return (ord(kind.value) << _LETTER) + int(index)
 
 
 def kind_of(key: int) -> Kind:

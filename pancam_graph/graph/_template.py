@@ -177,15 +177,22 @@ class FactorTemplate(ABC):
 
     def mast(self, stop: int) -> Slot:
         """Slot of a stop's mast pose: fixed where both its sigmas are 0."""
-        entry = self.traverse.stops[stop]
-        if entry.sigma_rotation_rad == 0 and entry.sigma_translation_m == 0:
-            return Fixed(entry.world_T_mast)
-        return Key(key_of(Kind.MAST, stop))
+        return self._masts[stop]
+
+    @cached_property
+    def _masts(self) -> tuple[Slot, ...]:
+        return tuple(
+            Fixed(stop.world_T_mast)
+            if stop.sigma_rotation_rad == 0 and stop.sigma_translation_m == 0
+            else Key(key_of(Kind.MAST, i))
+            for i, stop in enumerate(self.traverse.stops)
+        )
 
     def masts(self, values: gtsam.Values) -> tuple[gtsam.Pose3, ...]:
         """Mast poses of all stops at the values."""
-        slots = [self.mast(i) for i in range(len(self.traverse.stops))]
-        return tuple(values.atPose3(slot.key) if isinstance(slot, Key) else slot.value for slot in slots)
+        return tuple(
+            values.atPose3(slot.key) if isinstance(slot, Key) else slot.value for slot in self._masts
+        )
 
     def correction(self, values: gtsam.Values) -> RigCorrection | None:
         """Corrections of the traverse's rig at the values; None where nothing of it is free."""

@@ -20,6 +20,10 @@ from pancam_graph.landmarks import kernel
 from pancam_graph.landmarks._losses import SQUARED, Loss
 
 _GRAIN = 1024
+"""Landmarks that one thread takes at once where each is iterated on: about a millisecond."""
+_LIGHT_GRAIN = 8192
+"""The same where each observation is looked at once: threads wait for the interpreter's lock longer than
+shorter ranges take."""
 _RAY_GRAIN = 16384
 SETTLED = 1e-9
 """Refinement of a landmark ends when a step promises to lower its cost by no more than this share."""
@@ -267,7 +271,8 @@ def evaluate(
     seen, n = seen_by(measurements, views), len(measurements.image)
     vector, origin = _arrays(landmarks, measurements)
     residual, b, in_front = np.empty((n, 2)), np.empty((n, 2, 3)), np.empty(n, dtype=bool)
-    over_landmarks(kernel.evaluate, np.arange(len(vector)), seen, vector, origin, residual, b, in_front)
+    which = np.arange(len(vector))
+    over_landmarks(kernel.evaluate, which, seen, vector, origin, residual, b, in_front, grain=_LIGHT_GRAIN)
     return residual, b, in_front
 
 
@@ -278,7 +283,8 @@ def residuals(
     seen, n = seen_by(measurements, views), len(measurements.image)
     vector, origin = _arrays(landmarks, measurements)
     residual, in_front = np.empty((n, 2)), np.empty(n, dtype=bool)
-    over_landmarks(kernel.residuals, np.arange(len(vector)), seen, vector, origin, residual, in_front)
+    which = np.arange(len(vector))
+    over_landmarks(kernel.residuals, which, seen, vector, origin, residual, in_front, grain=_LIGHT_GRAIN)
     return residual, in_front
 
 

@@ -286,15 +286,16 @@ def _measure(
     if len(rows) == 0:
         raise SolveError("observations: expected tracks seen in two or more images, found none")
     rows = rows[np.lexsort((observations.image[rows], observations.track[rows]))]
-    landmark_track, landmark = np.unique(observations.track[rows], return_inverse=True)
+    tracks = observations.track[rows]
+    is_new = np.diff(tracks, prepend=tracks[:1]) > 0
     measurements = Measurements(
         row=rows,
         image=observations.image[rows],
-        landmark=landmark.astype(np.int64),
+        landmark=np.cumsum(is_new),
         uv_px=observations.uv_px[rows],
         whitening=observations.noise.select(rows).whitening,
     )
-    return measurements, landmark_track, reason
+    return measurements, tracks[measurements.starts], reason
 
 
 def _left_out_warnings(observations: Observations, reason: Reasons) -> list[str]:

@@ -65,6 +65,15 @@ class Problem:
 
     def cost(self, loss: Loss = SQUARED) -> float:
         """True cost: half the sum of squares of `factors`, and the loss of observations that take part."""
+        if loss is SQUARED:
+            return self._squared
+        return self._cost(loss)
+
+    @cached_property
+    def _squared(self) -> float:
+        return self._cost(SQUARED)
+
+    def _cost(self, loss: Loss) -> float:
         residual, _ = self.residuals
         return float(self.factors.error(self.values) + loss.cost(residual)[self.kept].sum())
 
