@@ -54,6 +54,12 @@ def opportunity_folder() -> Path:
 
 
 @pytest.fixture(scope="session")
+def pds4_folder() -> Path:
+    """A PDS4 label of a Navcam image of Perseverance, and two labelled images of the PanCam of ExoMars."""
+    return shared("data/pds4_labels")
+
+
+@pytest.fixture(scope="session")
 def bench_generator() -> Path:
     """The program that writes the traverses of the benchmark."""
     return shared("bench/make_traverse.py")

@@ -1,4 +1,4 @@
-"""Image files as 2-D grey arrays: PDS .IMG through its label, anything else through OpenCV."""
+"""Image files as 2-D grey arrays: uncompressed ones through their labels, anything else through OpenCV."""
 
 import struct
 from dataclasses import dataclass
@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from pancam_graph.base.errors import ImageError
 from pancam_graph.base.regular_files import instead_of_file
-from pancam_graph.io._pds_samples import read_pds_image, read_samples
 from pancam_graph.io._picture_size import PICTURE_FORMATS, WantedSize, picture_size, require_size
+from pancam_graph.io._stored_files import STORED_SUFFIXES, read_stored_image
 from pancam_graph.io._tiff_entries import ORIENTATION, TIFF_STARTS, first_entries
 
 __all__ = ["GreyImage", "ImageContent", "read_content", "read_image"]
@@ -20,6 +20,8 @@ GreyImage = NDArray[np.uint8] | NDArray[np.uint16]
 
 _GREY_WEIGHTS = np.array([0.299, 0.587, 0.114])
 """Red, green, blue to luma, ITU-R BT.601; what OpenCV uses for its own formats."""
+_FULL_SCALE = 65_000.0
+"""What the largest sample of reals and of wide integers becomes: below the limit that counts as saturated."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,11 +39,12 @@ class ImageContent:
 def read_image(path: Path) -> GreyImage:
     """Read an image as (rows, columns), 8 or 16 bits, grey.
 
-    A file that ends in .img or .IMG is read through its PDS3 label (attached, or a .LBL beside it):
-    integers of 8 or 16 bits in either byte order; negative samples, and those that the label calls missing or
-    invalid, become 0. Anything else is left to OpenCV (PNG, TIFF, JPEG, PGM, BMP, WebP, JPEG 2000), without
-    turning or stretching. Colour becomes luma; an alpha channel is left out. Pixel [0, 0] is the top left
-    one.
+    A file that ends in .img, .dat or .raw is read through its label (PDS4, an .xml beside it; PDS3,
+    attached or a .LBL beside it): integers of 8, 16 or 32 bits and reals in either byte order. Negative
+    samples, and those that the label calls missing or invalid, become 0; of reals and of integers of 32 bits
+    the largest becomes 65,000. Anything else is left to OpenCV (PNG, TIFF, JPEG, PGM, BMP, WebP, JPEG 2000),
+    without turning or stretching. Colour becomes luma; an alpha channel is left out. Pixel [0, 0] is the top
+    left one.
 
     Raises ImageError for a file that is missing, no regular file, unreadable, truncated, of more than
     `MAX_PIXELS` by its header, or not of 8 or 16 bits.
@@ -57,29 +60,36 @@ def read_content(path: Path, wanted: WantedSize | None = None) -> ImageContent:
     other = instead_of_file(path)
     if other is not None:
         raise ImageError(f"{path}: expected an image file, found {other}")
-    if path.suffix.lower() == ".img":
-        return _read_pds(path, wanted)
+    if path.suffix.lower() in STORED_SUFFIXES:
+        return _read_stored(path, wanted)
     return _read_with_opencv(path, wanted)
 
 
-def _read_pds(path: Path, wanted: WantedSize | None) -> ImageContent:
-    image = read_pds_image(path)
+def _read_stored(path: Path, wanted: WantedSize | None) -> ImageContent:
+    image = read_stored_image(path)
     require_size(path, (image.layout.width_px, image.layout.height_px), wanted)
-    samples = read_samples(image)
+    samples = image.layout.samples(image.no_data)
     if samples.shape[0] == 1:
         return ImageContent(samples=_unsigned(samples[0]), colour=False, host=image.host)
     if samples.shape[0] < 3:
-        raise ImageError(f"{path}: BANDS: expected 1, or 3 for colour, found {samples.shape[0]}")
+        raise ImageError(f"{path}: bands: expected 1, or 3 for colour, found {samples.shape[0]}")
     colour = bool(np.any(samples[1:3] != samples[0]))
     grey = np.tensordot(_GREY_WEIGHTS, np.maximum(samples[:3], 0).astype(float), axes=1)
-    return ImageContent(
-        samples=_unsigned(np.rint(grey).astype(samples.dtype)), colour=colour, host=image.host
-    )
+    if samples.dtype.kind in "iu":
+        grey = np.rint(grey).astype(samples.dtype)
+    return ImageContent(samples=_unsigned(grey), colour=colour, host=image.host)
 
 
 def _unsigned(samples: NDArray[Any]) -> GreyImage:
+    """Samples of 8 or 16 bits; 0 for negative ones. Wider integers and reals are scaled to fill 16 bits."""
     positive: NDArray[Any] = np.maximum(samples, 0)
-    return positive.astype(np.uint8) if samples.dtype.itemsize == 1 else positive.astype(np.uint16)
+    if samples.dtype.itemsize == 1:
+        return positive.astype(np.uint8)
+    if samples.dtype.itemsize == 2:
+        return positive.astype(np.uint16)
+    largest = float(positive.max())
+    scale = 1.0 if largest == 0 else _FULL_SCALE / largest
+    return np.rint(positive * scale).astype(np.uint16)
 
 
 def _read_with_opencv(path: Path, wanted: WantedSize | None) -> ImageContent:

@@ -29,8 +29,9 @@ from pancam_graph.base.geometry import FloatArray, IntArray, wrap_angle
 from pancam_graph.base.text import visible
 from pancam_graph.data import Frame, Image, Stop, Traverse
 from pancam_graph.io._input_format import InputFormat
+from pancam_graph.io._labelled_files import LABEL_SUFFIXES, labelled_files
+from pancam_graph.io._labelled_image import LabelledImage
 from pancam_graph.io._pds_exposures import one_of_each_exposure
-from pancam_graph.io._pds_image import LabelledImage, read_labelled_image
 from pancam_graph.io._pictures import left_out
 from pancam_graph.rigs import MastKinematics, ReferenceSigma, RigFit, RigFitOptions, fit_rig
 
@@ -89,12 +90,10 @@ def read_pds(folder: Path | str) -> Traverse:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of rover images, found {_kind(folder)}")
-    files = sorted(f for f in folder.iterdir() if f.suffix.lower() == ".img")
-    if not files:
-        raise InputError(f"{folder}: expected images with PDS labels (*.IMG), found none")
-    products, unusable = list[LabelledImage](), dict[str, InputError]()
-    for file in files:
-        _add_image(file, products, unusable)
+    found = labelled_files(folder)
+    products, unusable = found.images, found.unusable
+    if not products and not unusable:
+        raise InputError(f"{folder}: expected images with PDS labels (*.IMG, *.xml), found none")
     if not products:
         raise next(iter(unusable.values()))
     kinematics = _common_mast(products)
@@ -129,7 +128,7 @@ def read_pds(folder: Path | str) -> Traverse:
         pointing_sigma=sigma,
         mast_height_m=kinematics.mast_height_m,
         source=f"PDS labels of {visible(folder.resolve().name)}; {kinematics.source}",
-        uncertainty=images[0].rover.uncertainty_of(rig.longest_side_px),
+        uncertainty=images[0].uncertainty_of(rig.longest_side_px),
         rover_T_mast=fit.world_T_mast,
         eyes=tuple(
             replace(eye, unit=images[int(np.argmax(eye_of == eye_names.index(eye.name)))].unit)
@@ -143,10 +142,10 @@ def read_pds(folder: Path | str) -> Traverse:
         frames=tuple(frames[r] for r in order),
         images=tuple(
             Image(
-                id=visible(image.label.file.stem),  # a name that is no text has no place in results
+                id=visible(image.file.stem),  # a name that is no text has no place in results
                 frame=frame_ids[frame_of[i]],
                 camera=eye_names[eye_of[i]],
-                file=image.label.file.name,
+                file=image.file.name,
             )
             for i, image in enumerate(images)
         ),
@@ -156,17 +155,10 @@ def read_pds(folder: Path | str) -> Traverse:
 
 
 PDS3 = InputFormat(
-    needs="PDS images (*.IMG, *.LBL)",
-    matches=lambda names: any(Path(name).suffix.lower() in {".img", ".lbl"} for name in names),
+    needs="rover images with labels (*.IMG, *.LBL, *.xml)",
+    matches=lambda names: any(Path(name).suffix.lower() in LABEL_SUFFIXES for name in names),
     read=read_pds,
 )
-
-
-def _add_image(file: Path, images: list[LabelledImage], unusable: dict[str, InputError]) -> None:
-    try:
-        images.append(read_labelled_image(file))
-    except InputError as error:
-        unusable[file.stem] = error
 
 
 def _kind(path: Path) -> str:
@@ -179,16 +171,15 @@ def _common_mast(images: Sequence[LabelledImage]) -> MastKinematics:
     for image in images:
         if image.host != first.host:
             raise InputError(
-                f"{image.label.label_file}: INSTRUMENT_HOST_ID: expected {first.host} as in "
-                f"{first.label.label_file.name}, found {image.host}: images of two rovers"
+                f"{image.label_file}: INSTRUMENT_HOST_ID: expected {first.host} as in "
+                f"{first.label_file.name}, found {image.host}: images of two rovers"
             )
         if image.stop[0] != first.stop[0]:
             raise InputError(
-                f"{image.label.label_file}: ROVER_MOTION_COUNTER: expected site {first.stop[0]} as in "
-                f"{first.label.label_file.name}, found {image.stop[0]}: poses in two site frames"
+                f"{image.label_file}: ROVER_MOTION_COUNTER: expected site {first.stop[0]} as in "
+                f"{first.label_file.name}, found {image.stop[0]}: poses in two site frames"
             )
-    rover = first.rover
-    return rover.mast if rover.mast_of is None else rover.mast_of(first.label)
+    return first.mast
 
 
 def _sort_eyes(images: Sequence[LabelledImage]) -> tuple[IntArray, list[str]]:
@@ -240,7 +231,7 @@ def _sort_stops(
         if max(turn, shift) > _SAME_POSE:
             warnings.append(
                 f"stop {_stop_id(stop)}: its labels' rover poses differ by up to {shift * 1e3:.1f} mm and "
-                f"{turn * 1e3:.1f} mrad; that of {images[i].label.file.name} is used"
+                f"{turn * 1e3:.1f} mrad; that of {images[i].file.name} is used"
             )
     origin = images[next(iter(first_of.values()))].world_T_rover.translation()
     stops: list[Stop] = []
@@ -308,7 +299,7 @@ def _fit_rig(
     for image in images:
         if np.linalg.norm(image.model.C) > _FARTHEST_CAMERA_M:
             raise InputError(
-                f"{image.label.label_file}: camera centre: expected a point within "
+                f"{image.label_file}: camera centre: expected a point within "
                 f"{_FARTHEST_CAMERA_M:g} m of the rover, found {image.model.C.tolist()}"
             )
     measured = np.array([images[i].pan_tilt_rad for i in frames_first])
@@ -339,7 +330,7 @@ def _fit_rig(
         warnings.append(
             f"the mast model misses the label's camera in {int(bad.sum())} of {len(images)} images by more "
             f"than 0.1 mm or 0.1 mrad; worst {metres[worst] * 1e3:.2f} mm and "
-            f"{radians[worst] * 1e3:.2f} mrad in {images[worst].label.file.name}"
+            f"{radians[worst] * 1e3:.2f} mrad in {images[worst].file.name}"
         )
     return fit
 
@@ -358,7 +349,7 @@ def _warn_of_angles(
     frames = np.flatnonzero((alone > 3 * sigma).any(axis=1))
     if len(frames):
         worst = int(alone.max(axis=1).argmax())
-        name = images[int(np.flatnonzero(frame_of == worst)[0])].label.file.name
+        name = images[int(np.flatnonzero(frame_of == worst)[0])].file.name
         warnings.append(
             f"{len(frames)} of {len(change)} pointings: the label's camera is turned from the measured "
             f"angles by more than 3 sigma, at most {alone[worst].max() * 1e3:.1f} mrad in {name}; the "

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pancam_graph.cameras import CAHV
-from pancam_graph.io._pds_image import LabelledImage
+from pancam_graph.io._labelled_image import LabelledImage
 
 __all__ = ["Exposures", "one_of_each_exposure"]
 
@@ -44,28 +44,28 @@ def one_of_each_exposure(images: Sequence[LabelledImage]) -> Exposures:
     for same in products.values():
         best, *others = sorted(same, key=_rank)
         if others:
-            names = sorted(image.label.file.name for image in others)
+            names = sorted(image.file.name for image in others)
             left_out |= set(names)
             warnings.append(
-                f"{best.label.file.name}: used of {len(same)} products of one exposure; left out: "
+                f"{best.file.name}: used of {len(same)} products of one exposure; left out: "
                 f"{', '.join(names)}"
             )
     more = len(warnings) - _NAMED
     if more > 0:
         warnings[_NAMED:] = [f"{more} more exposures have several products, of which one each is used"]
-    kept = tuple(image for image in images if image.label.file.name not in left_out)
+    kept = tuple(image for image in images if image.file.name not in left_out)
     return Exposures(images=kept, warnings=tuple(warnings))
 
 
 def _exposure(image: LabelledImage) -> tuple[object, ...]:
     if image.clock_start is None:
-        return (image.label.file,)
+        return (image.file,)
     return image.host, image.instrument, image.clock_start, image.first_line_sample
 
 
 def _rank(image: LabelledImage) -> tuple[object, ...]:
     """Best first; the name decides among equals."""
-    name = image.label.file.name
+    name = image.file.name
     match = _TYPE.match(name.upper())
     kind = match[1] if match is not None else ""
     model = image.model

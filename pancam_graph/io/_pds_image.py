@@ -1,6 +1,5 @@
-"""One rover image's label, turned to z up: camera model, rover pose, measured mast angles."""
+"""One PDS3 label, turned to z up: camera model, rover pose, measured mast angles."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import gtsam
@@ -9,49 +8,20 @@ from pancam_graph.base.errors import CameraError, GeometryError, InputError
 from pancam_graph.base.geometry import FloatArray, pose_from_wxyz
 from pancam_graph.base.text import visible
 from pancam_graph.cameras import CAHV, cahv_of_vectors
+from pancam_graph.io._clock import plain_clock
+from pancam_graph.io._labelled_image import LabelledImage
 from pancam_graph.io._pds_label import LabelGroup, PdsLabel, read_label
-from pancam_graph.io._pds_rover import ROVER_FRAMES, LabelledRover, reference_frame
+from pancam_graph.io._pds_rover import ROVER_FRAMES, reference_frame
 from pancam_graph.io._pds_rovers import rover_of
 from pancam_graph.io._pds_samples import image_of_label
 from pancam_graph.rigs import camera_z_up, pose_z_up
 
-__all__ = ["LabelledImage", "read_labelled_image"]
+__all__ = ["read_labelled_image"]
 
 _CAMERA_GROUPS = ("GEOMETRIC_CAMERA_MODEL", "GEOMETRIC_CAMERA_MODEL_PARMS")
 _LONGEST_SERIAL = 40
 _CLOCK = "SPACECRAFT_CLOCK_START_COUNT"
 _ROVER_GROUPS = ("ROVER_COORDINATE_SYSTEM", "ROVER_COORDINATE_SYSTEM_PARMS", "ROVER_COORD_SYSTEM_PARMS")
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class LabelledImage:
-    """An image as its label describes it, z up; not yet sorted into stops, frames and eyes."""
-
-    label: PdsLabel
-    host: str
-    instrument: str
-    stop: tuple[int, int]
-    """Site and drive of the motion counter."""
-    rover: LabelledRover
-    mast_counter: int | None
-    """Number of motions of the mast so far; None where the label has no such counter."""
-    clock_start: str | None
-    """The spacecraft's clock at the start of the exposure; None where the label has none."""
-    first_line_sample: tuple[int, int]
-    """Where on the detector the first pixel is, counted from 1."""
-    sample_bits: int
-    pan_tilt_rad: tuple[float, float]
-    """Measured pan and tilt of the chain."""
-    world_T_rover: gtsam.Pose3
-    model: CAHV
-    """The camera in the rover frame."""
-    serial: str
-    """Serial number of the camera; "" where the label has none."""
-
-    @property
-    def unit(self) -> str:
-        """The camera that it is: host, instrument and serial number."""
-        return " ".join(part for part in (self.host, self.instrument, self.serial) if part)
 
 
 def read_labelled_image(file: Path) -> LabelledImage:
@@ -61,7 +31,14 @@ def read_labelled_image(file: Path) -> LabelledImage:
     ImageError for a file shorter than its label says.
     """
     label = read_label(file)
-    rover, host, instrument = rover_of(label)
+    host, instrument = label.top.text("INSTRUMENT_HOST_ID").upper(), label.top.text("INSTRUMENT_ID").upper()
+    rover = rover_of(
+        host,
+        instrument,
+        where=label.label_file,
+        host_entry="INSTRUMENT_HOST_ID",
+        instrument_entry="INSTRUMENT_ID",
+    )
     camera = label.group(*_CAMERA_GROUPS)
     layout = image_of_label(label).layout
     layout.require_complete()
@@ -82,15 +59,17 @@ def read_labelled_image(file: Path) -> LabelledImage:
                 f"found {', '.join(counter)}"
             )
     return LabelledImage(
-        label=label,
+        file=label.file,
+        label_file=label.label_file,
         host=host,
         instrument=instrument,
         stop=(counter["SITE"], counter["DRIVE"]),
-        rover=rover,
+        mast=rover.mast if rover.mast_of is None else rover.mast_of(label),
+        uncertainty_of=rover.uncertainty_of,
         mast_counter=counter.get("PMA", counter.get("RSM")),
-        clock_start=label.top.text(_CLOCK) if _CLOCK in label.top.items else None,
+        clock_start=plain_clock(label.top.text(_CLOCK)) if _CLOCK in label.top.items else None,
         first_line_sample=(samples.integer("FIRST_LINE", 1), samples.integer("FIRST_LINE_SAMPLE", 1)),
-        sample_bits=8 * layout.dtype.itemsize,
+        sample_bits=layout.sample_bits,
         pan_tilt_rad=pan_tilt_rad,
         world_T_rover=pose_z_up(site_T_rover),
         model=camera_z_up(model),

@@ -10,16 +10,16 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, get_args
 
 import numpy as np
 
 from pancam_graph.base.errors import ImageError, InputError
 from pancam_graph.base.geometry import FloatArray
 from pancam_graph.base.regular_files import instead_of_file, is_missing
-from pancam_graph.io._picture_size import MAX_PIXELS
+from pancam_graph.io._image_layout import ImageLayout, Storage, require_sides
 
-__all__ = ["ImageLayout", "LabelGroup", "PdsLabel", "read_label"]
+__all__ = ["LabelGroup", "PdsLabel", "may_have_label", "read_label"]
 
 _MAX_LABEL_BYTES = 1 << 20
 _MAX_QUOTED = 120
@@ -51,51 +51,15 @@ _SAMPLE_KINDS = {
     "LSB_UNSIGNED_INTEGER": "<u",
     "PC_UNSIGNED_INTEGER": "<u",
     "VAX_UNSIGNED_INTEGER": "<u",
+    "IEEE_REAL": ">f",
+    "FLOAT": ">f",
+    "REAL": ">f",
+    "MAC_REAL": ">f",
+    "SUN_REAL": ">f",
+    "PC_REAL": "<f",
 }
-
-
-@dataclass(frozen=True, kw_only=True)
-class ImageLayout:
-    """Where the pixels of a PDS image are, and how they are written."""
-
-    file: Path
-    """The file with the pixels; another than the label's where the label is detached."""
-    offset_bytes: int
-    """Offset of the first line from the start of that file."""
-    width_px: int
-    height_px: int
-    bands: int
-    dtype: np.dtype[Any]
-    """One sample, with its byte order."""
-    line_prefix_bytes: int
-    line_suffix_bytes: int
-    storage: str
-    """BAND_SEQUENTIAL, LINE_INTERLEAVED or SAMPLE_INTERLEAVED."""
-
-    @property
-    def line_bytes(self) -> int:
-        """Bytes of one stored line, of all bands where samples are interleaved."""
-        bands = self.bands if self.storage == "SAMPLE_INTERLEAVED" else 1
-        samples = self.width_px * bands * self.dtype.itemsize
-        return self.line_prefix_bytes + samples + self.line_suffix_bytes
-
-    @property
-    def end_bytes(self) -> int:
-        """Offset of the end of the last line from the start of the file."""
-        bands = 1 if self.storage == "SAMPLE_INTERLEAVED" else self.bands
-        return self.offset_bytes + self.height_px * bands * self.line_bytes
-
-    def require_complete(self) -> None:
-        """Raise ImageError if the file is missing or shorter than its label says."""
-        other = instead_of_file(self.file)
-        if other is not None:
-            raise ImageError(f"{self.file}: expected an image file, found {other}")
-        size = self.file.stat().st_size
-        if size < self.end_bytes:
-            raise ImageError(
-                f"{self.file}: ^IMAGE: expected {self.end_bytes} bytes or more for {self.height_px} lines of "
-                f"{self.width_px} samples, found {size}: the file is truncated"
-            )
+_BITS = {"i": (8, 16, 32), "u": (8, 16, 32), "f": (32, 64)}
+"""Bits of a sample, by the kind of its type."""
 
 
 @dataclass(frozen=True)
@@ -200,8 +164,8 @@ class PdsLabel:
     def image_layout(self) -> ImageLayout:
         """Where the pixels are.
 
-        Raises ImageError for a label without an image, or with samples that are not integers of 8 or
-        16 bits.
+        Raises ImageError for a label without an image, or with samples that are not integers of 8, 16 or
+        32 bits or reals of 32 or 64.
         """
         try:
             return self._image_layout()
@@ -214,26 +178,23 @@ class PdsLabel:
         image = self.group("IMAGE")
         file, offset = self._image_pointer()
         kind, bits = image.text("SAMPLE_TYPE").upper(), image.integer("SAMPLE_BITS")
-        if kind not in _SAMPLE_KINDS or bits not in {8, 16}:
+        if kind not in _SAMPLE_KINDS or bits not in _BITS[_SAMPLE_KINDS[kind][1]]:
             raise ImageError(
-                f"{image.where}: SAMPLE_TYPE, SAMPLE_BITS: expected integers of 8 or 16 bits, "
-                f"found {kind} of {bits}"
+                f"{image.where}: SAMPLE_TYPE, SAMPLE_BITS: expected integers of 8, 16 or 32 bits or "
+                f"reals of 32 or 64, found {kind} of {bits}"
             )
         width, height, bands = (
             image.integer("LINE_SAMPLES"),
             image.integer("LINES"),
             image.integer("BANDS", 1),
         )
-        if min(width, height, bands) < 1 or width * height * bands > MAX_PIXELS:
-            raise ImageError(
-                f"{image.where}: LINES, LINE_SAMPLES, BANDS: expected 1 or more of each and at most "
-                f"{MAX_PIXELS} in all, found {height}, {width}, {bands}"
-            )
-        storage = "BAND_SEQUENTIAL"
+        require_sides(image.where, "LINES, LINE_SAMPLES, BANDS", height, width, bands)
+        told = "BAND_SEQUENTIAL"
         if bands > 1 and "BAND_STORAGE_TYPE" in image.items:
-            storage = image.text("BAND_STORAGE_TYPE").upper().replace(" ", "_")
-        if storage not in {"BAND_SEQUENTIAL", "LINE_INTERLEAVED", "SAMPLE_INTERLEAVED"}:
-            raise ImageError(f"{image.where}: BAND_STORAGE_TYPE: expected BAND_SEQUENTIAL, found {storage}")
+            told = image.text("BAND_STORAGE_TYPE").upper().replace(" ", "_")
+        storage: Storage | None = next((kind for kind in get_args(Storage) if kind == told), None)
+        if storage is None:
+            raise ImageError(f"{image.where}: BAND_STORAGE_TYPE: expected BAND_SEQUENTIAL, found {told}")
         return ImageLayout(
             file=file,
             offset_bytes=offset,
@@ -241,7 +202,7 @@ class PdsLabel:
             height_px=height,
             bands=bands,
             # Bytes of rovers are never below 0, whatever the label calls them.
-            dtype=np.dtype(f"{_SAMPLE_KINDS[kind]}{bits // 8}") if bits == 16 else np.dtype(np.uint8),
+            dtype=np.dtype(f"{_SAMPLE_KINDS[kind]}{bits // 8}") if bits > 8 else np.dtype(np.uint8),
             line_prefix_bytes=image.integer("LINE_PREFIX_BYTES", 0),
             line_suffix_bytes=image.integer("LINE_SUFFIX_BYTES", 0),
             storage=storage,
@@ -268,6 +229,21 @@ class PdsLabel:
         return file, (place - 1) * self.top.integer("RECORD_BYTES")
 
 
+def may_have_label(file: Path) -> bool:
+    """Whether an image begins like one with a PDS3 label, or has a .LBL beside it."""
+    if any(not is_missing(label) for label in _detached(file)):
+        return True
+    try:
+        return _looks_like_label(_head(file))
+    except InputError:
+        return False
+
+
+def _detached(file: Path) -> list[Path]:
+    """Where the label of an image may be beside it."""
+    return [file.with_suffix(s) for s in (".LBL", ".lbl", ".Lbl")]
+
+
 def read_label(file: Path) -> PdsLabel:
     """Read the PDS3 label of an image: attached to it, or in a .LBL of the same name beside it.
 
@@ -276,8 +252,7 @@ def read_label(file: Path) -> PdsLabel:
     head = _head(file)
     label_file = file
     if not _looks_like_label(head):
-        detached = [file.with_suffix(s) for s in (".LBL", ".lbl", ".Lbl")]
-        label_file = next((f for f in detached if not is_missing(f)), file)
+        label_file = next((f for f in _detached(file) if not is_missing(f)), file)
         if label_file != file:
             head = _head(label_file)
         if not _looks_like_label(head):

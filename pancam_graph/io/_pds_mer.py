@@ -38,6 +38,6 @@ MER = LabelledRover(
     cameras=("PANCAM", "NAVCAM"),
     mast=MER_MAST,
     uncertainty_of=mer_uncertainty,
-    joints_rad=_joints_rad,
+    joints=_joints_rad,
     mast_of=_mast_of,
 )

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pancam_graph.base.errors import ImageError
+from pancam_graph.base.regular_files import instead_of_file
 from pancam_graph.io._tiff_entries import TIFF_STARTS, first_entries
 
 __all__ = [
@@ -21,6 +22,7 @@ __all__ = [
     "looks_like_picture",
     "picture_size",
     "require_size",
+    "size_of_file",
 ]
 
 MAX_PIXELS = 1 << 27
@@ -30,6 +32,9 @@ _SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".jpe", ".bmp", ".webp", 
 _NETPBM_SUFFIXES = (".pgm", ".ppm", ".pnm", ".pbm")
 
 Size = tuple[int, int]
+
+_HEADER_BYTES = 1 << 20
+"""Bytes in which the header of a picture is looked for; thumbnails in EXIF stand before it."""
 
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 """Markers of JPEG frames; the three others of the range are tables and extensions."""
@@ -64,6 +69,26 @@ def require_size(path: Path, size: Size, wanted: WantedSize | None) -> None:
         raise ImageError(
             f"{path}: expected a picture of at most {MAX_PIXELS} pixels, found {width_px} x {height_px}"
         )
+
+
+def size_of_file(path: Path) -> Size:
+    """Width and height of a picture by its file's header. Raises ImageError for a file that is none."""
+    other = instead_of_file(path)
+    if other is not None:
+        raise ImageError(f"{path}: expected an image file, found {other}")
+    try:
+        with path.open("rb") as stream:
+            data = stream.read(_HEADER_BYTES)
+            if data.startswith(TIFF_STARTS):  # the entries may be behind the samples
+                data += stream.read()
+    except OSError as error:
+        raise ImageError(f"{path}: expected an image file, could not read it: {error.strerror}") from error
+    size = picture_size(data)
+    if size is None:
+        raise ImageError(
+            f"{path}: expected a picture ({PICTURE_FORMATS}), found a file that begins like none"
+        )
+    return size
 
 
 def picture_size(data: bytes) -> Size | None:

@@ -544,7 +544,7 @@ def test_image_files(folder: Path) -> None:
 
 
 def test_folders_that_are_none(tmp_path: Path) -> None:
-    expected = r"expected a folder with traverse.json or with PDS images"
+    expected = r"expected a folder with traverse.json or with rover images with labels"
     refused(tmp_path / "nowhere", expected, "nothing there")
     refused(tmp_path, expected, "an empty folder")
     (tmp_path / "notes.txt").write_text("")

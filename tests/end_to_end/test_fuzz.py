@@ -17,6 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pancam_graph import SimulationOptions, Traverse, TraverseSmoother, simulate, write_traverse
+from pancam_graph.cameras import CAHVORE
 from pancam_graph.data import Freedom, Sharing
 from pancam_graph.images._cache import Cache
 from pancam_graph.io import read_image, read_input, read_mask, read_pds, read_traverse, rig_json, use_rig
@@ -35,6 +36,7 @@ from support.fuzzing import (
     outcome,
     packed,
 )
+from support.pds4_labels import small_pds4_text
 from support.pds_files import pds_file
 from support.rover_labels import (
     MARS2020_NAVCAM,
@@ -44,6 +46,7 @@ from support.rover_labels import (
     mars2020_mast,
     msl_mast,
     navcam_b_head,
+    turned,
 )
 
 Case = Callable[[np.random.Generator], str]
@@ -262,6 +265,24 @@ def labels(folder: Path, text: str) -> Case:
         file.write_bytes(label.ljust(8192) + bytes(48))
         said = outcome(lambda: read_pds(folder), folder)
         return said or outcome(lambda: read_image(file), folder)
+
+    return case
+
+
+@kind_of_case
+def labels_of_pds4(folder: Path) -> Case:
+    head = replace(MARS2020_NAVCAM, width_px=6, height_px=4)
+    rotation, point = mars2020_mast(as_designed=True).head(*POINTINGS[0])
+    model = turned(head, rotation, point)
+    assert isinstance(model, CAHVORE)
+    text = small_pds4_text(model, POINTINGS[0])
+    (folder / "a.dat").write_bytes(bytes(range(24)))
+
+    def case(rng: np.random.Generator) -> str:
+        label = mutated_text(rng, text).encode("utf-8", "replace")
+        (folder / "a.xml").write_bytes(mutated_bytes(rng, label) if rng.random() < 0.3 else label)
+        said = outcome(lambda: read_pds(folder), folder)
+        return said or outcome(lambda: read_image(folder / "a.dat"), folder)
 
     return case
 

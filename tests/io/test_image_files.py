@@ -180,7 +180,7 @@ def test_files_without_a_usable_label_are_refused(tmp_path: Path, content: bytes
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"sample_type": "IEEE_REAL", "bits": 32}, "IMAGE: SAMPLE_TYPE.*found IEEE_REAL of 32"),
+        ({"sample_type": "VAX_REAL", "bits": 32}, "IMAGE: SAMPLE_TYPE.*found VAX_REAL of 32"),
         (
             {"size": (0, 4)},
             "IMAGE: LINES, LINE_SAMPLES, BANDS: expected 1 or more of each and at most .*, found 0, 4, 1",

@@ -1,0 +1,55 @@
+"""One image as its label describes it, whatever the label's format: what all formats of labels fill in."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import gtsam
+
+from pancam_graph.base.geometry import FloatArray
+from pancam_graph.cameras import CAHV
+from pancam_graph.rigs import MastKinematics, RigUncertainty
+
+__all__ = ["LabelledImage"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LabelledImage:
+    """An image as its label describes it, z up; not yet sorted into stops, frames and eyes."""
+
+    file: Path
+    """The picture."""
+    label_file: Path
+    """The file with the label: the picture itself, or one beside it."""
+    host: str
+    """The rover, as INSTRUMENT_HOST_ID names it."""
+    instrument: str
+    """The camera, as INSTRUMENT_ID names it."""
+    serial: str
+    """Serial number of the camera; "" where the label has none."""
+    stop: tuple[int, int]
+    """Site and drive of the motion counter."""
+    mast: MastKinematics
+    """The mast, with those of its numbers that the label has."""
+    uncertainty_of: Callable[[int], RigUncertainty]
+    """How far cameras and axes of the label may be off, by the longer side of the images, pixels."""
+    mast_counter: int | None
+    """Number of motions of the mast so far; None where the label has no such counter."""
+    clock_start: str | None
+    """The spacecraft's clock at the start of the exposure; None where the label has none."""
+    first_line_sample: tuple[int, int]
+    """Where on the detector the first pixel is, counted from 1."""
+    sample_bits: int
+    pan_tilt_rad: tuple[float, float]
+    """Measured pan and tilt of the chain."""
+    world_T_rover: gtsam.Pose3
+    """The rover in the frame of its site."""
+    model: CAHV
+    """The camera in the rover frame."""
+    site_offset_m: FloatArray | None = None
+    """(3,) origin of the image's site in the frame of the site before it; None where the label has none."""
+
+    @property
+    def unit(self) -> str:
+        """The camera that it is: host, instrument and serial number."""
+        return " ".join(part for part in (self.host, self.instrument, self.serial) if part)
