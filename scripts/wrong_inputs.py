@@ -141,6 +141,47 @@ def _neighbouring_rock(share: float, distance_m: float) -> Fault:
     return fault
 
 
+def _mirrored(s: Simulation, rng: np.random.Generator) -> Traverse:
+    """All images are mirrored, left to right."""
+    t = s.traverse
+    assert t.observations is not None  # simulated
+    o = t.observations
+    width = np.array([eye.camera.width_px for eye in t.rig.eyes])[t.image_eye[o.image]]
+    mirrored = np.column_stack([width - 1 - o.uv_px[:, 0], o.uv_px[:, 1]])
+    return t.with_observations(replace(o, uv_px=mirrored))
+
+
+def _pans(change: Callable[[FloatArray], FloatArray]) -> Fault:
+    """The pans of each stop are others."""
+
+    def fault(s: Simulation, rng: np.random.Generator) -> Traverse:
+        t = s.traverse
+        pan = t.pan_tilt_rad[:, 0].copy()
+        for stop in range(len(t.stops)):
+            of = t.frame_stop == stop
+            pan[of] = change(pan[of])
+        frames = [replace(f, pan_rad=float(p)) for f, p in zip(t.frames, pan, strict=True)]
+        return replace(t, frames=tuple(frames))
+
+    return fault
+
+
+def _apart_mounts(factor: float) -> Fault:
+    """The rig claims its mounts farther apart than they are."""
+
+    def fault(s: Simulation, rng: np.random.Generator) -> Traverse:
+        eyes = s.traverse.rig.eyes
+        middle = np.mean([eye.head_T_camera.translation() for eye in eyes], axis=0)
+        moved = []
+        for eye in eyes:
+            mount = eye.head_T_camera
+            place = middle + factor * (mount.translation() - middle)
+            moved.append(replace(eye, head_T_camera=type(mount)(mount.rotation(), place)))
+        return replace(s.traverse, rig=replace(s.traverse.rig, eyes=tuple(moved)))
+
+    return fault
+
+
 def _stated_noise(factor: float) -> Fault:
     """Observations state their sigmas too large or too small."""
 
@@ -245,6 +286,8 @@ class Case:
 
 _FEW_LINKS = {"stops": 1, "pans": 7, "points_per_image": 15}
 """One panorama whose frames have few neighbours: many have one alone."""
+_ROW = {"pans": 8}
+"""Whole turns of few frames."""
 _DOWN = {"spacing_m": 0.5, "pans": 6, "tilts_rad": (-np.pi / 2,)}
 """Heads that look straight down, at stops so close that they see the same ground."""
 _MOUNTS = SolveOptions(sharing=Sharing(mounts=Freedom(scope="eye")))
@@ -276,6 +319,15 @@ CASES: dict[str, Case] = {
     "a tenth of the tracks on a rock 0.1 m away": Case(fault=_neighbouring_rock(0.1, 0.1)),
     "focal length off by 0.2 %": Case(drive={"focal_error": 2e-3}),
     "mounts off by 0.5 mrad": Case(drive={"mount_error_rad": 5e-4}),
+    "pans of the other sense": Case(fault=_pans(np.negative), drive=_ROW),
+    "each frame with its neighbour's pan": Case(fault=_pans(lambda pan: np.roll(pan, 1)), drive=_ROW),
+    "the same, one stop": Case(fault=_pans(lambda pan: np.roll(pan, 1)), drive=_ROW | {"stops": 1}),
+    "images mirrored": Case(fault=_mirrored, drive=_ROW),
+    "mounts 5 % farther apart": Case(fault=_apart_mounts(1.05), drive=_ROW),
+    "mounts 5 % farther apart, odometry of 1 %": Case(
+        fault=_apart_mounts(1.05), drive=_ROW | {"sigma_stop_m": 0.04}
+    ),
+    "mounts twice as far apart": Case(fault=_apart_mounts(2.0), drive=_ROW),
     "all sigmas stated as 1e-6 px": Case(fault=_tiny_sigmas(1.0)),
     "half of the sigmas stated as 1e-6 px": Case(fault=_tiny_sigmas(0.5)),
     "half of the observations a million times better": Case(fault=_apart),

@@ -14,6 +14,7 @@ from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.cameras import FIELD_PER_COEFFICIENT
 from pancam_graph.data import Refined, Traverse, Verdict, VerdictTest
 from pancam_graph.graph import HardTemplate
+from pancam_graph.solve._behind import points_behind
 from pancam_graph.solve._chances import CHANCE, rms_limit, two_sided_limit
 from pancam_graph.solve._covariance import Uncertainty
 from pancam_graph.solve._fit import Fitted
@@ -40,8 +41,6 @@ _UNEVEN = 2.0
 """Largest ratio of an image's, or a camera's, residuals to those of all."""
 _NAMED = 6
 """Parts of telemetry let go that are named."""
-_FAR_OFF = 10.0
-"""Sigmas beyond which odometry may as well be right, and the rig wrong, where all of it is let go."""
 _BEATEN = 3.0
 """Change of an entry of the rig in sigmas of its prior from which it is said."""
 _FIELD_BEATEN = 2.0
@@ -91,6 +90,7 @@ def verdict(at: Optimum) -> Verdict:
         *_telemetry(at),
         _let_go(at),
         *let_go_links(at.fitted.problem),
+        *points_behind(at.traverse, float(np.mean(at.used)) if len(at.used) else 1.0),
         *_freed(at),
         *_fields(at),
         *_held(at),
@@ -302,8 +302,9 @@ def _let_go(at: Optimum) -> VerdictTest:
         )
     elif _no_place_left(at):
         why = (
-            "nothing of where stops stand is left, and the rig alone tells how long all is; check odometry "
-            "and the distance of the eyes (baseline)"
+            "nothing of where stops stand is left, so that the rig alone tells how long all is, and pans "
+            "alone which way; check odometry, the distance of the eyes (baseline), and whether all pans are "
+            "off in common"
         )
     elif len(parts) > most:
         limit, why = float(most), "too many to believe the rest; check telemetry, its sigmas, and the rig"
@@ -313,12 +314,13 @@ def _let_go(at: Optimum) -> VerdictTest:
 
 
 def _no_place_left(at: Optimum) -> bool:
-    """Whether the places of all stops that telemetry does not hold were let go, by many sigmas each."""
-    t, let_go = at.traverse, at.let_go
-    free = np.array([s.sigma_translation_m > 0 for s in t.stops])
+    """Whether the places of all stops that telemetry does not hold were let go.
+
+    Odometry may then as well be right, and what the places were compared with is wrong.
+    """
+    free = np.array([s.sigma_translation_m > 0 for s in at.traverse.stops])
     went = np.any(at.fitted.problem.template.let_go.stops[free, 3:], axis=1)
-    sizes = [abs(part.size) / part.sigma for part in let_go if part.is_length]
-    return bool(free.any() and np.all(went) and min(sizes, default=0.0) > _FAR_OFF)
+    return bool(free.any() and np.all(went))
 
 
 def _held_against(at: Optimum) -> str:

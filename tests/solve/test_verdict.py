@@ -76,6 +76,19 @@ def test_a_wrong_baseline_is_not_odometry_that_is_wrong(rig: str) -> None:
     assert "baseline" in named(solution)["let go"].says
 
 
+@pytest.mark.slow
+def test_pans_off_in_common_are_not_the_only_leg_that_is_wrong() -> None:
+    """Each frame has its neighbour's pan: around a whole turn all of a stop are off by the same step."""
+    t = drive(pans=8).traverse
+    pan = t.pan_tilt_rad[:, 0].copy()
+    for stop in range(2):
+        pan[t.frame_stop == stop] = np.roll(pan[t.frame_stop == stop], 1)
+    frames = [replace(f, pan_rad=float(p)) for f, p in zip(t.frames, pan, strict=True)]
+    solution = solve(replace(t, frames=tuple(frames)))
+    assert failed(solution) == {"let go"}
+    assert "off in common" in named(solution)["let go"].says
+
+
 def test_a_wrong_pan_that_is_said_to_be_exact_fails_where_the_others_went_along() -> None:
     made = drive()
     frames = list(made.traverse.frames)
