@@ -2,9 +2,14 @@
 
 import os
 import random
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+
+from pancam_graph.base.compiled import Entry
+from pancam_graph.base.native_code import NativeFunction
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -31,6 +36,27 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for module in modules:
         order.shuffle(module)
     items[:] = [item for module in modules for item in module]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _compiled_code_is_called_without_numba() -> Iterator[None]:
+    """Any test fails that calls a function of the package which only Numba's dispatcher can call.
+
+    Such a function is compiled anew in each process of a user's, and all that is seen of it is a warning.
+    """
+    compile_now = Entry._compiled
+
+    def compiled(entry: Entry, *arguments: Any) -> NativeFunction | None:
+        native = compile_now(entry, *arguments)
+        package = (entry.__module__ or "").partition(".")[0]
+        assert native is not None or package != "pancam_graph", (
+            f"{entry.__qualname__} needs Numba at each run"
+        )
+        return native
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Entry, "_compiled", compiled)
+        yield
 
 
 def shared(name: str) -> Path:

@@ -155,6 +155,34 @@ def _differentiate(
             jacobian[k, c] -= mean + along * template[k]
 
 
+@part
+def _invert(normal: FloatArray, inverse: FloatArray) -> None:
+    """Write the inverse of a positive definite matrix, of which the lower half is read and overwritten.
+
+    NumPy's own is LAPACK's, which code that is called without Numba cannot reach.
+    """
+    n = len(normal)
+    for c in range(n):  # its Cholesky factor L, with 1 / L_cc on the diagonal
+        for r in range(c, n):
+            value = normal[r, c]
+            for k in range(c):
+                value -= normal[r, k] * normal[c, k]
+            normal[r, c] = value * normal[c, c] if r > c else 1.0 / math.sqrt(value)
+    for c in range(n):  # L^-1, into the lower half
+        inverse[c, c] = normal[c, c]
+        for r in range(c + 1, n):
+            value = 0.0
+            for k in range(c, r):
+                value -= normal[r, k] * inverse[k, c]
+            inverse[r, c] = value * normal[r, r]
+    for c in range(n):  # L^-T L^-1; what is read of L^-1 lies in rows from r on, not yet overwritten
+        for r in range(c, n):
+            value = 0.0
+            for k in range(r, n):
+                value += inverse[k, r] * inverse[k, c]
+            inverse[r, c] = inverse[c, r] = value
+
+
 @entry
 def align_patches(
     first: int,
@@ -190,7 +218,8 @@ def align_patches(
     template, patch, jacobian = np.empty(n_taps), np.empty(n_taps), np.empty((n_taps, 6))
     bent = np.empty((n_taps, 2))
     around, scores = np.empty((widest, widest)), np.empty((widest, widest))
-    change = np.empty(6)
+    pull, change = np.empty(6), np.empty(6)
+    normal, inverse = np.empty((6, 6)), np.empty((6, 6))
     for row in range(first, last):
         u, v = uv_a[row]
         for k in range(n_taps):
@@ -213,7 +242,7 @@ def align_patches(
         x_start, y_start = x, y
 
         _differentiate(image_a, u, v, contrast, (m00, m01, m10, m11), offset, weight, template, jacobian)
-        normal = np.zeros((6, 6))
+        normal[:] = 0.0
         for k in range(n_taps):
             for c in range(6):
                 for d in range(c + 1):
@@ -221,11 +250,9 @@ def align_patches(
         trace = 0.0
         for c in range(6):
             trace += normal[c, c]
-            for d in range(c):
-                normal[d, c] = normal[c, d]
         for c in range(6):
             normal[c, c] += 1e-9 * (1 + trace)
-        inverse = np.linalg.inv(normal)
+        _invert(normal, inverse)
 
         at_start, correlation, moving = -1.0, -1.0, True
         for step in range(steps + 1):
@@ -240,12 +267,15 @@ def align_patches(
                 at_start = correlation
             if step == steps or not moving:
                 break
-            change[:] = 0.0
+            pull[:] = 0.0
             for k in range(n_taps):
                 error = weight[k] * (patch[k] - template[k])
                 for c in range(6):
-                    change[c] -= error * jacobian[k, c]
-            change[:] = inverse @ change
+                    pull[c] -= error * jacobian[k, c]
+            for c in range(6):
+                change[c] = 0.0
+                for d in range(6):
+                    change[c] += inverse[c, d] * pull[d]
             x += min(max(change[0], -_MAX_STEP_PX), _MAX_STEP_PX)
             y += min(max(change[1], -_MAX_STEP_PX), _MAX_STEP_PX)
             m00 += min(max(change[2], -_MAX_AFFINE_STEP), _MAX_AFFINE_STEP)

@@ -128,7 +128,8 @@ def eliminate_fields(
                     by_base[0, 3 + k], by_base[1, 3 + k] = -w * e0[k], -w * e1[k]
                 if rows > 6:
                     by_calibration(cameras.calibration, image, u_px, v_px, sights.whitening, i, root, jac)
-                    by_base[:, 6:] = jac
+                    for k in range(rows - 6):
+                        by_base[0, 6 + k], by_base[1, 6 + k] = jac[0, k], jac[1, k]
                 for m in range(2):
                     for c in range(2):
                         white[m, c] = root * sights.whitening[i, m, c]
