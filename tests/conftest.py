@@ -50,7 +50,7 @@ def _compiled_code_is_called_without_numba() -> Iterator[None]:
         native = compile_now(entry, *arguments)
         package = (entry.__module__ or "").partition(".")[0]
         assert native is not None or package != "pancam_graph", (
-            f"{entry.__qualname__} needs Numba at each run"
+            f"{entry._kept.name} needs Numba at each run"
         )
         return native
 

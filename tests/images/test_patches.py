@@ -13,6 +13,6 @@ def test_the_inverse_of_normal_matrices(condition: float) -> None:
     axes = np.linalg.qr(rng.normal(size=(6, 6)))[0]
     normal = axes * np.geomspace(1, condition, 6) @ axes.T
     inverse = np.empty((6, 6))
-    _invert.plain(np.tril(normal), inverse)
+    _invert(np.tril(normal), inverse)
     np.testing.assert_array_equal(inverse, inverse.T)
     np.testing.assert_allclose(inverse, np.linalg.inv(normal), rtol=0, atol=1e-14 * condition)
