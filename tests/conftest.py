@@ -49,9 +49,7 @@ def _compiled_code_is_called_without_numba() -> Iterator[None]:
     def compiled(entry: Entry, *arguments: Any) -> NativeFunction | None:
         native = compile_now(entry, *arguments)
         package = (entry.__module__ or "").partition(".")[0]
-        assert native is not None or package != "pancam_graph", (
-            f"{entry._kept.name} needs Numba at each run"
-        )
+        assert native is not None or package != "pancam_graph", f"{entry._kept.name} needs Numba at each run"
         return native
 
     with pytest.MonkeyPatch.context() as patch:
