@@ -49,6 +49,8 @@ _MOST_GROUPS = 1
 """Groups of variables, at most, of which information is taken off."""
 _FIRST_ROUNDS = 10
 """Rounds after which it may depend on direction however large the step is, and steps are short."""
+_LONGER = 4.0
+"""By how much a short step is longer than its direction's last one, at most."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -92,18 +94,24 @@ def far_terrain(problem: Problem) -> FarTerrain | None:
         return None
     prior = RangePrior()
     expected = _expected(placed, broad, prior)
-    feigned = _feigned(placed, expected.landmarks)
+    system = panels_of(placed.at(placed.values, expected.landmarks))
+    feigned = _feigned(placed, system)
     _LOG.info("far terrain: %d landmarks of broad range feign %.2g of information", broad.sum(), feigned)
     if feigned < _MORE:
         return None
-    return _solved(placed, broad, prior, expected)
+    return _solved(placed, broad, prior, expected, system)
 
 
-def _solved(problem: Problem, broad: BoolArray, prior: RangePrior, known: _Expected) -> FarTerrain:
-    """Rounds of: step to where the gradient vanishes, ranges fitted there, and expected ranges again."""
+def _solved(
+    problem: Problem, broad: BoolArray, prior: RangePrior, known: _Expected, system: Panels
+) -> FarTerrain:
+    """Rounds of: step to where the gradient vanishes, ranges fitted there, and expected ranges again.
+
+    `system` is that at the ranges that are expected first.
+    """
     link = problem.template.linkage
     held = all_columns(link, held_columns(problem.template))
-    root = panels_of(problem.at(problem.values, known.landmarks)).root()
+    root, short = system.copy().root(), _ShortSteps()
     learnt = 0
     for number in range(_ROUNDS):
         length = float(np.sqrt(2 * root.gain()))
@@ -113,15 +121,17 @@ def _solved(problem: Problem, broad: BoolArray, prior: RangePrior, known: _Expec
             # A distribution learnt far from the solution keeps traces of the bias there.
             prior, learnt = RangePrior(is_divided=True), learnt + 1
             known = _expected(problem, broad, prior)
-            root = panels_of(problem.at(problem.values, known.landmarks)).root()
+            system = panels_of(problem.at(problem.values, known.landmarks))
+            root, short = system.copy().root(), _ShortSteps()
             length = float(np.sqrt(2 * root.gain()))
         if length < _SETTLED:
             break
-        step = root.step() if number < _FIRST_ROUNDS else _short_step(problem, known)
+        step = root.step() if number < _FIRST_ROUNDS else short.next(system, panels_of(problem))
         step[held] = 0.0
         problem = problem.at(retracted(link, problem.values, step), problem.landmarks).placed()
         known = _expected(problem, broad, prior)
-        root = panels_of(problem.at(problem.values, known.landmarks)).root()
+        system = panels_of(problem.at(problem.values, known.landmarks))
+        root = system.copy().root()
     return FarTerrain(
         problem=problem,
         expected=known.landmarks,
@@ -130,16 +140,32 @@ def _solved(problem: Problem, broad: BoolArray, prior: RangePrior, known: _Expec
     )
 
 
-def _short_step(problem: Problem, known: _Expected) -> FloatArray:
-    """A step (columns,) that does not overshoot where few landmarks of no known range tell of a direction.
+class _ShortSteps:
+    """Steps that do not overshoot where few landmarks of no known range tell of a direction.
 
     The slope of the gradient there is A(g)'N A(q^), which may exceed A(g)'N A(g) many times. It never exceeds
-    the mean of the systems at both ranges, which takes its place.
+    the mean of the systems at both ranges, which takes its place. In other directions the slope may be a
+    hundredth of that mean: what a step leaves of itself tells how much longer the next one may be (Barzilai
+    and Borwein 1988, in the metric of the mean).
     """
-    panels = panels_of(problem.at(problem.values, known.landmarks))
-    for panel, fitted in zip(panels.panel, panels_of(problem).panel, strict=True):
-        panel[:, :-1] = 0.5 * (panel[:, :-1] + fitted[:, :-1])
-    return panels.root().step()
+
+    def __init__(self) -> None:
+        self._last: FloatArray | None = None
+        self._longer = 1.0
+
+    def next(self, system: Panels, fitted: Panels) -> FloatArray:
+        """The step (columns,) from where the systems at expected and at fitted ranges are these."""
+        mean = system.copy()
+        for panel, other in zip(mean.panel, fitted.panel, strict=True):
+            panel[:, :-1] = 0.5 * (panel[:, :-1] + other[:, :-1])
+        step = mean.copy().root().step()
+        if self._last is not None and self._last.any():
+            metric = mean.times(self._last[:, None])[:, 0]
+            gone = 1 - float(step @ metric) / float(self._last @ metric)
+            most = _LONGER * self._longer
+            self._longer = min(max(self._longer / gone, 1.0), most) if gone > 0 else most
+        self._last = step
+        return self._longer * step
 
 
 def _may_matter(problem: Problem) -> bool:
@@ -252,14 +278,13 @@ def _shares(information: FloatArray, covariance: FloatArray) -> tuple[FloatArray
     return share, unit @ turn
 
 
-def _feigned(problem: Problem, expected: Landmarks) -> float:
-    """Information that fitted ranges add to that of the system at expected ones, in units of the latter.
+def _feigned(problem: Problem, expected: Panels) -> float:
+    """Information that fitted ranges add to that of the system `expected`, in units of the latter.
 
     It is summed over all directions: the trace of the excess times the covariance. Each direction counts as
     known to a share of its diagonal at least, since rounding errors of both systems are no excess.
     """
-    fitted, system = panels_of(problem), panels_of(problem.at(problem.values, expected))
-    excess = system.copy()
+    fitted, excess, system = panels_of(problem), expected.copy(), expected.copy()
     for panel, more in zip(excess.panel, fitted.panel, strict=True):
         np.subtract(more, panel, out=panel)
     system.damp(_FAINTEST)

@@ -58,9 +58,7 @@ class ReducedSystem:
 
     def firm(self, problem: Problem) -> "ReducedSystem":
         """The same, or one by QR where a weak prior of the problem is lost in rounding errors of this one."""
-        if not _loses_digits(problem, self.root):
-            return self
-        return replace(self, root=_root_by_qr(problem, self.system))
+        return replace(self, root=_firm_root(problem, self.system, self.root))
 
 
 def panels_of(problem: Problem) -> Panels:
@@ -106,12 +104,27 @@ def loosened_root(problem: Problem, system: LandmarkSystem, factor: float) -> Ro
     add((*factors.ties, *factors.seated), 1.0)
     add(factors.priors, factor**-2)
     panels.hold(held_columns(template))
-    root = panels.root()
-    return _root_by_qr(problem, system, factor) if _loses_digits(problem, root) else root
+    return _firm_root(problem, system, panels.root(), factor)
 
 
-def _root_by_qr(problem: Problem, system: LandmarkSystem, factor: float = 1.0) -> Root:
-    """The square root of `loosened_root`, by QR of the rows of landmarks and of all other factors."""
+def _firm_root(problem: Problem, system: LandmarkSystem, root: Root, factor: float = 1.0) -> Root:
+    """A root, or one by QR where a weak prior of the problem is lost in rounding errors and QR keeps it.
+
+    `root` is that of `loosened_root` with this factor.
+    """
+    if not root.is_rounded:
+        return root
+    motion = _common_motion(problem)
+    if motion is None and not root.leaves_free:
+        return root
+    return _root_by_qr(problem, system, motion, factor)
+
+
+def _root_by_qr(problem: Problem, system: LandmarkSystem, motion: FloatArray | None, factor: float) -> Root:
+    """The square root of `loosened_root`, by QR of the rows of landmarks and of all other factors.
+
+    `motion` is the common motion of all poses that images cannot tell, if there is one.
+    """
     template, link, factors, values = (
         problem.template,
         problem.template.linkage,
@@ -123,13 +136,8 @@ def _root_by_qr(problem: Problem, system: LandmarkSystem, factor: float = 1.0) -
     panels.hold(held)
     more = _rows(link, graph_of((*factors.ties, *factors.seated)).linearize(values), held, 1.0)
     more += _rows(link, graph_of(factors.priors).linearize(values), held, 1 / factor)
-    root, motion = panels.root(), _common_motion(problem)
+    root = panels.root()
     return with_rows(root if motion is None else _without_motion(root, motion, link), more)
-
-
-def _loses_digits(problem: Problem, root: Root) -> bool:
-    """Whether a weak prior of the problem is lost in rounding errors of a root, and QR would keep it."""
-    return root.leaves_free or (root.is_rounded and _common_motion(problem) is not None)
 
 
 def _common_motion(problem: Problem) -> FloatArray | None:

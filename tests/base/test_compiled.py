@@ -1,15 +1,19 @@
 """Compiled code on disk: found again as long as no source file of its folder changes."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+import pancam_graph
+from pancam_graph import SimulationOptions, simulate, solve
 from pancam_graph.base.compiled import Entry, folder_digest
 from pancam_graph.cameras import LENS_SOURCES
 from pancam_graph.landmarks import kernel
+from pancam_graph.rigs import mer_navcam
 
 CALLEE = """
 from pancam_graph.base.compiled import part
@@ -81,3 +85,25 @@ def test_loops_on_disk_are_named_after_the_sources_of_lenses_too() -> None:
     digest = folder_digest(LENS_SOURCES)
     assert (LENS_SOURCES / "_cahvore.py").exists()
     assert all(digest in entry.sources for entry in entries)
+
+
+def test_every_entry_point_returns_what_can_be_handed_on_without_numba() -> None:
+    """Of any other result, such as a tuple, code is not kept, and each process would compile it anew."""
+    decorated = re.compile(r"@(?:\w+\.)?entry\ndef (\w+)\(.*?\) -> (.+?):\n", re.DOTALL)
+    returned = {
+        f"{path.name}: {name}": kind
+        for path in Path(pancam_graph.__file__).parent.rglob("*.py")
+        for name, kind in decorated.findall(path.read_text(encoding="utf-8"))
+    }
+    assert len(returned) > 20
+    assert {name: kind for name, kind in returned.items() if kind not in {"None", "int", "float"}} == {}
+
+
+@pytest.mark.skipif(bool(os.environ.get("NUMBA_DISABLE_JIT")), reason="nothing is compiled")
+def test_the_loops_of_a_solve_are_called_without_numba() -> None:
+    made = simulate(mer_navcam(), SimulationOptions(stops=2, pans=3, points_per_image=12), seed=1)
+    solve(made.traverse)
+    modules = [module for name, module in sys.modules.items() if name.startswith("pancam_graph.")]
+    entries = {value for module in modules for value in vars(module).values() if isinstance(value, Entry)}
+    assert len([entry for entry in entries if entry.signatures]) > 5
+    assert [entry for entry in entries if entry._dispatcher is not None] == []
