@@ -84,6 +84,12 @@ def pds4_folder() -> Path:
 
 
 @pytest.fixture(scope="session")
+def feed_folder() -> Path:
+    """A Navcam picture of Perseverance with its record, from the public feed of raw images."""
+    return shared("data/mars2020_raw")
+
+
+@pytest.fixture(scope="session")
 def bench_generator() -> Path:
     """The program that writes the traverses of the benchmark."""
     return shared("bench/make_traverse.py")

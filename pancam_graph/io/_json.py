@@ -13,6 +13,7 @@ from pancam_graph.base.errors import InputError, PancamGraphError
 from pancam_graph.base.regular_files import instead_of_file
 
 __all__ = [
+    "any_json",
     "any_json_object",
     "entry_name",
     "json_object",
@@ -138,9 +139,20 @@ def require_format(data: dict[str, Any], path: Path, format_name: str, version: 
 def any_json_object(content: bytes, path: Path) -> dict[str, Any]:
     """The object in JSON text of any format; `path` is the file that errors name.
 
+    Raises InputError as `any_json` does, and for anything else than an object.
+    """
+    data = any_json(content, path)
+    if not isinstance(data, dict):
+        raise InputError(f"{path}: expected a JSON object, found {short(data)}")
+    return data
+
+
+def any_json(content: bytes, path: Path) -> Any:
+    """The value in JSON text of any format; `path` is the file that errors name.
+
     NaN and infinite numbers are let through: the schema refuses them and names the entry.
 
-    Raises InputError for what is not JSON, for anything else than an object, and for a key that stands twice.
+    Raises InputError for what is not JSON, and for a key that stands twice in an object.
     """
     doubled: dict[int, str] = {}
     kept: list[
@@ -169,8 +181,6 @@ def any_json_object(content: bytes, path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: expected JSON, found brackets nested too deeply") from error
     except ValueError as error:  # Python's limit on the length of integers
         raise InputError(f"{path}: expected JSON, found an integer of too many digits") from error
-    if not isinstance(data, dict):
-        raise InputError(f"{path}: expected a JSON object, found {short(data)}")
     if entry is not None:
         raise InputError(f"{path}: {entry}: expected each key once in an object, found it twice")
     return data

@@ -2,18 +2,21 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from pancam_graph.base.errors import InputError
+from pancam_graph.io._feed import feed_image, feed_records, picture_of_record
 from pancam_graph.io._labelled_image import LabelledImage
 from pancam_graph.io._pds4_image import rover_image_of_xml
 from pancam_graph.io._pds_image import read_labelled_image
 from pancam_graph.io._pds_label import may_have_label
+from pancam_graph.io._picture_size import looks_like_picture
 from pancam_graph.io._xml import read_xml
 
 __all__ = ["LABEL_SUFFIXES", "LabelledFiles", "labelled_files"]
 
-LABEL_SUFFIXES = frozenset({".img", ".lbl", ".xml"})
+LABEL_SUFFIXES = frozenset({".img", ".lbl", ".xml", ".json"})
 """How files with labels end, in small letters."""
 _PRODUCT = "Product_Observational"
 
@@ -26,12 +29,14 @@ class LabelledFiles:
     """By the names of their pictures."""
     unusable: dict[str, InputError] = field(default_factory=dict)
     """Why images cannot be used, by the names of their files without the ending."""
+    warnings: list[str] = field(default_factory=list)
+    """What is said of files with many records."""
     unread: list[Path] = field(default_factory=list)
     """Files that have no label, and are none."""
 
 
 def labelled_files(folder: Path) -> LabelledFiles:
-    """The images of a folder that have a label: PDS4 beside them, PDS3 in them or beside them.
+    """The images of a folder that have a label: PDS4, PDS3, or a record of the feed.
 
     Of an image with both, the PDS4 label is read, and the other one where that cannot be used.
     """
@@ -53,8 +58,11 @@ def labelled_files(folder: Path) -> LabelledFiles:
     for label in by_suffix[".lbl"]:
         if label.stem not in known:
             _add(found, label, _without_image)
+    _add_feed(found, by_suffix[".json"], files)
     found.images.sort(key=lambda image: image.file.name)
-    found.unread = [file for file in files if file.suffix.lower() not in LABEL_SUFFIXES and file.is_file()]
+    used = {image.file for image in found.images} | {image.label_file for image in found.images}
+    said = set(found.unusable)
+    found.unread = [f for f in files if f not in used and not {f.stem, f.name} & said and f.is_file()]
     return found
 
 
@@ -63,6 +71,33 @@ def _add(found: LabelledFiles, file: Path, read: Callable[[Path], LabelledImage]
         found.images.append(read(file))
     except InputError as error:
         found.unusable.setdefault(file.stem, error)
+
+
+def _add_feed(found: LabelledFiles, jsons: list[Path], files: list[Path]) -> None:
+    """Add the pictures that records of the feed describe."""
+    taken = {image.file for image in found.images}
+    pictures = {f.name.lower(): f for f in files if looks_like_picture(f) and f not in taken}
+    for file in jsons:
+        try:
+            records = feed_records(file)
+        except InputError as error:
+            found.unusable[file.name] = error
+            continue
+        alone = 0
+        for record in records:
+            picture = picture_of_record(record, pictures)
+            if picture is None:
+                alone += 1
+            elif picture in taken:
+                found.warnings.append(f"{record.where}: {picture.name} is described twice; the first counts")
+            else:
+                taken.add(picture)
+                _add(found, picture, partial(feed_image, record))
+        if alone and alone == len(records):
+            expected = f"{file}: expected a picture of a record beside it"
+            found.unusable[file.name] = InputError(f"{expected}, found none for {alone} of {alone}")
+        elif alone:
+            found.warnings.append(f"{file.name}: {alone} of its {len(records)} records have no picture here")
 
 
 def _of_xml(label: Path) -> LabelledImage:

@@ -8,7 +8,7 @@ import gtsam
 
 from pancam_graph.base.geometry import FloatArray
 from pancam_graph.cameras import CAHV
-from pancam_graph.rigs import MastKinematics, RigUncertainty
+from pancam_graph.rigs import MastKinematics, PointingSigma, RigUncertainty
 
 __all__ = ["LabelledImage"]
 
@@ -46,6 +46,14 @@ class LabelledImage:
     """The rover in the frame of its site."""
     model: CAHV
     """The camera in the rover frame."""
+    told_angles: tuple[float, ...] = ()
+    """What tells images of one pointing from others, in radians; empty: `pan_tilt_rad` does."""
+    pointing_sigma: PointingSigma | None = None
+    """Accuracy of pan and tilt; None: the mast's."""
+    remark: str = ""
+    """What a user should know of how the label was read; the same for all images that it is true of."""
+    levelled: bool = True
+    """Whether the label has the rover's attitude; else `world_T_rover` has none."""
     site_offset_m: FloatArray | None = None
     """(3,) origin of the image's site in the frame of the site before it; None where the label has none."""
 

@@ -16,6 +16,7 @@ Label pixels count from 0 at the centre of the first one, as ours do.
 """
 
 import logging
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -32,6 +33,7 @@ from pancam_graph.io._input_format import InputFormat
 from pancam_graph.io._labelled_files import LABEL_SUFFIXES, labelled_files
 from pancam_graph.io._labelled_image import LabelledImage
 from pancam_graph.io._pds_exposures import one_of_each_exposure
+from pancam_graph.io._picture_size import looks_like_picture
 from pancam_graph.io._pictures import left_out
 from pancam_graph.rigs import MastKinematics, ReferenceSigma, RigFit, RigFitOptions, fit_rig
 
@@ -93,12 +95,18 @@ def read_pds(folder: Path | str) -> Traverse:
     found = labelled_files(folder)
     products, unusable = found.images, found.unusable
     if not products and not unusable:
-        raise InputError(f"{folder}: expected images with PDS labels (*.IMG, *.xml), found none")
+        pictures = sum(looks_like_picture(file) for file in found.unread)
+        hint = f" but {pictures} pictures; pancam-graph init {folder} makes a traverse.json of them"
+        found_words = f"none{hint if pictures else ''}"
+        raise InputError(
+            f"{folder}: expected rover images with labels (*.IMG, *.xml, *.json), found {found_words}"
+        )
     if not products:
         raise next(iter(unusable.values()))
     kinematics = _common_mast(products)
     exposures = one_of_each_exposure(products)
-    images, warnings = exposures.images, [*left_out(unusable), *exposures.warnings]
+    images = exposures.images
+    warnings = [*left_out(unusable), *found.warnings, *exposures.warnings, *_remarks(images)]
     eye_of, eye_names = _sort_eyes(images)
     stop_ids, stops = _sort_stops(images, kinematics, warnings)
     frame_of, frames_first = _sort_frames(images, eye_of)
@@ -116,8 +124,8 @@ def read_pds(folder: Path | str) -> Traverse:
             stop=_stop_id(images[i].stop),
             pan_rad=float(wrap_angle(fit.pan_tilt_rad[i, 0])),
             tilt_rad=float(fit.pan_tilt_rad[i, 1]),
-            sigma_pan_rad=sigma.pan_rad,
-            sigma_tilt_rad=sigma.tilt_rad,
+            sigma_pan_rad=(images[i].pointing_sigma or sigma).pan_rad,
+            sigma_tilt_rad=(images[i].pointing_sigma or sigma).tilt_rad,
         )
         for name, i in zip(frame_ids, frames_first, strict=True)
     )
@@ -155,10 +163,23 @@ def read_pds(folder: Path | str) -> Traverse:
 
 
 PDS3 = InputFormat(
-    needs="rover images with labels (*.IMG, *.LBL, *.xml)",
+    needs="rover images with labels (*.IMG, *.LBL, *.xml, *.json)",
     matches=lambda names: any(Path(name).suffix.lower() in LABEL_SUFFIXES for name in names),
     read=read_pds,
 )
+
+
+def _remarks(images: Sequence[LabelledImage]) -> list[str]:
+    """What is true of images, once for all of which it is true."""
+    count = Counter(image.remark for image in images if image.remark)
+    said = [f"{number} of {len(images)} images: {remark}" for remark, number in count.items()]
+    unlevel = sorted({_stop_id(image.stop) for image in images if not image.levelled})
+    if unlevel:
+        said.append(
+            f"stop {', '.join(unlevel)}: the labels have no attitude; the world is level and turned as the "
+            "rover is, so that azimuths count from its forward direction and its tilt is not in them"
+        )
+    return said
 
 
 def _kind(path: Path) -> str:
@@ -262,7 +283,8 @@ def _sort_frames(images: Sequence[LabelledImage], eye_of: IntArray) -> tuple[Int
         for k, j in enumerate(firsts):
             other = images[j]
             same_place = (image.stop, image.mast_counter) == (other.stop, other.mast_counter)
-            apart = wrap_angle(np.subtract(image.pan_tilt_rad, other.pan_tilt_rad))
+            angles, others = image.told_angles or image.pan_tilt_rad, other.told_angles or other.pan_tilt_rad
+            apart = wrap_angle(np.subtract(angles, others))
             if same_place and np.abs(apart).max() < SAME_POINTING_RAD and int(eye_of[i]) not in eyes_in[k]:
                 row = k
                 break

@@ -288,6 +288,36 @@ def labels_of_pds4(folder: Path) -> Case:
 
 
 @kind_of_case
+def records_of_the_feed(folder: Path) -> Case:
+    rotation, point = mars2020_mast(as_designed=True).head(*POINTINGS[0])
+    model = turned(MARS2020_NAVCAM, rotation, point)
+    vectors = [f"({','.join(repr(float(v)) for v in getattr(model, letter))})" for letter in "CAHVORE"]
+    record = {
+        "imageid": "NLF_0670_0726421423_362ECM",
+        "camera": {
+            "instrument": "NAVCAM_LEFT",
+            "camera_model_component_list": ";".join([*vectors, "3", "0.37"]),
+        },
+        "extended": {"mastAz": "1.2", "mastEl": -33.9, "xyz": "(12.8,60.1,0.3)", "dimension": "(8,6)"},
+        "attitude": [0.98, 0.02, -0.03, 0.195],
+        "site": "32",
+        "drive": 604,
+    }
+    tree = {"images": [record]}
+    (folder / "NLF_0670_0726421423_362ECM01.png").write_bytes(plain_pictures.picture(".png", 8, 6))
+    file = folder / "a.json"
+
+    def case(rng: np.random.Generator) -> str:
+        tried = dumped(mutated_tree(rng, tree))
+        file.write_bytes(
+            mutated_text(rng, tried.decode()).encode("utf-8", "replace") if rng.random() < 0.5 else tried
+        )
+        return outcome(lambda: read_input(folder), folder)
+
+    return case
+
+
+@kind_of_case
 def samples_of_labels(folder: Path) -> Case:
     file = pds_file(folder / "a.IMG", bytes(range(24)), extra="  BANDS = 1\r\n  MISSING_CONSTANT = 3\r\n")
     text = file.read_bytes()[:1024].rstrip().decode()
