@@ -3,8 +3,9 @@
 One module a factor: `mast` (pan-tilt chain, 6 rows), `mast_projection` (a point seen from a rigid mast, 2
 rows), `camera_projection` (a point seen by a camera that is no pinhole, 2 rows), `circle` (thesis eq. 4.8, 3
 rows), `projective` (projection matrix, 12 rows), `joint_prior` (vectors with correlated errors), `encoder`
-(angles and their readings). Factors that
-GTSAM has (priors of one variable, projections of a pinhole) are taken from GTSAM.
+(angles and their readings), `stop_position`, `stop_distance`, `stop_heading` (what is known of masts).
+Factors that GTSAM has (priors of one variable, relative poses, projections of a pinhole) are taken from
+GTSAM.
 """
 
 from pancam_graph.factors._slots import Corrected as Corrected
@@ -30,3 +31,9 @@ from pancam_graph.factors.mast_projection import mast_projection_factor as mast_
 from pancam_graph.factors.mast_projection import mast_projection_residual as mast_projection_residual
 from pancam_graph.factors.projective import projective_factor as projective_factor
 from pancam_graph.factors.projective import projective_residual as projective_residual
+from pancam_graph.factors.stop_distance import stop_distance_factor as stop_distance_factor
+from pancam_graph.factors.stop_distance import stop_distance_residual as stop_distance_residual
+from pancam_graph.factors.stop_heading import stop_heading_factor as stop_heading_factor
+from pancam_graph.factors.stop_heading import stop_heading_residual as stop_heading_residual
+from pancam_graph.factors.stop_position import stop_position_factor as stop_position_factor
+from pancam_graph.factors.stop_position import stop_position_residual as stop_position_residual

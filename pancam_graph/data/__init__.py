@@ -1,5 +1,18 @@
 """The data model: what is known of a traverse, and what an adjustment found."""
 
+from pancam_graph.data._constraints import CONSTRAINTS as CONSTRAINTS
+from pancam_graph.data._constraints import Constraint as Constraint
+from pancam_graph.data._constraints import Landmark as Landmark
+from pancam_graph.data._constraints import LandmarkAzimuth as LandmarkAzimuth
+from pancam_graph.data._constraints import LandmarkElevation as LandmarkElevation
+from pancam_graph.data._constraints import LandmarkHeight as LandmarkHeight
+from pancam_graph.data._constraints import LandmarkInfinity as LandmarkInfinity
+from pancam_graph.data._constraints import LandmarkPlane as LandmarkPlane
+from pancam_graph.data._constraints import LandmarkPosition as LandmarkPosition
+from pancam_graph.data._constraints import StopDistance as StopDistance
+from pancam_graph.data._constraints import StopHeading as StopHeading
+from pancam_graph.data._constraints import StopPose as StopPose
+from pancam_graph.data._constraints import StopPosition as StopPosition
 from pancam_graph.data._cross_validation import CrossValidation as CrossValidation
 from pancam_graph.data._cross_validation import HalfScore as HalfScore
 from pancam_graph.data._cross_validation import Sigmas as Sigmas
@@ -13,6 +26,7 @@ from pancam_graph.data._matching import Refusal as Refusal
 from pancam_graph.data._matching import StopMatching as StopMatching
 from pancam_graph.data._noise import PixelNoise as PixelNoise
 from pancam_graph.data._noise import mean_sigma_px as mean_sigma_px
+from pancam_graph.data._points import NamedPoints as NamedPoints
 from pancam_graph.data._rig_treatment import RigTreatment as RigTreatment
 from pancam_graph.data._rig_treatment import field_within as field_within
 from pancam_graph.data._rig_treatment import sharing_for as sharing_for

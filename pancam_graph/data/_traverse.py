@@ -4,7 +4,7 @@ A stop is one place of the mast, a frame one pointing of the head, an image one 
 frame, a track one terrain point seen in several images.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -16,10 +16,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pancam_graph.base.arrays import float_array, int_array
+from pancam_graph.base.choices import expected_one_of, nearest, some_of
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, compose, pose_arrays
+from pancam_graph.data._constraints import Constraint, Landmark
 from pancam_graph.data._matching import Matching
 from pancam_graph.data._noise import PixelNoise, mean_sigma_px
+from pancam_graph.data._points import NamedPoints
 from pancam_graph.data._sharing import Sharing
 from pancam_graph.rigs import Rig
 
@@ -105,6 +108,8 @@ class Observations:
     """(n, 2, 2) covariance of (u, v), symmetric and positive definite; None means sigma_px^2 I."""
     origin: Literal["given", "images"] = "given"
     """"images" if this package measured the pixels: their sigmas are guesses, which a solve rescales."""
+    point_track: Mapping[str, int] = field(default_factory=dict)
+    """Track of each named point whose marks are among the rows (`with_points`)."""
 
     def __post_init__(self) -> None:
         """Turn the columns to int64 and float64. Raises InputError for what is no number, or masked."""
@@ -131,6 +136,33 @@ class Observations:
     def with_covariance(self, covariance_px2: FloatArray) -> "Observations":
         """The same observations with other covariances (n, 2, 2), and the sigmas that belong to them."""
         return replace(self, covariance_px2=covariance_px2, sigma_px=mean_sigma_px(covariance_px2))
+
+    def with_points(self, points: NamedPoints | None) -> "Observations":
+        """These observations, then the marks of named points, whose tracks follow the largest here."""
+        if points is None or not len(points):
+            return self
+        first = int(self.track.max(initial=-1)) + 1
+        track = {name: first + i for i, name in enumerate(points.names)}
+        covariance = self.covariance_px2
+        if covariance is not None:
+            own = points.sigma_px[:, None, None] ** 2 * np.eye(2)
+            covariance = np.concatenate([covariance, own])
+        return replace(
+            self,
+            image=np.concatenate([self.image, points.image]),
+            track=np.concatenate([self.track, [track[name] for name in points.name]]),
+            uv_px=np.concatenate([self.uv_px, points.uv_px]),
+            sigma_px=np.concatenate([self.sigma_px, points.sigma_px]),
+            covariance_px2=covariance,
+            point_track=track,
+        )
+
+    def without_points(self) -> "Observations":
+        """The observations that are no marks of named points."""
+        if not self.point_track:
+            return self
+        marks = np.isin(self.track, list(self.point_track.values()))
+        return replace(self.select(~marks), point_track={})
 
     def select(self, rows: BoolArray | IntArray) -> "Observations":
         """The observations of some rows, by mask or index."""
@@ -168,6 +200,10 @@ class Traverse:
     """Sentences about the input that a reader of it wrote for the user."""
     matching: Matching | None = None
     """Statistics of the search for observations in images; None for observations from elsewhere."""
+    constraints: tuple[Constraint, ...] = ()
+    """What is known of terrain points and stops beside pictures and telemetry."""
+    points: NamedPoints | None = None
+    """Marks of named points; `observations`, once there are any, have them too (`with_points`)."""
 
     _of_which_one: ClassVar[tuple[str, ...]] = ("stops", "frames", "images")
     """Kinds of entries of which there must be one at least."""
@@ -205,6 +241,57 @@ class Traverse:
         _require_unique("images: frame and camera", [f"{i.frame} {i.camera}" for i in self.images])
         if self.observations is not None:
             _require_observations(self.observations, len(self.images))
+        if self.points is not None:
+            wrong = (self.points.image < 0) | (self.points.image >= len(self.images))
+            _require_rows(
+                "image", f"a row of images, 0 to {len(self.images) - 1}", wrong, self.points.image, "points"
+            )
+        self._require_constraints()
+
+    def _require_constraints(self) -> None:
+        """Raise InputError for a constraint on what there is not, and for exact ones that contradict."""
+        stops = [s.id for s in self.stops]
+        held = {s.id for s in self.stops if not s.sigmas.any()}
+        for i, one in enumerate(self.constraints):
+            where = f"constraints[{i}] ({one.kind})"
+            for stop in one.stops:
+                if stop not in stops:
+                    raise InputError(expected_one_of(f"{where}: stop", stop, stops))
+            for landmark in one.landmarks:
+                self.track_of(landmark, f"{where}: landmark")
+            if one.stops and not one.landmarks and held.issuperset(one.stops):
+                raise InputError(
+                    f"{where}: expected a stop that can move, found {' and '.join(one.stops)} held by sigma 0"
+                )
+            for j, other in enumerate(self.constraints[:i]):
+                if one.contradicts(other):
+                    raise InputError(
+                        f"{where}: expected what constraints[{j}] says, which is exact (sigma 0) as this is; "
+                        "found another value"
+                    )
+
+    def track_of(self, landmark: Landmark, where: str = "landmark") -> int | None:
+        """Number of the track of a landmark, by name or number; None where it has none yet.
+
+        Raises InputError, beginning with `where`, for a name that is not in `points`, and for a track that
+        no observation has.
+        """
+        known = {} if self.observations is None else dict(self.observations.point_track)
+        names = list(dict.fromkeys([*known, *(() if self.points is None else self.points.names)]))
+        if isinstance(landmark, str) and landmark in names:
+            return known.get(landmark)
+        if isinstance(landmark, int | np.integer) or landmark.isdecimal():
+            track = int(landmark)
+            if self.observations is not None and np.any(self.observations.track == track):
+                return track
+            found = (
+                f"{landmark}, which no observation has"
+                if self.observations is not None
+                else (f"{landmark}: tracks that are still to be found have no numbers")
+            )
+            raise InputError(f"{where}: expected a name of points or the number of a track, found {found}")
+        there = f"one of {some_of(names)}" if names else "a name of points, of which there are none"
+        raise InputError(f"{where}: expected {there}; found {landmark!r}{nearest(landmark, names)}")
 
     @cached_property
     def frame_stop(self) -> IntArray:
@@ -343,12 +430,18 @@ def _require_observations(obs: Observations, n_images: int) -> None:
         )
 
 
-def _require_rows(name: str, expected: str, wrong: ArrayLike, column: FloatArray | IntArray) -> None:
-    """Raise InputError naming the first row that is wrong."""
+def _require_rows(
+    name: str,
+    expected: str,
+    wrong: ArrayLike,
+    column: FloatArray | IntArray,
+    table: str = "observations",
+) -> None:
+    """Raise InputError naming the first row of a table that is wrong."""
     if np.any(wrong):
         row = int(np.argmax(wrong))
         found = column[row].tolist()
-        raise InputError(f"observations: {name}, row {row}: expected {expected}, found {found}")
+        raise InputError(f"{table}: {name}, row {row}: expected {expected}, found {found}")
 
 
 def _require_covariances(covariance_px2: FloatArray) -> None:

@@ -71,6 +71,8 @@ class GivenFactor:
     factor: gtsam.NonlinearFactor
     name: str
     """Its name in errors, with its variables."""
+    constraint: int | None = None
+    """Row of the traverse's constraint that it states; None for a factor of the caller's."""
 
     @property
     def keys(self) -> tuple[int, ...]:

@@ -1,10 +1,10 @@
-"""Telemetry that is believed less than its sigmas say."""
+"""Telemetry and constraints that are believed less than their sigmas say."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pancam_graph.base.geometry import FloatArray
+from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.data import Traverse
 
 __all__ = ["LetGo"]
@@ -23,6 +23,8 @@ class LetGo:
     """(stops, 2) of one error that all pans, or all tilts, of a stop share."""
     stops: FloatArray
     """(stops, 6) of the mast's pose, in its tangent: rotation first, radians and metres."""
+    constraints: BoolArray
+    """(constraints,) whether each does not count."""
 
     @staticmethod
     def nothing(traverse: Traverse) -> "LetGo":
@@ -32,11 +34,13 @@ class LetGo:
             angles_rad=np.zeros((len(traverse.frames), 2)),
             common_rad=np.zeros((n_stops, 2)),
             stops=np.zeros((n_stops, 6)),
+            constraints=np.zeros(len(traverse.constraints), dtype=bool),
         )
 
     def __bool__(self) -> bool:
         """Whether anything is let go."""
-        return bool(self.angles_rad.any() or self.common_rad.any() or self.stops.any())
+        some = self.angles_rad, self.common_rad, self.stops, self.constraints
+        return any(bool(each.any()) for each in some)
 
     def __add__(self, other: "LetGo") -> "LetGo":
         """Both: of each entry the larger sigma."""
@@ -45,6 +49,7 @@ class LetGo:
             angles_rad=np.maximum(self.angles_rad, other.angles_rad),
             common_rad=np.maximum(self.common_rad, other.common_rad),
             stops=np.maximum(self.stops, other.stops),
+            constraints=self.constraints | other.constraints,
         )
 
     def angle_covariance(self, stop: int, sigmas: FloatArray, angles_rad: FloatArray) -> FloatArray | None:

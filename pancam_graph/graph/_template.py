@@ -86,9 +86,7 @@ class FactorTemplate(ABC):
         `present` are values of another template, from which variables of given factors are fixed that this
         template lacks. `apart` as for `ties`: it keeps the graph sparse for elimination by GTSAM.
         """
-        seats = self.seats(given, present)
         stops = range(len(self.traverse.stops))
-        placed = (seated(one, seats) for one in given)
         return Factors(
             telemetry=tuple(self.telemetry_priors()),
             ties=tuple(self.ties(apart=apart)),
@@ -97,8 +95,19 @@ class FactorTemplate(ABC):
                 *(factor for stop in stops for factor in self.flex_factors(stop)),
             ),
             given=tuple(given),
-            seated=tuple(factor for factor in placed if factor is not None),
+            seated=self.seated(given, present),
         )
+
+    def seated(
+        self, given: Sequence[GivenFactor], present: gtsam.Values | None = None
+    ) -> tuple[gtsam.NonlinearFactor, ...]:
+        """Given factors on this template's variables, but those held or let go; see `factors`."""
+        believed = [
+            one for one in given if one.constraint is None or not self.let_go.constraints[one.constraint]
+        ]
+        seats = self.seats(believed, present)
+        placed = (seated(one, seats) for one in believed)
+        return tuple(factor for factor in placed if factor is not None)
 
     @cached_property
     def keys(self) -> GraphKeys:

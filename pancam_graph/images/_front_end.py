@@ -113,7 +113,7 @@ def find_observations(
     work.cache.forget_others()
     pairs = tuple(_report(*each) for each in zip(work.pairs, work.matches, strict=True))
     matching = Matching(pairs=pairs, stops=tuple(stops))
-    return traverse.with_observations(observations, warnings, matching=matching)
+    return traverse.with_observations(observations.with_points(traverse.points), warnings, matching=matching)
 
 
 def find_masks(

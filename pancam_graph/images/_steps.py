@@ -10,7 +10,7 @@ threads, it takes the steps that it needs into local names.
 import logging
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -302,7 +302,7 @@ class Steps:
         features. A solve of them places the terrain of each stop, which is then sought in the images of other
         stops. The result for each direction of each pair of stops is kept in the cache as soon as it is done.
         """
-        traverse = self.traverse.with_observations(observations)
+        traverse = replace(self.traverse, constraints=(), points=None).with_observations(observations)
         usable = [
             None if mask is None else mask.usable(between_stops=True, margin_px=_PATCH_PX)
             for mask in self.masks

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 import pydantic
 
+from pancam_graph.base.choices import nearest
 from pancam_graph.base.errors import InputError, PancamGraphError
 from pancam_graph.base.regular_files import instead_of_file
 
@@ -214,8 +215,13 @@ def _sentence(error: Any) -> str:
         length = context["min_length" if kind == "too_short" else "max_length"]  # the same in every schema
         return f"{where}: expected {length} numbers, found {context['actual_length']}"
     if kind in {"union_tag_invalid", "union_tag_not_found"} and isinstance(error["input"], dict):
+        if "expected_tags" not in context:
+            return f"{where}.kind: expected this key, found an object without it"
         tags = context["expected_tags"].translate(str.maketrans("", "", "'<>"))
-        return f"{where}.model: expected one of {tags}; found {short(error['input'].get('model'))}"
+        key = "kind" if "kind" in context["discriminator"] else "model"
+        found = error["input"].get(key)
+        near = nearest(found, tags.split(", ")) if isinstance(found, str) else ""
+        return f"{where}.{key}: expected one of {tags}; found {short(found)}{near}"
     if kind == "literal_error":
         return f"{where}: expected {context['expected']}, found {short(error['input'])}"
     expected = "an object" if kind.startswith("union_tag") else _EXPECTED.get(kind, error["msg"])

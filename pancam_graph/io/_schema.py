@@ -11,6 +11,7 @@ from pancam_graph.base.choices import expected_one_of
 from pancam_graph.base.errors import InputError
 from pancam_graph.data import QUANTITIES, Freedom, Sharing
 from pancam_graph.io._camera_entry import AnyCamera, camera_entry
+from pancam_graph.io._constraint_entries import AnyConstraint
 from pancam_graph.io._entries import Entry, Label, PoseEntry, SparseEntry, Text
 from pancam_graph.io._json import prefixed
 from pancam_graph.rigs import Rig, RigCovariance, RigEntry, RigUncertainty, rig_template
@@ -256,6 +257,8 @@ class TraverseFile(Entry):
     images: list[ImageEntry]
     observations: Label | None
     sharing: SharingEntry | None = None
+    constraints: list[AnyConstraint] = []  # noqa: RUF012  pydantic copies it
+    points: Label | None = None
 
 
 def rig_entry(rig: Rig) -> OwnRigEntry:

@@ -10,7 +10,8 @@ from pancam_graph.base.errors import ImageError, InputError, PancamGraphError
 from pancam_graph.base.regular_files import instead_of_file, is_missing
 from pancam_graph.base.text import visible
 from pancam_graph.base.whole_files import whole_file
-from pancam_graph.data import Frame, Image, Observations, Stop, Traverse
+from pancam_graph.data import Frame, Image, NamedPoints, Observations, Stop, Traverse
+from pancam_graph.io._constraint_entries import constraint_entry, points_csv, read_points
 from pancam_graph.io._entries import TRAVERSE_FORMAT, VERSION, PoseEntry
 from pancam_graph.io._input_format import InputFormat
 from pancam_graph.io._json import prefixed, read_json, refused_by_schema, short, validated
@@ -31,6 +32,7 @@ __all__ = ["TRAVERSE_FOLDER", "read_traverse", "traverse_entries", "traverse_of"
 
 _TRAVERSE_JSON = "traverse.json"
 _OBSERVATIONS = "observations.npz"
+_POINTS = "points.csv"
 _IN_OBSERVATIONS = "observations: "
 """Beginning of what `Traverse` says about observations."""
 
@@ -68,8 +70,10 @@ def read_traverse(folder: Path | str) -> Traverse:
         source = None
         if entries.observations is not None:
             source = _inside(folder, entries.observations, "observations")
+        marks = None if entries.points is None else _inside(folder, entries.points, "points")
     observations = None if source is None else read_observations(source)
-    traverse = _checked(entries, path, observations, source)
+    points = None if marks is None else read_points(marks, [i.id for i in entries.images])
+    traverse = _checked(entries, path, observations, source, points)
     with prefixed(f"{path}: rig.uncertainty.covariance"):
         require_other_pictures(traverse, traverse.rig)
     unusable = _unusable_images(files, traverse)
@@ -78,13 +82,17 @@ def read_traverse(folder: Path | str) -> Traverse:
 
 
 def _checked(
-    entries: TraverseFile, path: Path, observations: Observations | None, source: Path | None
+    entries: TraverseFile,
+    path: Path,
+    observations: Observations | None,
+    source: Path | None,
+    points: NamedPoints | None,
 ) -> Traverse:
     """The traverse of a file. Raises InputError naming the file at fault: itself, or that of observations."""
     try:
         # Numbers that are too large overflow. The constructors refuse the result; NumPy need not warn too.
         with np.errstate(all="ignore"):
-            return traverse_of(entries, path.parent, observations)
+            return traverse_of(entries, path.parent, observations, points)
     except PancamGraphError as error:
         in_observations = source is not None and str(error).startswith(_IN_OBSERVATIONS)
         with prefixed(source if in_observations else path):
@@ -108,12 +116,16 @@ def write_traverse(traverse: Traverse, folder: Path | str, *, overwrite: bool = 
     observations = traverse.observations
     with refused_by_schema(path):
         entries = traverse_entries(traverse)
-    content = entries.model_dump(exclude={"sharing"})
+    content = entries.model_dump(exclude={"sharing", "constraints", "points"})
     for image in content["images"]:
         if image["mask"] is None:
             del image["mask"]
     if entries.sharing is not None:
         content["sharing"] = entries.sharing.model_dump(exclude_defaults=True)
+    if entries.constraints:
+        content["constraints"] = [one.model_dump() for one in entries.constraints]
+    if entries.points is not None:
+        content["points"] = entries.points
     text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -121,14 +133,25 @@ def write_traverse(traverse: Traverse, folder: Path | str, *, overwrite: bool = 
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source, target)
         if observations is not None:
-            whole_file(folder / _OBSERVATIONS, observations_npz(observations))
+            whole_file(folder / _OBSERVATIONS, observations_npz(observations.without_points()))
+        if traverse.points is not None:
+            whole_file(folder / _POINTS, points_csv(traverse.points, [i.id for i in traverse.images]))
         whole_file(path, f"{text}\n".encode())  # last, so that a folder with it is complete
     except OSError as error:
         raise InputError(f"{folder}: expected a folder to write to, found: {error}") from error
 
 
-def traverse_of(entries: TraverseFile, folder: Path, observations: Observations | None = None) -> Traverse:
+def traverse_of(
+    entries: TraverseFile,
+    folder: Path,
+    observations: Observations | None = None,
+    points: NamedPoints | None = None,
+) -> Traverse:
     """The traverse that a file's entries say. Raises InputError as `Traverse` does."""
+    constraints = []
+    for i, entry in enumerate(entries.constraints):
+        with prefixed(f"constraints[{i}] ({entry.kind})"):
+            constraints.append(entry.constraint())
     stops = tuple(
         Stop(
             id=s.id,
@@ -144,9 +167,11 @@ def traverse_of(entries: TraverseFile, folder: Path, observations: Observations 
         stops=stops,
         frames=tuple(Frame(**f.model_dump()) for f in entries.frames),
         images=tuple(Image(**i.model_dump()) for i in entries.images),
-        observations=observations,
+        observations=None if observations is None else observations.with_points(points),
         sharing=None if entries.sharing is None else entries.sharing.sharing(),
         folder=folder,
+        constraints=tuple(constraints),
+        points=points,
     )
 
 
@@ -183,6 +208,8 @@ def traverse_entries(traverse: Traverse) -> TraverseFile:
         ],
         observations=None if traverse.observations is None else _OBSERVATIONS,
         sharing=None if traverse.sharing is None else SharingEntry.of(traverse.sharing),
+        constraints=[constraint_entry(one) for one in traverse.constraints],  # type: ignore[misc]  # of its union
+        points=None if traverse.points is None else _POINTS,
     )
 
 

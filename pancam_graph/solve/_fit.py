@@ -9,6 +9,7 @@ from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.data import FIXED, PixelNoise
 from pancam_graph.graph import HardTemplate
 from pancam_graph.landmarks import Landmarks
+from pancam_graph.solve._constraints import constrained
 from pancam_graph.solve._eliminated import EliminatedSolver, Ended
 from pancam_graph.solve._far_terrain import FarTerrain, far_terrain
 from pancam_graph.solve._optimise import Outcome
@@ -48,7 +49,7 @@ def fit(screened: Screened) -> Fitted:
     Where smooth distortion fields are free, once without them and from there once with them. Raises
     SolveError where the system has a direction that nothing holds however much it is damped.
     """
-    prepared, problem = screened.prepared, screened.problem
+    prepared, problem = screened.prepared, constrained(screened.problem)
     solver = solver_for(prepared.options, prepared.on_iteration, is_near=screened.is_near)
     noise, behind = prepared.noise, np.zeros(len(prepared.observations), dtype=bool)
     costs: list[float] = []
@@ -86,11 +87,12 @@ def fitted_elsewhere(
 ) -> Fitted:
     """A problem that was fitted elsewhere, over what it accepts: `costs` on the way, and why that ended.
 
-    Where it is not the optimum of what it accepts, residuals decide how large the noise is, or fields are
-    free, the rounds of `fit` follow.
+    Where it is not the optimum of what it accepts, residuals decide how large the noise is, fields are
+    free, or there are constraints, the rounds of `fit` follow.
     """
     prepared, problem = screened.prepared, screened.problem
-    if not is_optimum or prepared.rescales_noise or prepared.sharing.field != FIXED:
+    has_more = prepared.rescales_noise or prepared.sharing.field != FIXED or prepared.traverse.constraints
+    if not is_optimum or has_more:
         fitted = fit(screened)
         outcome = fitted.outcome
         return replace(

@@ -7,7 +7,14 @@ import gtsam
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import BoolArray
 from pancam_graph.data import Traverse
-from pancam_graph.graph import ExplicitLandmarks, GraphKeys, RigVariables, SoftTemplate, whole_graph
+from pancam_graph.graph import (
+    ExplicitLandmarks,
+    GraphKeys,
+    RigVariables,
+    SoftTemplate,
+    stop_constraints,
+    whole_graph,
+)
 from pancam_graph.initialise import Start
 from pancam_graph.landmarks import SQUARED, loss_of
 from pancam_graph.solve._options import SolveOptions
@@ -67,7 +74,7 @@ def build_graph(
     assert isinstance(
         problem.template, SoftTemplate
     )  # the method with explicit landmarks has no other template
-    return whole_graph(
+    graph, values = whole_graph(
         problem.values,
         ExplicitLandmarks(problem.template, problem.measurements),
         problem.points_m(),
@@ -75,3 +82,6 @@ def build_graph(
         loss=loss,
         is_rigid=options.firm_tie == "hard",
     )
+    for one in stop_constraints(traverse, problem.template.keys):
+        graph.push_back(one.factor)
+    return graph, values

@@ -10,6 +10,7 @@ from pancam_graph.data import State, Verdict
 from pancam_graph.elimination import Covariance
 from pancam_graph.landmarks import refine
 from pancam_graph.solve._considered import considered
+from pancam_graph.solve._constraints import constrained
 from pancam_graph.solve._covariance import Uncertainty, uncertainty
 from pancam_graph.solve._diagnose import connection_warnings, listed
 from pancam_graph.solve._fit import Fitted, regular
@@ -140,7 +141,7 @@ def _uncertainty(
 def _first(fitted: Fitted) -> Problem:
     """`Judged.first` of a fit."""
     prepared, problem = fitted.screened.prepared, fitted.problem
-    first, m = prepared.problem, problem.measurements
+    first, m = constrained(prepared.problem), problem.measurements
     if problem.template.let_go:
         first = first.letting_go(problem.template.let_go)
     if m is first.measurements and problem.accepted.all():

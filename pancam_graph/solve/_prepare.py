@@ -42,6 +42,7 @@ from pancam_graph.landmarks import (
     triangulate,
 )
 from pancam_graph.solve._alternation import AlternatingSolver
+from pancam_graph.solve._constraints import require_constraints
 from pancam_graph.solve._eliminated import EliminatedSolver
 from pancam_graph.solve._explicit import ExplicitSolver
 from pancam_graph.solve._optimise import Iteration
@@ -119,8 +120,8 @@ def prepare(
 
     `start` gives the first stops, angles and cameras; default: telemetry's. `factors` are the caller's own,
     on keys of `graph_keys`. Raises InputError for a traverse without observations, for given cameras that are
-    not one an image, for sigmas too uneven, options that the traverse cannot serve, and factors that fail;
-    SolveError where no track is seen twice.
+    not one an image, for sigmas too uneven, options that the traverse cannot serve, and for factors and
+    constraints that fail; SolveError where no track is seen twice.
     """
     if traverse.observations is None:
         raise InputError(
@@ -144,6 +145,7 @@ def prepare(
         values=values,
         landmarks=Landmarks(vector=np.zeros((n, 4)), origin_m=np.zeros((n, 3))),
     )
+    require_constraints(traverse, options, problem)
     return Prepared(
         traverse=traverse,
         options=options,

@@ -96,10 +96,14 @@ class Problem:
         return replace(self, template=template, factors=factors, values=values)
 
     def letting_go(self, let_go: LetGo) -> "Problem":
-        """The same problem with telemetry believed less."""
-        template = self.template.letting_go(let_go)
-        telemetry = tuple(template.telemetry_priors())
-        return replace(self, template=template, factors=replace(self.factors, telemetry=telemetry))
+        """The same problem with telemetry and constraints believed less."""
+        template, factors = self.template.letting_go(let_go), self.factors
+        factors = replace(
+            factors,
+            telemetry=tuple(template.telemetry_priors()),
+            seated=template.seated(factors.given, self.values) if factors.given else (),
+        )
+        return replace(self, template=template, factors=factors)
 
     def at(self, values: gtsam.Values, landmarks: Landmarks) -> "Problem":
         """The same problem at other values and landmarks."""

@@ -1,0 +1,43 @@
+"""Constraints on stops as factors on the keys of masts; those on terrain points are in `_sensors`."""
+
+from collections.abc import Iterator
+
+import gtsam
+import numpy as np
+
+from pancam_graph.data import Constraint, StopDistance, StopHeading, StopPose, StopPosition, Traverse
+from pancam_graph.factors import Key, stop_distance_factor, stop_heading_factor, stop_position_factor
+from pancam_graph.graph._given import GivenFactor
+from pancam_graph.graph._graph_keys import GraphKeys
+
+__all__ = ["stop_constraints"]
+
+
+def stop_constraints(traverse: Traverse, keys: GraphKeys) -> Iterator[GivenFactor]:
+    """The constraints of a traverse that are about stops alone."""
+    for i, one in enumerate(traverse.constraints):
+        factor = _factor(one, [keys.mast(stop) for stop in one.stops])
+        if factor is not None:
+            yield GivenFactor(factor=factor, name=f"constraints[{i}] ({one.about})", constraint=i)
+
+
+def _factor(one: Constraint, masts: list[int]) -> gtsam.NonlinearFactor | None:
+    noise = gtsam.noiseModel
+    if isinstance(one, StopPosition):
+        return stop_position_factor(
+            noise.Gaussian.Covariance(one.covariance),
+            Key(masts[0]),
+            position_m=one.target_m,
+            axes=one.axes,
+        )
+    if isinstance(one, StopPose):
+        return gtsam.BetweenFactorPose3(
+            masts[0], masts[1], one.a_T_b, noise.Gaussian.Covariance(one.covariance)
+        )
+    if isinstance(one, StopDistance):
+        sigma = noise.Diagonal.Sigmas(np.array([one.sigma]))
+        return stop_distance_factor(sigma, Key(masts[0]), Key(masts[1]), distance_m=one.value)
+    if isinstance(one, StopHeading):
+        sigma = noise.Diagonal.Sigmas(np.array([one.sigma]))
+        return stop_heading_factor(sigma, Key(masts[0]), heading_rad=one.value)
+    return None

@@ -1,0 +1,218 @@
+"""The entries of `constraints` in `traverse.json`, one a kind, and the table of named points."""
+
+import csv
+import io
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
+
+import gtsam
+import numpy as np
+from pydantic import Field
+
+from pancam_graph.base.choices import expected_one_of
+from pancam_graph.base.errors import InputError
+from pancam_graph.base.geometry import FloatArray
+from pancam_graph.data import CONSTRAINTS, Constraint, NamedPoints
+from pancam_graph.io._csv_table import read_csv_table
+from pancam_graph.io._entries import Label, PoseEntry, SparseEntry
+from pancam_graph.io._json import prefixed, short
+
+__all__ = ["AnyConstraint", "constraint_entry", "points_csv", "read_points"]
+
+_Landmark = Label | int
+_Axes = Annotated[list[float | None], Field(min_length=3, max_length=3)]
+_Three = Annotated[list[float], Field(min_length=3, max_length=3)]
+_Two = Annotated[list[Label], Field(min_length=2, max_length=2)]
+_CLASS = {one.kind: one for one in CONSTRAINTS}
+_COLUMNS = ("name", "image", "u_px", "v_px", "sigma_px")
+
+
+class _ConstraintEntry(SparseEntry):
+    """Base of all kinds."""
+
+    _OPTIONAL: ClassVar = frozenset({"robust", "sigma_m", "covariance_m2"})
+
+    kind: str
+    robust: bool | None = None
+
+    def constraint(self) -> Constraint:
+        """The constraint. Raises InputError naming the entry."""
+        known = {name: getattr(self, name) for name in type(self).model_fields if name != "kind"}
+        if isinstance(known.get("a_T_b"), PoseEntry):
+            known["a_T_b"] = known["a_T_b"].pose("a_T_b")
+        for name in ("covariance", "covariance_m2"):
+            if known.get(name) is not None:
+                known[name] = _matrix(name, known[name])
+        if "stops" in known:
+            known["between"] = tuple(known.pop("stops"))
+        known["robust"] = bool(known["robust"])
+        return _CLASS[self.kind](**known)
+
+
+class _LandmarkPosition(_ConstraintEntry):
+    kind: Literal["landmark-position"]
+    landmark: _Landmark
+    position_m: _Axes
+    sigma_m: _Axes | None = None
+    covariance_m2: list[list[float]] | None = None
+
+
+class _LandmarkHeight(_ConstraintEntry):
+    kind: Literal["landmark-height"]
+    landmark: _Landmark
+    height_m: float
+    sigma_m: float
+
+
+class _LandmarkPlane(_ConstraintEntry):
+    kind: Literal["landmark-plane"]
+    landmark: _Landmark
+    normal: _Three
+    offset_m: float
+    sigma_m: float
+
+
+class _LandmarkAzimuth(_ConstraintEntry):
+    kind: Literal["landmark-azimuth"]
+    landmark: _Landmark
+    stop: Label
+    azimuth_rad: float
+    sigma_rad: float
+
+
+class _LandmarkElevation(_ConstraintEntry):
+    kind: Literal["landmark-elevation"]
+    landmark: _Landmark
+    stop: Label
+    elevation_rad: float
+    sigma_rad: float
+
+
+class _LandmarkInfinity(_ConstraintEntry):
+    kind: Literal["landmark-infinity"]
+    landmark: _Landmark
+
+
+class _StopPosition(_ConstraintEntry):
+    kind: Literal["stop-position"]
+    stop: Label
+    position_m: _Axes
+    sigma_m: _Axes | None = None
+    covariance_m2: list[list[float]] | None = None
+
+
+class _StopPose(_ConstraintEntry):
+    kind: Literal["stop-pose"]
+    stops: _Two
+    a_T_b: PoseEntry
+    covariance: list[list[float]]
+
+
+class _StopDistance(_ConstraintEntry):
+    kind: Literal["stop-distance"]
+    stops: _Two
+    distance_m: float
+    sigma_m: float
+
+
+class _StopHeading(_ConstraintEntry):
+    kind: Literal["stop-heading"]
+    stop: Label
+    heading_rad: float
+    sigma_rad: float
+
+
+AnyConstraint = Annotated[
+    _LandmarkPosition
+    | _LandmarkHeight
+    | _LandmarkPlane
+    | _LandmarkAzimuth
+    | _LandmarkElevation
+    | _LandmarkInfinity
+    | _StopPosition
+    | _StopPose
+    | _StopDistance
+    | _StopHeading,
+    Field(discriminator="kind"),
+]
+"""Any kind of constraint, as the type of an entry."""
+
+_ENTRY = {
+    entry.model_fields["kind"].annotation.__args__[0]: entry  # type: ignore[union-attr]  # a Literal
+    for entry in _ConstraintEntry.__subclasses__()
+}
+
+
+def constraint_entry(constraint: Constraint) -> "_ConstraintEntry":
+    """The entry of a constraint."""
+    entry = _ENTRY[constraint.kind]
+    known: dict[str, object] = {"kind": constraint.kind}
+    for name in entry.model_fields:
+        value = getattr(constraint, "between" if name == "stops" else name, None)
+        if name == "kind" or value is None or (name == "robust" and not value):
+            continue
+        if isinstance(value, gtsam.Pose3):
+            value = PoseEntry.of(value)
+        elif isinstance(value, np.ndarray):
+            value = value.tolist()
+        elif isinstance(value, tuple | list):
+            value = [float(v) if isinstance(v, int | float | np.number) else v for v in value]
+        elif isinstance(value, np.number) or (isinstance(value, int) and name not in {"landmark", "robust"}):
+            value = float(value)
+        known[name] = value
+    return entry(**known)  # type: ignore[arg-type]  # as the fields say
+
+
+def _matrix(name: str, rows: list[list[float]]) -> FloatArray:
+    n = 6 if name == "covariance" else 3
+    lengths = sorted({len(row) for row in rows})
+    if len(rows) != n or lengths != [n]:
+        raise InputError(f"{name}: expected {n} rows of {n} numbers, found {len(rows)} of {lengths}")
+    return np.array(rows, dtype=float)
+
+
+def read_points(path: Path, images: list[str]) -> NamedPoints:
+    """The table of named points: columns `name`, `image` (its id), `u_px`, `v_px`, `sigma_px`.
+
+    Raises InputError naming file and line.
+    """
+    table = read_csv_table(path)
+    with prefixed(path):
+        at = {name: table.column(name, ", ".join(_COLUMNS)) for name in _COLUMNS}
+        row_of = {name: row for row, name in enumerate(images)}
+        names, rows, numbers = [], [], []
+        for line, cells in table.rows:
+            name, image = cells[at["name"]].strip(), cells[at["image"]].strip()
+            if not name:
+                raise InputError(f"line {line}: name: expected a name, found an empty cell")
+            if image not in row_of:
+                raise InputError(expected_one_of(f"line {line}: image", image, images))
+            names.append(name)
+            rows.append(row_of[image])
+            numbers.append([_number(cells[at[c]], f"line {line}: {c}") for c in _COLUMNS[2:]])
+        columns = np.array(numbers, dtype=float).reshape(-1, 3)
+        return NamedPoints(
+            name=tuple(names),
+            image=np.array(rows, dtype=np.int64),
+            uv_px=columns[:, :2],
+            sigma_px=columns[:, 2],
+        )
+
+
+def points_csv(points: NamedPoints, images: list[str]) -> bytes:
+    """The content of the table of named points, digits to double precision."""
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(_COLUMNS)
+    for name, image, uv, sigma in zip(
+        points.name, points.image.tolist(), points.uv_px.tolist(), points.sigma_px.tolist(), strict=True
+    ):
+        writer.writerow([name, images[image], *map(repr, uv), repr(sigma)])
+    return text.getvalue().encode()
+
+
+def _number(cell: str, where: str) -> float:
+    try:
+        return float(cell)
+    except ValueError as error:
+        raise InputError(f"{where}: expected a number, found {short(cell)}") from error
