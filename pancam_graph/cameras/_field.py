@@ -30,7 +30,7 @@ class Fields:
     coefficients_px: FloatArray
     """(fields, *FIELD_SHAPE)"""
     row: IntArray
-    """(n,) the field of each image"""
+    """(n,) the field of each image; -1: it has none"""
     size_px: FloatArray
     """(n, 2) width and height of each image"""
 
@@ -40,7 +40,9 @@ class Fields:
         begin = np.cumsum([0, *(len(f.coefficients_px) for f in fields)])
         return Fields(
             coefficients_px=np.concatenate([f.coefficients_px for f in fields]),
-            row=np.concatenate([f.row + b for f, b in zip(fields, begin, strict=False)]),
+            row=np.concatenate(
+                [np.where(f.row < 0, -1, f.row + b) for f, b in zip(fields, begin, strict=False)]
+            ),
             size_px=np.concatenate([f.size_px for f in fields]),
         )
 
@@ -52,7 +54,10 @@ class Fields:
         """
         cell, t, _ = self._cells(image, uv_px)
         along_u, along_v = np.moveaxis(_cubics(t), 1, 0)
-        return cell[:, ::-1], along_v[:, :, None] * along_u[:, None, :]
+        weight = along_v[:, :, None] * along_u[:, None, :]
+        if (self.row < 0).any():
+            weight[self.row[image] < 0] = 0.0
+        return cell[:, ::-1], weight
 
     def slope(self, image: IntArray, uv_px: FloatArray) -> FloatArray:
         """Derivatives (m, 2, 2) of `at` by the pixel: 0 across an edge, beyond it."""

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -11,8 +10,9 @@ from pancam_graph.base.compiled import uncounted
 from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.cameras._camera import Camera
 from pancam_graph.cameras._field_camera import without_field
-from pancam_graph.cameras._lens import Distorted, Distortion
+from pancam_graph.cameras._lens import Distorted
 from pancam_graph.cameras._lenses import LENSES, lens_of
+from pancam_graph.cameras._sensors import SENSORS
 
 __all__ = ["LENS_SOURCES", "LensTable", "distort"]
 
@@ -31,7 +31,7 @@ class LensTable:
     row: IntArray
     """(n,) row of the table of each image; -1: the camera has no distortion."""
     kind: IntArray
-    """(lenses,) which model each is: its place in `LENSES`."""
+    """(lenses,) which model each is: its place in `LENSES`, or behind these in `SENSORS`."""
     parameters: FloatArray
     """(lenses, width) its numbers, 0 where it has fewer."""
 
@@ -64,6 +64,12 @@ class LensTable:
         )
 
     @staticmethod
+    def of_sensors(kind: IntArray) -> "LensTable":
+        """The table of sensors of some kinds (n,), each its place in `SENSORS`."""
+        n = len(kind)
+        return LensTable(row=np.arange(n), kind=len(LENSES) + kind, parameters=np.zeros((n, _WIDTH)))
+
+    @staticmethod
     def joined(tables: "Sequence[LensTable]") -> "LensTable":
         """The table of the images of several tables, one after the other."""
         begin = np.cumsum([0, *(len(t.kind) for t in tables)])
@@ -76,6 +82,7 @@ class LensTable:
 
 
 _Distort = Callable[[int, FloatArray, int, float, float, float, float], Distorted]
+_DistortOne = Callable[[FloatArray, int, float, float, float, float], Distorted]
 
 
 @uncounted.part
@@ -84,9 +91,8 @@ def _none(kind: int, p: FloatArray, row: int, d0: float, d1: float, d2: float, w
     return False, (d0, d1, d2), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.0)
 
 
-def _first_or(number: int, distortion: Distortion[Any], otherwise: _Distort) -> _Distort:
-    """A function that calls the distortion where `kind` is its number, and another one elsewhere."""
-    own = distortion.distort
+def _first_or(number: int, own: _DistortOne, otherwise: _Distort) -> _Distort:
+    """A function that calls one distortion where `kind` is its number, and another one elsewhere."""
 
     @uncounted.merged
     def either(kind: int, p: FloatArray, row: int, d0: float, d1: float, d2: float, w: float) -> Distorted:
@@ -98,14 +104,16 @@ def _first_or(number: int, distortion: Distortion[Any], otherwise: _Distort) -> 
 
 
 def _any_of_lenses() -> _Distort:
-    """One function for all lenses of the registry; compiled loops cannot look functions up in a table."""
+    """One function for all lenses and sensors; compiled loops cannot look functions up in a table."""
     out: _Distort = _none
+    for number, sensor in reversed(list(enumerate(SENSORS, start=len(LENSES)))):
+        out = _first_or(number, sensor, out)
     for number, lens in reversed(list(enumerate(LENSES))):
         if lens.distortion is not None:
-            out = _first_or(number, lens.distortion, out)
+            out = _first_or(number, lens.distortion.distort, out)
     return out
 
 
 distort = _any_of_lenses()
-"""The distortion of any lens, for compiled loops: takes kind, parameters and row of a `LensTable`, then d and
-w as `Distortion.distort` does."""
+"""The distortion of any lens or sensor, for compiled loops: takes kind, parameters and row of a `LensTable`,
+then d and w as `Distortion.distort` does."""

@@ -472,7 +472,8 @@ class LandmarkSystem:
         lost[self.landmark_row[strays]] = True
         part, rows = m.part(np.flatnonzero(lost[m.landmark])), np.cumsum(lost)[self.landmark_row[strays]] - 1
         weight = weight[: len(part.image)]
-        placed = triangulate(*rays_of(part, views), part.landmark, weight)
+        of_image = (part.row >= 0).astype(float)  # sensors have no rays
+        placed = triangulate(*rays_of(part, views), part.landmark, of_image)
         placed = placed.about(self._given(self.origin_m)[lost])
         placed = refine(placed, part, views, weight, self.loss, beyond_infinity=True)
         self._take_if_better(strays, placed.vector[rows], sights, bearings)
@@ -576,6 +577,23 @@ class LandmarkSystem:
 
         in_parallel(work, len(self.blocks), grain=1)
         return self._given(out)
+
+    def eliminated(
+        self, landmark: int, covariance: Covariance
+    ) -> tuple[Block, FloatArray, FloatArray, FloatArray]:
+        """A landmark, by its row in the order given, at the last linearisation.
+
+        Its block, W = L^-1 E' (3, columns of the block), L (3, 3), and what the uncertainty of fields adds to
+        L' C L (3, 3), C being the landmark's covariance.
+        """
+        j = int(np.flatnonzero(self.landmark_row == landmark)[0])
+        whole = next(chunk for chunk in self.chunks if chunk.begin <= j < chunk.end)
+        one, block = replace(whole, begin=j, end=j + 1), self.blocks[whole.block]
+        W, L, more = self._dense_arms(one), np.zeros((3, 3)), np.zeros((1, 3, 3))
+        L[np.tril_indices(3)] = self.reduced.factor[j]
+        if self._fields is not None:
+            more = self._fields.spread(j, j + 1, block, covariance, lambda: W)
+        return block, W[0], L, more[0]
 
     @property
     def undetermined(self) -> BoolArray:

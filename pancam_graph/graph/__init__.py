@@ -27,6 +27,9 @@ from pancam_graph.graph._let_go import LetGo as LetGo
 from pancam_graph.graph._projective import ProjectiveTemplate as ProjectiveTemplate
 from pancam_graph.graph._rig_variables import RigVariable as RigVariable
 from pancam_graph.graph._rig_variables import RigVariables as RigVariables
+from pancam_graph.graph._sensors import Sensors as Sensors
+from pancam_graph.graph._sensors import Sight as Sight
+from pancam_graph.graph._sensors import sights_of as sights_of
 from pancam_graph.graph._soft import SoftTemplate as SoftTemplate
 from pancam_graph.graph._template import FactorTemplate as FactorTemplate
 from pancam_graph.graph._template import diagonal_noise as diagonal_noise

@@ -7,6 +7,7 @@ where that is free. Quantities that telemetry holds (sigma 0) are not variables.
 """
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -38,6 +39,7 @@ from pancam_graph.factors import Key
 from pancam_graph.graph._factors import FactorList
 from pancam_graph.graph._given import Seat
 from pancam_graph.graph._keys import Kind, index_of, key_of, kind_of
+from pancam_graph.graph._sensors import Sensors
 from pancam_graph.graph._template import FactorTemplate
 from pancam_graph.landmarks import CameraViews
 
@@ -72,9 +74,27 @@ class HardTemplate(FactorTemplate):
         """Key of how the heads of those frames stand off the rigid mast."""
         return key_of(Kind.FLEX, stop)
 
+    def sensing(self, sensors: Sensors | None) -> "HardTemplate":
+        """The same variables, with these sensors behind the images."""
+        other = copy(self)
+        other.sensors = sensors
+        other.__dict__.pop("linkage", None)
+        return other
+
     @cached_property
     def linkage(self) -> Linkage:
         """Units depend on their angles, their mast, and free entries of the rig; see `_segments`."""
+        link = self._linkage_of_images
+        return link if self.sensors is None else self.sensors.linked(link, self._mast_keys)
+
+    @cached_property
+    def _mast_keys(self) -> tuple[int | None, ...]:
+        """Key of each stop's mast; None where it is held."""
+        slots = [self.mast(stop) for stop in range(len(self.traverse.stops))]
+        return tuple(slot.key if isinstance(slot, Key) else None for slot in slots)
+
+    @cached_property
+    def _linkage_of_images(self) -> Linkage:
         t, free = self.traverse, self.rig_variables
         keys: list[int] = []
         dims: list[int] = []
@@ -107,8 +127,7 @@ class HardTemplate(FactorTemplate):
         place = np.zeros(len(t.frames), dtype=np.int64)
         for frames in self._frames:
             place[frames] = np.arange(len(frames))
-        stops, stop_of = range(len(t.stops)), t.frame_stop[seg.frame]
-        masts = [slot.key if isinstance(slot := self.mast(stop), Key) else None for stop in stops]
+        stops, stop_of, masts = range(len(t.stops)), t.frame_stop[seg.frame], self._mast_keys
         column[:, _ANGLES] = 2 * place[seg.frame]
         variable[:, _ANGLES] = np.array([row.get(self.angles_key(stop), -1) for stop in stops])[stop_of]
         variable[:, _MAST] = np.array([-1 if key is None else row[key] for key in masts])[stop_of]
@@ -199,12 +218,13 @@ class HardTemplate(FactorTemplate):
         if free.of["calibration"]:
             basis = free.basis("calibration")
             chain[:, _CALIBRATION, 6:, : basis.shape[2]] = basis
-        return Posture(
+        posture = Posture(
             views=self._views(masts, angles, values),
             unit_R=masts[0][stop],
             unit_t=masts[1][stop],
             chain=chain[seg.present],
         )
+        return posture if self.sensors is None else self.sensors.postured(posture, masts, self._mast_keys)
 
     def _angle_twists(self, angles: FloatArray, axes: tuple[FloatArray, FloatArray] | None) -> FloatArray:
         """Twists of the mast frame (frames, 6, 2), rotation first, that move the head as its pan and tilt do.

@@ -22,6 +22,7 @@ from pancam_graph.graph._head_flex import HeadFlex
 from pancam_graph.graph._keys import Kind, index_of, key_of, kind_of, read_variable
 from pancam_graph.graph._let_go import LetGo
 from pancam_graph.graph._rig_variables import RigVariables
+from pancam_graph.graph._sensors import Sensors
 from pancam_graph.landmarks import CameraViews
 
 __all__ = ["FactorTemplate", "diagonal_noise"]
@@ -32,6 +33,8 @@ class FactorTemplate(ABC):
 
     refines_landmarks = False
     """Whether landmarks are optimised with cameras held after every step, besides back substitution."""
+    sensors: Sensors | None = None
+    """Sensors behind the images in `linkage` and `posture`; None: there are none."""
 
     def __init__(self, traverse: Traverse, model: Model, sharing: Sharing | None = None) -> None:
         """`sharing` as `Sharing.for_model` returns it; None: the default of the model."""

@@ -5,6 +5,7 @@ from pancam_graph.landmarks._landmarks import CameraViews as CameraViews
 from pancam_graph.landmarks._landmarks import Landmarks as Landmarks
 from pancam_graph.landmarks._landmarks import Measurements as Measurements
 from pancam_graph.landmarks._landmarks import as_floats as as_floats
+from pancam_graph.landmarks._landmarks import evaluate as evaluate
 from pancam_graph.landmarks._landmarks import lines_of_sight as lines_of_sight
 from pancam_graph.landmarks._landmarks import over_landmarks as over_landmarks
 from pancam_graph.landmarks._landmarks import point_sigma_m as point_sigma_m

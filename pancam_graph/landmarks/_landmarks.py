@@ -121,7 +121,7 @@ class Measurements:
     """Observations sorted by landmark; n rows."""
 
     row: IntArray
-    """(n,) row in the traverse's observations"""
+    """(n,) row in the traverse's observations; -1: it is by a sensor, and no observation"""
     image: IntArray
     """(n,) row of the image of each observation"""
     landmark: IntArray

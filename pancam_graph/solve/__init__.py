@@ -1,5 +1,6 @@
 """The adjustment of a traverse: prepare, screen, fit, judge."""
 
+from pancam_graph.solve._constraints import constrained as constrained
 from pancam_graph.solve._diagnose import listed as listed
 from pancam_graph.solve._eliminated import EliminatedSolver as EliminatedSolver
 from pancam_graph.solve._fit import Fitted as Fitted

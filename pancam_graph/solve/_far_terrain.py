@@ -188,8 +188,11 @@ def _ranges(problem: Problem) -> InverseRanges:
 
 
 def _broad(problem: Problem, ranges: InverseRanges) -> BoolArray:
-    """(landmarks,) whether a landmark takes part and its range is badly known."""
-    return np.asarray(problem.present & (ranges.variance > (_BROAD * ranges.per_m) ** 2))
+    """(landmarks,) whether a landmark takes part and its range is badly known; a tied one's is not."""
+    free = problem.present.copy()
+    if problem.ties is not None:
+        free[problem.ties.landmark[problem.tied]] = False
+    return np.asarray(free & (ranges.variance > (_BROAD * ranges.per_m) ** 2))
 
 
 def _expected(problem: Problem, broad: BoolArray, prior: RangePrior) -> _Expected:

@@ -10,6 +10,7 @@ from pancam_graph.data import State, Verdict
 from pancam_graph.elimination import Covariance
 from pancam_graph.landmarks import refine
 from pancam_graph.solve._considered import considered
+from pancam_graph.solve._constraint_tests import ConstraintTest, constraint_tests
 from pancam_graph.solve._constraints import constrained
 from pancam_graph.solve._covariance import Uncertainty, uncertainty
 from pancam_graph.solve._diagnose import connection_warnings, listed
@@ -41,6 +42,8 @@ class Judged:
     first: Problem
     """The start, with the measurements of the optimum and the landmarks that fit the start best: what is
     gained from there to the optimum is due to the cameras alone."""
+    constraints: tuple[ConstraintTest, ...]
+    """A test of each constraint; none where covariances are unknown."""
     verdict: Verdict
     warnings: tuple[str, ...]
     """Warnings of all stages, a sentence each."""
@@ -59,6 +62,7 @@ def judge(fitted: Fitted) -> Judged:
         places = problem.landmarks if prepared.options.landmark_covariances else None
         stated = considered(fitted, regular, state, covariances, landmarks=places)
     let_go = parts_let_go(prepared.traverse, problem.template.let_go, state)
+    constraints = tuple(constraint_tests(regular, reduced, covariances.variables))
     return Judged(
         fitted=fitted,
         state=state,
@@ -67,6 +71,7 @@ def judge(fitted: Fitted) -> Judged:
         used=used,
         regular=regular,
         first=first,
+        constraints=constraints,
         verdict=verdict(
             Optimum(
                 fitted=fitted,
@@ -76,11 +81,13 @@ def judge(fitted: Fitted) -> Judged:
                 used=used,
                 cost_initial=first.cost(),
                 let_go=let_go,
+                constraints=constraints,
             )
         ),
         warnings=(
             *prepared.warnings,
             *(f"{sentence(part)}: let go" for part in let_go),
+            *(f"{one.says}: let go" for one in constraints if one.let_go),
             *warnings,
             *_fit_warnings(fitted, used, reduced, covariances),
             *connection_warnings(prepared.traverse, m.image[problem.kept], m.landmark[problem.kept]),

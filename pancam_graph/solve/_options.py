@@ -114,8 +114,13 @@ class SolveOptions(StopRule):
     @property
     def takes_field(self) -> bool:
         """Whether such a solve can estimate smooth distortion fields."""
-        is_usual = (self.model, self.landmarks, self.method) == ("mast", "eliminated", "joint")
-        return is_usual and self.firm_tie == "hard" and self.rig != "considered"
+        return self.is_usual and self.rig != "considered"
+
+    @property
+    def is_usual(self) -> bool:
+        """Whether landmarks are eliminated from the rigid mast, and all else is adjusted jointly."""
+        usual = (self.model, self.landmarks, self.method) == ("mast", "eliminated", "joint")
+        return usual and self.firm_tie == "hard"
 
     @property
     def firm_flex(self) -> Flex:

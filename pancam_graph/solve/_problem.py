@@ -11,10 +11,11 @@ import numpy as np
 from pancam_graph.base.errors import SolveError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.elimination import LandmarkSystem
-from pancam_graph.graph import Factors, FactorTemplate, LetGo
+from pancam_graph.graph import Factors, FactorTemplate, HardTemplate, LetGo
 from pancam_graph.landmarks import SQUARED, CameraViews, Landmarks, Loss, Measurements, refine, residuals
 from pancam_graph.solve._optimise import Iteration, Outcome
 from pancam_graph.solve._stopping import StopRule
+from pancam_graph.solve._ties import Ties
 
 __all__ = ["Problem", "Solver", "reach_m", "system_of"]
 
@@ -37,6 +38,8 @@ class Problem:
     values: gtsam.Values
     """Values of the template's variables."""
     landmarks: Landmarks
+    ties: Ties | None = None
+    """Constraints on landmarks, by the template's sensors; None: there are none."""
 
     @cached_property
     def views(self) -> CameraViews:
@@ -54,6 +57,34 @@ class Problem:
         """(n,) whether a measurement takes part."""
         return np.asarray(self.accepted & self.present[self.measurements.landmark])
 
+    @cached_property
+    def tied(self) -> BoolArray:
+        """(ties,) whether each takes part: its landmark does, and it was not let go."""
+        if self.ties is None:
+            return np.zeros(0, dtype=bool)
+        gone = self.template.let_go.constraints[self.ties.constraint]
+        return np.asarray(self.present[self.ties.landmark] & ~gone)
+
+    @cached_property
+    def sensed(self) -> tuple[FloatArray, BoolArray]:
+        """Of `residuals`, those of the ties that take part: (k, 2), (k,)."""
+        if self.ties is None:
+            return np.zeros((0, 2)), np.zeros(0, dtype=bool)
+        which = np.flatnonzero(self.tied)
+        alone = self.ties.rows(self.tied, np.arange(self.measurements.n_landmarks))
+        alone = replace(alone, landmark=np.arange(len(which)))  # a landmark of its own for each
+        landmarks = self.landmarks.of(self.ties.landmark[which])
+        return residuals(landmarks, alone, self.views_of_all)
+
+    @cached_property
+    def views_of_all(self) -> CameraViews:
+        """Cameras at the values, with the template's sensors behind them."""
+        sensors = self.template.sensors
+        if sensors is None:
+            return self.views
+        masts = np.array([pose.translation() for pose in self.template.masts(self.values)])
+        return sensors.behind(self.views, masts)
+
     def points_m(self) -> FloatArray:
         """World points (landmarks, 3), metres, none farther than the limit where noise hides parallax."""
         length, w = self.landmarks.length, self.landmarks.vector[:, 3]
@@ -64,7 +95,10 @@ class Problem:
         return self.landmarks.points_m(furthest)
 
     def cost(self, loss: Loss = SQUARED) -> float:
-        """True cost: half the sum of squares of `factors`, and the loss of observations that take part."""
+        """True cost: half the sum of squares of `factors`, and the loss of observations that take part.
+
+        Ties count as observations do.
+        """
         if loss is SQUARED:
             return self._squared
         return self._cost(loss)
@@ -75,7 +109,8 @@ class Problem:
 
     def _cost(self, loss: Loss) -> float:
         residual, _ = self.residuals
-        return float(self.factors.error(self.values) + loss.cost(residual)[self.kept].sum())
+        observed = loss.cost(residual)[self.kept].sum() + loss.cost(self.sensed[0]).sum()
+        return float(self.factors.error(self.values) + observed)
 
     @cached_property
     def residuals(self) -> tuple[FloatArray, BoolArray]:
@@ -84,16 +119,30 @@ class Problem:
 
     def placed(self, loss: Loss = SQUARED) -> "Problem":
         """The problem with landmarks optimised for the present cameras, beyond infinity if need be."""
-        weight = self.accepted.astype(float)
-        best = refine(self.landmarks, self.measurements, self.views, weight, loss, beyond_infinity=True)
+        m, weight = self.measurements, self.accepted.astype(float)
+        if self.ties is not None and self.tied.any():
+            joined, place = self.ties.behind(m, self.tied, np.arange(m.n_landmarks))
+            weights = np.ones(len(joined.row))
+            weights[place] = weight
+            m, weight = joined, weights
+        best = refine(self.landmarks, m, self.views_of_all, weight, loss, beyond_infinity=True)
         return replace(self, landmarks=best)
 
     def on(self, template: FactorTemplate) -> "Problem":
         """The same problem on another template, with the nearest cameras that its variables allow."""
         template = template.letting_go(self.template.let_go)
+        if isinstance(template, HardTemplate):
+            template = template.sensing(self.template.sensors)
         values = template.values(self.template.state(self.values, np.zeros((0, 3))))
         factors = template.factors(self.factors.given, present=self.values)
         return replace(self, template=template, factors=factors, values=values)
+
+    def untied(self) -> "Problem":
+        """The same problem without ties."""
+        if self.ties is None:
+            return self
+        assert isinstance(self.template, HardTemplate)  # no other has sensors
+        return replace(self, ties=None, template=self.template.sensing(None))
 
     def letting_go(self, let_go: LetGo) -> "Problem":
         """The same problem with telemetry and constraints believed less."""
@@ -170,6 +219,10 @@ def system_of(
     rows = np.flatnonzero(np.bincount(m.landmark, take, minlength=m.n_landmarks))
     if not take.all():
         m = m.part(np.flatnonzero(take))
+    if problem.ties is not None and problem.tied.any():
+        number = np.full(problem.measurements.n_landmarks, -1)
+        number[rows] = np.arange(len(rows))
+        m, _ = problem.ties.behind(m, problem.tied, number)
     landmarks = Landmarks(vector=problem.landmarks.vector[rows], origin_m=problem.landmarks.origin_m[rows])
     template = problem.template
     cliques = [*template.cliques, *problem.factors.joined(template.linkage), *cliques]

@@ -7,8 +7,10 @@ import numpy as np
 
 from pancam_graph.base.errors import SolveError
 from pancam_graph.base.geometry import FloatArray
+from pancam_graph.data import Traverse
 from pancam_graph.elimination import Root
 from pancam_graph.graph import LetGo
+from pancam_graph.solve._constraint_tests import ConstraintTest
 from pancam_graph.solve._fit import Fitted, fit
 from pancam_graph.solve._judge import Judged, judge
 from pancam_graph.solve._let_go import letting_go, most_let_go, parts_let_go
@@ -17,8 +19,10 @@ from pancam_graph.solve._telemetry_tests import Correction, StopTelemetry, Suspe
 
 __all__ = ["reconsidered"]
 
-_TESTS = {"pointing", "stops"}
-"""Tests of the verdict that single errors of telemetry fail."""
+_TESTS = {"pointing", "stops", "constraints"}
+"""Tests of the verdict that single errors of telemetry, or of constraints, fail."""
+_MOST_CONSTRAINTS = 1 / 3
+"""Largest share of the constraints that may be let go; one may in any case."""
 _AS_LIKELY = 15.0
 """Another error explains the corrections as well if its squared test is not less by more than this ..."""
 _ALIKE = 0.5
@@ -30,26 +34,36 @@ _OF_FRAME = 5.0
 
 
 def reconsidered(judged: Judged) -> Judged:
-    """Judged anew with wrong telemetry let go; the same object where telemetry agrees with the images.
+    """Judged anew without wrong telemetry and constraints; the same object where all agrees with the images.
 
     While a correction of telemetry is larger than chance allows, the largest one's prior is let go (iterated
     data snooping, Baarda 1968), with the priors of all other errors that would explain it as well: an error
-    of a stop's heading and one of all its pans look alike. What is left is then judged and solved again.
+    of a stop's heading and one of all its pans look alike. What is left is then judged and solved again. A
+    constraint that is further off than any telemetry is let go alone; where another error explains the
+    corrections as well, nothing is.
     Where more than a few parts of telemetry would have to go, or where another rig would explain more, none
     is: the verdict says why.
     """
     now, traverse = judged, judged.fitted.screened.prepared.traverse
-    most = most_let_go(traverse)
-    for _ in range(most):
+    most, n_constraints = most_let_go(traverse), len(traverse.constraints)
+    most_constraints = max(1, int(_MOST_CONSTRAINTS * n_constraints)) if n_constraints else 0
+    for _ in range(most + most_constraints):
         if not _fails(now):
             return now
         suspected = Suspected.of(now.regular, now.uncertainty, is_far=now.fitted.expected is not None)
-        problem, errors = now.fitted.problem, _largest(suspected)
-        if _is_of_rig(errors[0], now):
-            return judged
-        let_go = problem.template.let_go + letting_go(traverse, errors)
-        if len(parts_let_go(traverse, let_go, now.state)) > most:
-            return judged
+        problem, every = now.fitted.problem, suspected.angles + suspected.stops
+        constraint, is_sure = _wrong_constraint(now.constraints, every.sigmas)
+        if constraint is not None:
+            let_go = problem.template.let_go + _without(traverse, constraint)
+            if not is_sure or let_go.constraints.sum() > most_constraints:
+                return judged
+        else:
+            errors = _largest(suspected)
+            if _is_of_rig(errors[0], now):
+                return judged
+            let_go = problem.template.let_go + letting_go(traverse, errors)
+            if len(parts_let_go(traverse, let_go, now.state)) > most:
+                return judged
         try:
             now = judge(_fitted_again(now.fitted, let_go))
         except SolveError:
@@ -61,6 +75,27 @@ def _fails(judged: Judged) -> bool:
     if judged.uncertainty.masts is None or not judged.fitted.outcome.converged:
         return False
     return any(test.name in _TESTS for test in judged.verdict.failures)
+
+
+def _wrong_constraint(tests: Sequence[ConstraintTest], telemetry: FloatArray) -> tuple[int | None, bool]:
+    """Row of the constraint that is furthest off, and whether no other error explains that as well.
+
+    None where an error of telemetry, by these sizes (n,) of their tests, explains more.
+    """
+    square = np.array([max(0.0, one.square - one.freedom + 1) for one in tests if not one.let_go])
+    known = np.max(telemetry, initial=0.0) ** 2
+    if not len(square) or square.max() <= known:
+        return None, False
+    rows = [one.row for one in tests if not one.let_go]
+    rivals = np.sum(np.append(square, telemetry**2) >= square.max() - _AS_LIKELY)
+    return rows[int(np.argmax(square))], bool(rivals == 1)
+
+
+def _without(traverse: Traverse, constraint: int) -> LetGo:
+    """A constraint let go, and nothing else."""
+    out = LetGo.nothing(traverse)
+    out.constraints[constraint] = True
+    return out
 
 
 def _is_of_rig(error: Correction, judged: Judged) -> bool:
@@ -75,7 +110,8 @@ def _is_of_rig(error: Correction, judged: Judged) -> bool:
 def _fitted_again(fitted: Fitted, let_go: LetGo) -> Fitted:
     """The observations judged anew and fitted, from where a fit ended, with telemetry let go."""
     screened = fitted.screened
-    problem = fitted.problem.on(screened.problem.template)  # without the fields that `fit` adds
+    # Without the fields and constraints that `fit` adds.
+    problem = fitted.problem.untied().on(screened.problem.template)
     problem = replace(
         screened.problem.letting_go(let_go), values=problem.values, landmarks=fitted.problem.landmarks
     )

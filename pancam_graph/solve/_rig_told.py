@@ -129,6 +129,8 @@ def part_of(problem: Problem, sharing: Sharing) -> Problem:
         frames=tuple(t.frames[i] for i in frames),
         images=tuple(t.images[i] for i in images),
         observations=None,
+        constraints=(),
+        points=None,
     )
     place = np.full(len(t.images), -1)
     place[images] = np.arange(len(images))
@@ -143,6 +145,7 @@ def part_of(problem: Problem, sharing: Sharing) -> Problem:
             angles_rad=let_go.angles_rad[frames],
             common_rad=let_go.common_rad[first:last],
             stops=let_go.stops[first:last],
+            constraints=let_go.constraints[:0],
         )
     )
     state = problem.template.state(problem.values, np.zeros((0, 3)), problem.views)

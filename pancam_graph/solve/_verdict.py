@@ -16,6 +16,7 @@ from pancam_graph.data import Refined, Traverse, Verdict, VerdictTest
 from pancam_graph.graph import HardTemplate
 from pancam_graph.solve._behind import points_behind
 from pancam_graph.solve._chances import CHANCE, rms_limit, two_sided_limit
+from pancam_graph.solve._constraint_tests import ConstraintTest, constraint_verdict
 from pancam_graph.solve._covariance import Uncertainty
 from pancam_graph.solve._fit import Fitted
 from pancam_graph.solve._held_sureness import held_rig
@@ -72,6 +73,7 @@ class Optimum:
     """Cost at the start, over the same observations."""
     let_go: Sequence[Part]
     """What of telemetry was let go."""
+    constraints: Sequence[ConstraintTest]
 
     @property
     def traverse(self) -> Traverse:
@@ -89,6 +91,7 @@ def verdict(at: Optimum) -> Verdict:
         _sigmas(at),
         *_telemetry(at),
         _let_go(at),
+        *constraint_verdict(at.constraints),
         *let_go_links(at.fitted.problem),
         *points_behind(at.traverse, float(np.mean(at.used)) if len(at.used) else 1.0),
         *_freed(at),

@@ -6,14 +6,28 @@ import gtsam
 import numpy as np
 import pytest
 
-from pancam_graph import Traverse, build_graph, graph_keys, solve
+from pancam_graph import SolveOptions, Traverse, build_graph, graph_keys, solve
 from pancam_graph.base.errors import InputError
-from pancam_graph.data import Constraint, StopDistance, StopHeading, StopPose, StopPosition
+from pancam_graph.data import (
+    Constraint,
+    LandmarkAzimuth,
+    LandmarkHeight,
+    LandmarkInfinity,
+    LandmarkPlane,
+    LandmarkPosition,
+    StopDistance,
+    StopHeading,
+    StopPose,
+    StopPosition,
+)
 from pancam_graph.factors import Key, stop_heading_factor
 from pancam_graph.smoother import solve_incrementally
+from pancam_graph.solve import Problem, constrained, prepare
+from pancam_graph.solve._reduced import panels_of
 from support.gtsam_factors import distance_factor
 from support.parameters import slow_but_for
 from support.small_drives import HARD, SOFT, near_part, simulated
+from support.tied_drives import landmark_ties, noise_free, seen_often
 
 WAYS = {
     "hard": HARD,
@@ -111,3 +125,137 @@ def test_a_stop_that_telemetry_holds_cannot_be_tied() -> None:
 def test_a_distance_that_is_not_a_number_is_refused() -> None:
     with pytest.raises(InputError, match="distance_m: expected a finite number, found nan"):
         StopDistance(between=("a", "b"), distance_m=float("nan"), sigma_m=0.1)
+
+
+def system_cost(problem: Problem) -> float:
+    """Cost with landmarks where they fit best, up to the last digits."""
+    for _ in range(3):
+        problem = problem.placed()
+    return problem.cost()
+
+
+@pytest.mark.parametrize("state", ["random", "near the optimum", "far"])
+def test_the_gradient_of_tied_landmarks_is_that_of_the_cost(state: str) -> None:
+    """Of the cost with landmarks eliminated, by the masts: analytic in the kernel against differences."""
+    simulation = simulated(2, 3)
+    traverse = replace(simulation.traverse, constraints=landmark_ties(simulation, sigma=0.02))
+    prepared = prepare(traverse, HARD)
+    assert prepared.problem.ties is None
+    problem = constrained(prepared.problem)
+    assert problem.ties is not None
+    link, rng = problem.template.linkage, np.random.default_rng(3)
+    size = {"random": 1e-2, "near the optimum": 1e-7, "far": 0.1}[state]
+    start = gtsam.VectorValues()
+    for key, dim in zip(link.key, link.dim.tolist(), strict=True):
+        start.insert(key, size * rng.normal(size=dim))
+    problem = replace(problem, values=problem.values.retract(start)).placed().placed()
+    panels = panels_of(problem)
+    for key in (graph_keys(traverse, HARD).mast(stop.id) for stop in traverse.stops[1:]):
+        group, columns = int(link.group[link.row[key]]), link.columns_of(key)
+        gradient = panels.panel[group][columns, -1]
+        for k in range(6):
+            ends = []
+            for h in (1e-5, -1e-5):
+                step = gtsam.VectorValues()
+                step.insert(key, h * np.eye(6)[k])
+                ends.append(system_cost(replace(problem, values=problem.values.retract(step))))
+            numeric = (ends[0] - ends[1]) / 2e-5
+            assert gradient[k] == pytest.approx(numeric, rel=1e-3, abs=1e-4 * np.abs(gradient).max())
+
+
+def test_true_ties_and_pixels_without_noise_give_the_truth_whatever_telemetry_says() -> None:
+    simulation = simulated(2, 3)
+    traverse = replace(noise_free(simulation), constraints=landmark_ties(simulation, sigma=1e-5))
+    loose = tuple(
+        replace(stop, sigma_translation_m=1e3 * stop.sigma_translation_m) for stop in traverse.stops
+    )
+    solution = solve(replace(traverse, stops=loose), HARD)
+    assert solution.converged
+    for found, true in zip(solution.final.world_T_mast, simulation.truth.world_T_mast, strict=True):
+        assert np.abs(true.localCoordinates(found)).max() < 2e-5
+
+
+def test_a_tied_point_and_its_sigma_are_as_theory_says() -> None:
+    """Theory: the update of a Kalman filter on the point's own covariance."""
+    simulation = simulated(2, 3)
+    (landmark,) = seen_often(simulation, 1)
+    options = replace(HARD, landmark_covariances=True)
+    before = solve(simulation.traverse, options)
+    i = int(np.flatnonzero(before.landmark_track == landmark)[0])
+    assert before.landmark_covariance_m2 is not None
+    P, point = before.landmark_covariance_m2[i], before.final.landmarks_m[i]
+    off, R = np.array([2e-4, -1e-4, 1e-4]), np.diag([1e-6, 2e-6, 3e-6])
+    tie = LandmarkPosition(landmark=landmark, position_m=tuple(point + off), covariance_m2=R)
+    after = solve(replace(simulation.traverse, constraints=(tie,)), options)
+    gain = P @ np.linalg.inv(P + R)
+    assert after.landmark_covariance_m2 is not None
+    size = np.sqrt(np.diag(P))
+    expected = P - gain @ P
+    assert np.abs((after.landmark_covariance_m2[i] - expected) / np.outer(size, size)).max() < 0.02
+    moved = after.final.landmarks_m[i] - point
+    assert np.abs(moved - gain @ off).max() < 0.05 * np.abs(gain @ off).max()
+
+
+def test_a_point_at_infinity_stays_there() -> None:
+    simulation = simulated(2, 3)
+    tie = LandmarkInfinity(landmark=seen_often(simulation, 1)[0])
+    solution = solve(replace(simulation.traverse, constraints=(tie,)), HARD)
+    assert solution.verdict.passed is False  # it is a near point, and the verdict says so
+    assert any("landmark-infinity" in test.says for test in solution.verdict.failures)
+
+
+def with_gross(ties: tuple[Constraint, ...], which: int, *, robust: bool) -> tuple[Constraint, ...]:
+    """The ties with one wrong by far more than its sigma."""
+    tie = ties[which]
+    if isinstance(tie, LandmarkPosition):
+        known = [None if x is None else x + 0.3 for x in tie.position_m]
+        wrong: Constraint = replace(tie, position_m=known)
+    elif isinstance(tie, LandmarkHeight):
+        wrong = replace(tie, height_m=tie.height_m + 0.3)
+    elif isinstance(tie, LandmarkPlane):
+        wrong = replace(tie, offset_m=tie.offset_m + 0.3)
+    else:
+        assert isinstance(tie, LandmarkAzimuth)
+        wrong = replace(tie, azimuth_rad=tie.azimuth_rad + 0.1)
+    return tuple(replace(wrong if i == which else one, robust=robust) for i, one in enumerate(ties))
+
+
+@pytest.mark.parametrize("which", slow_but_for(0, range(6)))
+def test_a_gross_tie_is_found_named_and_let_go(which: int) -> None:
+    simulation = simulated(2, 3)
+    ties = landmark_ties(simulation)
+    robust = solve(
+        replace(simulation.traverse, constraints=with_gross(ties, which, robust=True)),
+        SolveOptions(rig="held"),
+    )
+    note = next(test for test in robust.verdict.tests if test.name == "constraints let go")
+    assert robust.verdict.passed
+    assert f"constraints[{which}] ({ties[which].about})" in note.says
+    assert any(f"constraints[{which}]" in warning for warning in robust.warnings)
+    others = tuple(one for i, one in enumerate(ties) if i != which)
+    without = solve(replace(simulation.traverse, constraints=others), SolveOptions(rig="held"))
+    apart = without.final.world_T_mast[2].localCoordinates(robust.final.world_T_mast[2])
+    assert np.abs(apart / np.sqrt(np.diag(without.stop_covariance[2]))).max() < 0.05
+
+
+def test_a_gross_tie_that_is_not_said_to_be_doubtful_fails_the_verdict() -> None:
+    simulation = simulated(2, 3)
+    ties = with_gross(landmark_ties(simulation), 3, robust=False)
+    verdict = solve(replace(simulation.traverse, constraints=ties), SolveOptions(rig="held")).verdict
+    (failure,) = verdict.failures
+    assert failure.name == "constraints let go"
+    assert "constraints[3] (landmark-height" in failure.says
+
+
+def test_ties_need_landmarks_that_are_eliminated_and_points_that_two_images_see() -> None:
+    simulation = simulated(2, 3)
+    ties = landmark_ties(simulation)[:1]
+    with pytest.raises(InputError, match=r"constraints\[0\] .*: expected the model mast, a hard tie"):
+        solve(replace(simulation.traverse, constraints=ties), replace(HARD, landmarks="explicit"))
+    t = simulation.traverse
+    assert t.observations is not None
+    of_point = np.flatnonzero(t.observations.track == ties[0].landmarks[0])
+    rows = np.setdiff1d(np.arange(len(t.observations)), of_point[1:])
+    once = replace(t, observations=t.observations.select(rows), constraints=ties)
+    with pytest.raises(InputError, match="expected a point that two or more images see, found it in fewer"):
+        solve(once, HARD)
