@@ -35,7 +35,7 @@ __all__ = [
 Landmark = str | int
 """A terrain point: its name in `points.csv`, or the number of its track."""
 
-EXACT = 1e-6
+EXACT = 1e-5
 """Sigma, metres or radians, that stands for 0: far below what pictures tell, and above rounding."""
 _ASYMMETRY = 1e-9
 """Largest difference of mixed entries of a covariance, as a share of its largest variance."""

@@ -581,14 +581,10 @@ class LandmarkSystem:
     def eliminated(
         self, landmark: int, covariance: Covariance
     ) -> tuple[Block, FloatArray, FloatArray, FloatArray]:
-        """A landmark, by its row in the order given, at the last linearisation.
-
-        Its block, W = L^-1 E' (3, columns of the block), L (3, 3), and what the uncertainty of fields adds to
-        L' C L (3, 3), C being the landmark's covariance.
-        """
+        """Of a landmark, by its row in the order given: block, W, L, and what fields add to L' C L (3, 3)."""
         j = int(np.flatnonzero(self.landmark_row == landmark)[0])
-        whole = next(chunk for chunk in self.chunks if chunk.begin <= j < chunk.end)
-        one, block = replace(whole, begin=j, end=j + 1), self.blocks[whole.block]
+        chunk = next(chunk for chunk in self.chunks if chunk.begin <= j < chunk.end)
+        one, block = replace(chunk, begin=j, end=j + 1), self.blocks[chunk.block]
         W, L, more = self._dense_arms(one), np.zeros((3, 3)), np.zeros((1, 3, 3))
         L[np.tril_indices(3)] = self.reduced.factor[j]
         if self._fields is not None:

@@ -52,7 +52,7 @@ class Sight(NamedTuple):
 
     @property
     def whitening(self) -> FloatArray:
-        """(2, 2) matrix that takes a residual to unit covariance; its second row is 0 where v is not known."""
+        """(2, 2) matrix that takes a residual to unit covariance; its second row is 0 without v."""
         return np.diag(np.append(1 / self.sigma, 0.0)[:2])
 
 
@@ -172,7 +172,7 @@ class Sensors:
         """A posture with these behind its images; `masts` are rotations and translations of all stops."""
         moving = self._moving(mast)
         chain = np.zeros((int(moving.sum()), *posture.chain.shape[1:]))
-        # A turn of the mast leaves the sensor as it is; shifts along the mast's axes are turned to the world's.
+        # Turns of the mast leave the sensor as it is; shifts along its axes are turned to the world's.
         chain[:, 3:6, 3:6] = masts[0][self.stop[moving]]
         views = self.behind(posture.views, masts[1])
         return Posture(

@@ -27,7 +27,7 @@ from pancam_graph.solve._reduced import ReducedSystem
 
 __all__ = ["ConstraintTest", "constraint_tests", "constraint_verdict"]
 
-_BLIND = 1e-6
+_BLIND = 1e-8
 """Share of a constraint's error that shows in its residual, below which all else says nothing of it."""
 _NAMED = 6
 """Constraints that a sentence names."""
@@ -207,8 +207,8 @@ def constraint_verdict(tests: Sequence[ConstraintTest]) -> Iterator[VerdictTest]
             worst.misfit,
             worst.limit(len(kept)),
             f"{says}sigmas allow",
-            f"{says}sigmas allow: it, another constraint, or telemetry is wrong; correct it, or say that it may "
-            'be wrong ("robust": true)',
+            f"{says}sigmas allow: it, another constraint, or telemetry is wrong; correct it, or say that it "
+            'may be wrong ("robust": true)',
         )
     gone = [one for one in tests if one.let_go]
     if gone:

@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from pancam_graph import SolveOptions, Traverse, build_graph, graph_keys, solve
+from pancam_graph import SolveOptions, Stop, Traverse, build_graph, graph_keys, solve
 from pancam_graph.base.errors import InputError
 from pancam_graph.data import (
     Constraint,
@@ -99,9 +99,9 @@ def test_a_position_by_axis_moves_the_stop_as_theory_says() -> None:
 
 def test_an_exact_distance_is_kept() -> None:
     plain = near_part(simulated(2, 2))
-    tie = StopDistance(between=[stop.id for stop in plain.stops[:2]], distance_m=4.1, sigma_m=0.0)
+    tie = StopDistance(between=[stop.id for stop in plain.stops[:2]], distance_m=4.012, sigma_m=0.0)
     masts = solve(replace(plain, constraints=(tie,)), HARD).final.world_T_mast
-    assert np.linalg.norm(masts[1].translation() - masts[0].translation()) == pytest.approx(4.1, abs=1e-6)
+    assert np.linalg.norm(masts[1].translation() - masts[0].translation()) == pytest.approx(4.012, abs=1e-5)
 
 
 def test_stop_by_stop_ends_where_batch_does_and_the_graph_has_the_cost() -> None:
@@ -150,7 +150,7 @@ def test_the_gradient_of_tied_landmarks_is_that_of_the_cost(state: str) -> None:
         start.insert(key, size * rng.normal(size=dim))
     problem = replace(problem, values=problem.values.retract(start)).placed().placed()
     panels = panels_of(problem)
-    for key in (graph_keys(traverse, HARD).mast(stop.id) for stop in traverse.stops[1:]):
+    for key in [graph_keys(traverse, HARD).mast(stop.id) for stop in traverse.stops[1:]]:
         group, columns = int(link.group[link.row[key]]), link.columns_of(key)
         gradient = panels.panel[group][columns, -1]
         for k in range(6):
@@ -163,22 +163,26 @@ def test_the_gradient_of_tied_landmarks_is_that_of_the_cost(state: str) -> None:
             assert gradient[k] == pytest.approx(numeric, rel=1e-3, abs=1e-4 * np.abs(gradient).max())
 
 
+def loosened(stop: Stop) -> Stop:
+    return replace(stop, sigma_translation_m=1e3, sigma_rotation_rad=10.0)
+
+
 def test_true_ties_and_pixels_without_noise_give_the_truth_whatever_telemetry_says() -> None:
     simulation = simulated(2, 3)
     traverse = replace(noise_free(simulation), constraints=landmark_ties(simulation, sigma=1e-5))
-    loose = tuple(
-        replace(stop, sigma_translation_m=1e3 * stop.sigma_translation_m) for stop in traverse.stops
-    )
-    solution = solve(replace(traverse, stops=loose), HARD)
+    stops = [traverse.stops[0], *(loosened(stop) for stop in traverse.stops[1:])]
+    frames = [replace(f, sigma_pan_rad=1.0, sigma_tilt_rad=1.0) for f in traverse.frames]
+    solution = solve(replace(traverse, stops=tuple(stops), frames=tuple(frames)), HARD)
     assert solution.converged
-    for found, true in zip(solution.final.world_T_mast, simulation.truth.world_T_mast, strict=True):
-        assert np.abs(true.localCoordinates(found)).max() < 2e-5
+    rotations, centres = traverse.camera_poses(simulation.truth.world_T_mast, simulation.truth.pan_tilt_rad)
+    assert np.abs(solution.final.world_t_camera - centres).max() < 1e-5
+    assert np.abs(solution.final.world_R_camera - rotations).max() < 1e-5
 
 
 def test_a_tied_point_and_its_sigma_are_as_theory_says() -> None:
     """Theory: the update of a Kalman filter on the point's own covariance."""
     simulation = simulated(2, 3)
-    (landmark,) = seen_often(simulation, 1)
+    landmark = seen_often(simulation, 1)[0]
     options = replace(HARD, landmark_covariances=True)
     before = solve(simulation.traverse, options)
     i = int(np.flatnonzero(before.landmark_track == landmark)[0])
@@ -200,7 +204,7 @@ def test_a_point_at_infinity_stays_there() -> None:
     simulation = simulated(2, 3)
     tie = LandmarkInfinity(landmark=seen_often(simulation, 1)[0])
     solution = solve(replace(simulation.traverse, constraints=(tie,)), HARD)
-    assert solution.verdict.passed is False  # it is a near point, and the verdict says so
+    assert solution.verdict is not None  # that it is a near point, the verdict says
     assert any("landmark-infinity" in test.says for test in solution.verdict.failures)
 
 
@@ -220,7 +224,7 @@ def with_gross(ties: tuple[Constraint, ...], which: int, *, robust: bool) -> tup
     return tuple(replace(wrong if i == which else one, robust=robust) for i, one in enumerate(ties))
 
 
-@pytest.mark.parametrize("which", slow_but_for(0, range(6)))
+@pytest.mark.parametrize("which", [0, *(pytest.param(i, marks=pytest.mark.slow) for i in range(1, 6))])
 def test_a_gross_tie_is_found_named_and_let_go(which: int) -> None:
     simulation = simulated(2, 3)
     ties = landmark_ties(simulation)
@@ -228,6 +232,7 @@ def test_a_gross_tie_is_found_named_and_let_go(which: int) -> None:
         replace(simulation.traverse, constraints=with_gross(ties, which, robust=True)),
         SolveOptions(rig="held"),
     )
+    assert robust.verdict is not None
     note = next(test for test in robust.verdict.tests if test.name == "constraints let go")
     assert robust.verdict.passed
     assert f"constraints[{which}] ({ties[which].about})" in note.says
@@ -242,6 +247,7 @@ def test_a_gross_tie_that_is_not_said_to_be_doubtful_fails_the_verdict() -> None
     simulation = simulated(2, 3)
     ties = with_gross(landmark_ties(simulation), 3, robust=False)
     verdict = solve(replace(simulation.traverse, constraints=ties), SolveOptions(rig="held")).verdict
+    assert verdict is not None
     (failure,) = verdict.failures
     assert failure.name == "constraints let go"
     assert "constraints[3] (landmark-height" in failure.says
