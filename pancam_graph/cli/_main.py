@@ -7,6 +7,7 @@ from pathlib import Path
 
 from pancam_graph import __version__
 from pancam_graph.base.choices import nearest
+from pancam_graph.cli._collector import leave_to_the_system
 from pancam_graph.cli._command import Command, Invocation
 from pancam_graph.cli._config import read_config
 from pancam_graph.cli._ending import run, status_of
@@ -26,7 +27,10 @@ _DESCRIPTION = (
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `pancam-graph` with the arguments of the process, or with those given; returns the exit status."""
     words = list(sys.argv[1:] if argv is None else argv)
-    return status_of(lambda: _dispatched(words))
+    status = status_of(lambda: _dispatched(words))
+    if argv is None:
+        leave_to_the_system()
+    return status
 
 
 def run_script(name: str) -> None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from pancam_graph.cli._collector import loading
 from pancam_graph.cli._command import Command, Invocation
 from pancam_graph.cli._parser import Assignment, CommandParser, Flag, LateChoice, Several
 
@@ -141,14 +142,15 @@ def _add_options(parser: CommandParser) -> None:
 
 def _work(call: Invocation) -> int:
     """Read, match images where observations are missing, solve, write."""
-    from pancam_graph import SolveOptions, read_input, solve
-    from pancam_graph.cli._resumable import resumable
-    from pancam_graph.cli._summary import print_summary
-    from pancam_graph.data import parse_sharing
-    from pancam_graph.io import use_rig
-    from pancam_graph.landmarks.kernel import must_compile
-    from pancam_graph.results import check_exports, check_out, write_results
-    from pancam_graph.solve import COMPILING, criteria
+    with loading():
+        from pancam_graph import SolveOptions, read_input, solve
+        from pancam_graph.cli._resumable import resumable
+        from pancam_graph.cli._summary import print_summary
+        from pancam_graph.data import parse_sharing
+        from pancam_graph.io import use_rig
+        from pancam_graph.landmarks.kernel import must_compile
+        from pancam_graph.results import check_exports, check_out, write_results
+        from pancam_graph.solve import COMPILING, criteria
 
     arguments, progress = call.arguments, call.progress
     chosen: dict[str, Any] = {

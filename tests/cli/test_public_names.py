@@ -203,3 +203,20 @@ assert main({words}) == 0
     assert not rooms & {"mosaic", "report", "simulate", "smoother"}
     parts = {m.split(".")[1] for m in loaded if m.startswith("scipy.")}
     assert not parts & {"fft", "interpolate", "ndimage", "optimize", "spatial", "stats"}
+
+
+def test_the_collector_looks_at_nothing_that_a_command_imports() -> None:
+    """In a process of its own; where the work is called from a program that has begun, that decides."""
+    code = """
+import gc, sys
+from pancam_graph.cli._collector import loading
+with loading():
+    print(gc.isenabled())
+print(gc.isenabled(), gc.get_freeze_count() > 0)
+gc.unfreeze()
+sys.modules["gtsam"] = sys
+with loading():
+    print(gc.isenabled())
+print(gc.isenabled(), gc.get_freeze_count())
+"""
+    assert python(code) == ["False", "True", "True", "True", "True", "0"]
