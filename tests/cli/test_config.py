@@ -184,7 +184,7 @@ def as_toml(value: object) -> str:
     return repr(value)
 
 
-@settings(deadline=None)  # the first that names an export or a rig loads its room
+@settings(deadline=None, max_examples=30)  # the first that names an export or a rig loads its room
 @given(
     content=st.dictionaries(KEYS, VALUES, max_size=4)
     | st.builds(

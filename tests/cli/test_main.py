@@ -283,6 +283,7 @@ def test_a_reader_who_leaves_early_is_no_error(words: str) -> None:
     assert done.stderr == ""
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="signals and pipes are another thing there")
 def test_work_goes_on_where_nobody_reads(tmp_path: Path) -> None:
     words = f"simulate {tmp_path}/made --stops 1 --pans 2 --sweep-deg 45"

@@ -228,7 +228,8 @@ def left_over(mosaics: StopMosaics) -> FloatArray:
     return np.asarray(np.exp(np.power(RADII[:, None] ** 2, [1, 2, 3]) @ mosaics.evening.vignetting))
 
 
-@pytest.mark.parametrize("lost", [pytest.param(0.1, marks=pytest.mark.slow), 0.35])
+@pytest.mark.slow
+@pytest.mark.parametrize("lost", [0.1, 0.35])
 def test_vignetting_is_found_and_taken_out(tmp_path: Path, lost: float) -> None:
     exposure = (1.0, 1.3, 0.8, 1.1, 0.9)
     mosaics = made(Scene(pans_rad=FIVE, vignetting=lost, exposure=exposure), tmp_path)
@@ -326,6 +327,7 @@ def test_wrong_landmarks_do_not_hide_the_ground(truth: Solution) -> None:
     assert np.abs(points[:, 2]).max() < 0.1
 
 
+@pytest.mark.slow
 def test_both_pointings_share_seams_and_exposure(tmp_path: Path) -> None:
     pictures = made(Scene(error_rad=((2e-3, -2e-3),)), tmp_path).cylinder.pictures
     assert pictures["telemetry"].shape == pictures["refined"].shape
@@ -463,6 +465,7 @@ def test_each_eye_has_its_mosaic_and_the_report_shows_them(tmp_path: Path) -> No
     assert 'data-before="stop A/1, camera right: telemetry&#x27;s pointing"' in page
 
 
+@pytest.mark.slow
 def test_the_program_writes_mosaics_when_asked(
     scripts_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
