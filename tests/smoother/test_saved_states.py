@@ -112,6 +112,7 @@ def test_a_header_that_promises_too_much_is_refused(saved: Path, tmp_path: Path,
         TraverseSmoother.load(path)
 
 
+@pytest.mark.slow
 def test_an_archive_that_unpacks_to_gigabytes_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "drive.npz"
     np.savez_compressed(path, header=np.zeros(300_000_000, np.uint8))

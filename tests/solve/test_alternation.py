@@ -31,6 +31,7 @@ from pancam_graph.rigs import mer_navcam
 from pancam_graph.solve import Fitted
 from pancam_graph.solve import _alternation as alternation
 from support.elimination_reference import whole
+from support.parameters import slow_but_for
 from support.solving import fitted
 
 SMALL = SimulationOptions(stops=2, pans=3, sweep_rad=1.5, points_per_image=15)
@@ -87,7 +88,7 @@ def solved(name: str, method: str) -> Solution:
 # --- the same optimum ---
 
 
-@pytest.mark.parametrize("name", SHARED)
+@pytest.mark.parametrize("name", slow_but_for("axis, focal length", SHARED))
 def test_both_ways_lead_to_one_optimum_the_joint_one_sooner(name: str) -> None:
     joint, turns = solved(name, "joint"), solved(name, "alternation")
     assert turns.converged
@@ -113,7 +114,7 @@ def test_the_cost_never_rises_and_is_the_true_one(name: str) -> None:
     assert turns.cost_final == pytest.approx(turns.cost_history[-1], rel=1e-9)
 
 
-@pytest.mark.parametrize("name", SHARED)
+@pytest.mark.parametrize("name", slow_but_for("axis, focal length", SHARED))
 def test_without_noise_the_truth_comes_back(name: str) -> None:
     simulation = simulate(mer_navcam(), replace(SMALL, noise_px=0.0, prior="truth"), seed=3)
     telemetry = simulation.telemetry_start
