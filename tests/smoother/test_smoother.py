@@ -203,7 +203,7 @@ def test_without_screening_all_that_is_seen_is_used() -> None:
     assert smoother.cost == pytest.approx(solve(t, SolveOptions(loss="none")).cost_final, rel=1e-5)
 
 
-@pytest.mark.parametrize("threads", ["1", "3"])
+@pytest.mark.parametrize("threads", [pytest.param("1", marks=pytest.mark.slow), "3"])
 def test_the_number_of_threads_changes_no_bit(
     small: Simulation, monkeypatch: pytest.MonkeyPatch, threads: str
 ) -> None:

@@ -206,7 +206,7 @@ def refusing(monkeypatch: pytest.MonkeyPatch, which: str, *, times: int) -> list
     return tries
 
 
-@pytest.mark.parametrize("name", ["radius", "calibration"])
+@pytest.mark.parametrize("name", slow_but_for("radius", ["radius", "calibration"]))
 @pytest.mark.parametrize("which", ["regular", "shared"])
 def test_a_set_that_stalls_rests_and_is_tried_again(
     which: str, name: str, monkeypatch: pytest.MonkeyPatch
