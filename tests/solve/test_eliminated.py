@@ -17,6 +17,7 @@ from pancam_graph.landmarks import LossName
 from pancam_graph.rigs import Eye, Rig, mer_navcam
 from pancam_graph.simulate import Simulation
 from pancam_graph.solve import Problem, fit, prepare, screen
+from support.parameters import slow_for
 from support.solving import fitted, solution_from
 
 SMALL = SimulationOptions(stops=2, pans=3, sweep_rad=1.5, points_per_image=15)
@@ -58,7 +59,7 @@ def masts_apart(a: Solution, b: Solution) -> float:
 # --- the same as explicit landmarks ---
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", slow_for("mast", MODELS))
 def test_near_landmarks_eliminated_or_explicit_give_one_optimum(model: str) -> None:
     traverse = near(small(2))
     ours, theirs = (solve(traverse, to_the_end(model, landmarks=way)) for way in ("eliminated", "explicit"))
