@@ -1,22 +1,31 @@
 """The subcommand init: plain pictures with told pointing to a traverse.json."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pancam_graph.base.text import shortened
 from pancam_graph.cli._command import Command, Invocation
 from pancam_graph.cli._parser import CommandParser, Flag, degrees
 from pancam_graph.cli._streams import write
 
+if TYPE_CHECKING:
+    from pancam_graph.io.plain import PlainTraverse
+
 __all__ = ["INIT"]
 
 _DESCRIPTION = """\
 Make a traverse.json of plain pictures (JPEG, PNG, TIFF and others) in FOLDER or in folders below it, one a
-stop, for pancam-graph refine FOLDER. Only headers of pictures are read; traverse.txt beside it says where
-every number comes from and what to change.
+stop, for pancam-graph refine FOLDER. traverse.txt beside it says where every number comes from and what to
+change.
 
---pointing names a CSV file, one line a picture, with the columns file, pan_deg, tilt_deg and, where you like,
-sigma_pan_deg, sigma_tilt_deg, camera, frame, stop. Pan counts anticlockwise seen from above (--pan clockwise
-for azimuths), tilt upwards. Pictures of several cameras at one stop, pan and tilt are one frame.
+Where the pointing of a picture is not told, or only to more than 2 degrees, pan, tilt and focal length are
+found in the pictures, which must overlap by a quarter or so: pan 0 is then where the first of them looks.
+Else only headers of pictures are read.
+
+--pointing names a CSV file, one line a picture, with the columns file, pan_deg, tilt_deg (or file alone) and,
+where you like, sigma_pan_deg, sigma_tilt_deg, camera, frame, stop. Pan counts anticlockwise seen from above
+(--pan clockwise for azimuths), tilt upwards. Pictures of several cameras at one stop, pan and tilt are one
+frame.
 
 Without --rig, pictures of one size, camera and focal length (EXIF) are of one eye, which sits on the head as
 --arms says. What is not told is taken wide and estimated from the pictures.
@@ -28,7 +37,12 @@ Exit status: 0 written, 2 bad input or a fault (nothing is written), 130 interru
 def _add_options(parser: CommandParser) -> None:
     add = parser.add_argument
     add("folder", type=Path, metavar="FOLDER", help="folder with the pictures; gets traverse.json")
-    add("--pointing", type=Path, metavar="FILE", help="CSV file with pan and tilt of each picture, degrees")
+    add(
+        "--pointing",
+        type=Path,
+        metavar="FILE",
+        help="CSV file with pan and tilt of each picture, degrees; by default they are found in the pictures",
+    )
     add(
         "--stops",
         type=Path,
@@ -55,7 +69,12 @@ def _add_options(parser: CommandParser) -> None:
         metavar="DEG",
         help="standard deviation of pans and tilts where the table tells none (a template's own, else 0.5)",
     )
-    add("--focal-px", type=float, metavar="PX", help="focal length of the cameras; by default EXIF tells it")
+    add(
+        "--focal-px",
+        type=float,
+        metavar="PX",
+        help="focal length of the cameras; by default EXIF tells it, or pictures of unknown pointing",
+    )
     add(
         "--field-deg",
         dest="field_rad",
@@ -89,7 +108,7 @@ def _add_options(parser: CommandParser) -> None:
 
 def _work(call: Invocation) -> int:
     """Read headers and tables, write."""
-    from pancam_graph.io.plain import PlainOptions, plain_traverse, write_plain
+    from pancam_graph.io.plain import PlainOptions, is_vague, plain_traverse, write_plain
 
     told = call.arguments
     options = PlainOptions(
@@ -106,6 +125,8 @@ def _work(call: Invocation) -> int:
     )
     with call.progress.shown(f"reading {told.folder}"):
         plain = plain_traverse(told.folder, options)
+    if any(map(is_vague, plain.traverse.frames)):
+        plain = _with_found_pointing(plain, call)
     write_plain(plain, told.folder, overwrite=told.overwrite)
     for warning in plain.traverse.warnings:
         write("stderr", shortened(f"warning: {warning}"))
@@ -116,6 +137,16 @@ def _work(call: Invocation) -> int:
     found = ", ".join(f"{len(of)} {name}{'' if len(of) == 1 else 's'}" for name, of in counts.items())
     call.say(f"{told.folder / 'traverse.json'}: {found}; traverse.txt explains it")
     return 0
+
+
+def _with_found_pointing(plain: "PlainTraverse", call: Invocation) -> "PlainTraverse":
+    """The traverse with the pointing that its pictures tell."""
+    from pancam_graph.images import find_pointing
+    from pancam_graph.io.plain import PlainTraverse
+
+    with call.progress.shown("looking where pictures overlap"):
+        found = find_pointing(plain.traverse, progress=call.progress.counted)
+    return PlainTraverse(traverse=found.traverse, sources=(*plain.sources, *found.sources))
 
 
 INIT = Command(

@@ -26,7 +26,10 @@ from pancam_graph.data._points import NamedPoints
 from pancam_graph.data._sharing import Sharing
 from pancam_graph.rigs import Rig
 
-__all__ = ["DrivePart", "Frame", "Image", "Observations", "Stop", "Traverse"]
+__all__ = ["UNKNOWN_RAD", "DrivePart", "Frame", "Image", "Observations", "Stop", "Traverse"]
+
+UNKNOWN_RAD = float(np.pi)
+"""Standard deviation from which on a pan or tilt is not known at all."""
 
 _ASYMMETRY = 1e-9
 """Largest difference of a covariance's two mixed entries, as a share of its larger variance."""

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from pancam_graph.images._masks import ImageMask as ImageMask
     from pancam_graph.images._masks import Reason as Reason
     from pancam_graph.images._normalise import usable_mask as usable_mask
+    from pancam_graph.images.pointing import FoundPointing as FoundPointing
+    from pancam_graph.images.pointing import find_pointing as find_pointing
 else:
     _LATE = {
         "find_masks": "_front_end",
@@ -25,6 +27,8 @@ else:
         "ImageMask": "_masks",
         "Reason": "_masks",
         "usable_mask": "_normalise",
+        "FoundPointing": "pointing",
+        "find_pointing": "pointing",
     }
 
     def __getattr__(name: str) -> object:

@@ -13,7 +13,7 @@ from pancam_graph.cameras import Camera
 from pancam_graph.images._front_end_options import FrontEndOptions
 from pancam_graph.images._normalise import normalise, usable_mask
 
-__all__ = ["DESCRIPTOR_NORM", "Features", "find_features"]
+__all__ = ["DESCRIPTOR_NORM", "Features", "describe", "find_features", "strongest"]
 
 DESCRIPTOR_NORM = 255.0
 """Length of a stored descriptor."""
@@ -81,17 +81,17 @@ def find_features(
     # squared because the uncertainty of telemetry makes an overlap look wider than it is.
     share = max(float(np.mean(wanted)), _LEAST_SHARE)
     limit = min(options.max_features / share**2, max(_MOST_FEATURES, options.max_features))
-    rows = _choose(table, usable, round(limit))
+    rows = strongest(table, usable, round(limit))
     chosen = [keypoints[i] for i in rows]
     angles = _vertical_angle_deg(camera, camera_up, table[rows][:, [1, 0]])
     for keypoint, angle in zip(chosen, angles, strict=True):
         keypoint.angle = float(angle)
-    kept, descriptor = _describe(sift, grey, chosen)
+    kept, descriptor = describe(sift, grey, chosen)
     uv_px = np.array([k.pt for k in kept], dtype=float).reshape(-1, 2)
     return Features(uv_px=uv_px, size_px=np.array([k.size for k in kept], dtype=float), descriptor=descriptor)
 
 
-def _choose(table: FloatArray, usable: NDArray[np.bool_], max_features: int) -> IntArray:
+def strongest(table: FloatArray, usable: NDArray[np.bool_], max_features: int) -> IntArray:
     """Rows of distinct, usable features (v, u, size, response), the strongest of each cell, sorted."""
     if not len(table):
         return np.empty(0, dtype=np.int64)
@@ -119,9 +119,10 @@ def _vertical_angle_deg(camera: Camera, camera_up: FloatArray, uv_px: FloatArray
     return np.asarray(np.rad2deg(np.arctan2(dv, du)) % 360.0)
 
 
-def _describe(
+def describe(
     sift: Any, grey: NDArray[np.uint8], keypoints: Sequence[Any]
 ) -> tuple[Sequence[Any], NDArray[np.uint8]]:
+    """The keypoints that have a descriptor, and their square-rooted descriptors of length 255, rounded."""
     if not keypoints:
         return [], np.empty((0, 128), dtype=np.uint8)
     kept, raw = sift.compute(grey, list(keypoints))

@@ -14,8 +14,17 @@ from hypothesis import strategies as st
 from pancam_graph import read_input, write_traverse
 from pancam_graph.base.errors import InputError
 from pancam_graph.cli import main
+from pancam_graph.data import UNKNOWN_RAD
 from pancam_graph.io import read_image, rig_json
-from pancam_graph.io.plain import Exif, PlainOptions, PlainTraverse, plain_traverse, read_exif, write_plain
+from pancam_graph.io.plain import (
+    Exif,
+    PlainOptions,
+    PlainTraverse,
+    is_vague,
+    plain_traverse,
+    read_exif,
+    write_plain,
+)
 from pancam_graph.rigs import Rig, rig_template, stereo_pan_tilt
 from support.fuzzing import mutated_bytes
 from support.plain_pictures import (
@@ -431,13 +440,24 @@ def test_an_option_that_makes_no_sense_is_one_sentence(
     assert says in refused(folder, **options)
 
 
-def test_folders_and_unknown_pointing(folder: Path, tmp_path: Path) -> None:
+def test_pointing_that_is_not_told_is_unknown_and_so_may_be_the_focal_length(folder: Path) -> None:
+    for lines in ([], ["file", "a.png", "b.png", "c.png"], [HEADER, "a.png,,", "b.png,,", "c.png,,"]):
+        pointing = table(folder / "p.csv", *lines) if lines else None
+        found = plain_traverse(folder, PlainOptions(pointing=pointing)).traverse
+        assert len(found.frames) == len(found.images) == 3
+        assert all(is_vague(frame) and min(frame.sigmas_rad) >= UNKNOWN_RAD for frame in found.frames)
+        assert found.rig.eyes[0].camera.pinhole.fx_px == 16.0
+        assert found.rig.uncertainty.focal == 0.5
+    of_one_frame = made(folder, "file,camera,frame", "a.png,l,x", "b.png,r,x", "c.png,l,y").traverse
+    assert [image.frame for image in of_one_frame.images] == ["x", "x", "y"]
+    told = made(folder, sigma_rad=np.deg2rad(5))
+    assert all(map(is_vague, told.traverse.frames))
+    assert not any(map(is_vague, made(folder).traverse.frames))
+
+
+def test_folders_that_are_none(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     for path, says in (
-        (
-            folder,
-            "expected --pointing FILE.csv with the columns file, pan_deg, tilt_deg, a line for each of the 3",
-        ),
         (tmp_path / "empty", "expected pictures (PNG, TIFF, JPEG,"),
         (tmp_path / "none", "expected a folder with pictures, found nothing there"),
         (folder / "a.png", "expected a folder with pictures, found a file"),

@@ -16,6 +16,8 @@ _FILM_SIGMA = 0.04
 """Equivalents by the diagonal and by the width of a picture of 4 : 3 differ by as much."""
 _FILM_ROUNDING_MM = 0.3
 """Standard deviation of what is rounded to millimetres."""
+_GUESS_SIGMA = 0.5
+"""Of a focal length as long as the longer side of a picture."""
 _FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
 _NARROWEST, _WIDEST = 100.0, 0.1
 """Focal lengths, over the longer side of a picture, of which EXIF is believed."""
@@ -34,10 +36,11 @@ class Focal:
     """Where it comes from, as the end of a sentence."""
 
 
-def focal_of(picture: PlainPicture, options: PlainOptions) -> Focal:
+def focal_of(picture: PlainPicture, options: PlainOptions, *, guessed: bool) -> Focal:
     """The focal length of the camera that took a picture.
 
-    Raises InputError, which names the options that tell it, where neither they nor EXIF do.
+    Where neither options nor EXIF tell it, a guess if `guessed`; else raises InputError, which names the
+    options that tell it.
     """
     if options.focal_px is not None:
         return _checked(options.focal_px, options.focal_sigma or _TOLD_SIGMA, "--focal-px", picture)
@@ -50,6 +53,10 @@ def focal_of(picture: PlainPicture, options: PlainOptions) -> Focal:
         focal_px = 0.5 * picture.width_px / math.tan(options.field_rad / 2)
         return _checked(focal_px, options.focal_sigma or _TOLD_SIGMA, "--field-deg", picture)
     found = _by_exif(picture)
+    if isinstance(found, str) and guessed:
+        return Focal(
+            focal_px=float(max(picture.size_px)), sigma=_GUESS_SIGMA, source=f"a guess, as EXIF tells {found}"
+        )
     if isinstance(found, str):
         raise InputError(
             f"{picture.path}: expected EXIF that tells the focal length, found {found}; --focal-px or "

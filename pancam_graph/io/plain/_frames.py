@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 from pancam_graph.base.errors import InputError
-from pancam_graph.data import Frame, Image
+from pancam_graph.data import UNKNOWN_RAD, Frame, Image
 from pancam_graph.io.plain._pointing import Pointed
 from pancam_graph.rigs import PointingSigma
 
@@ -16,13 +16,17 @@ def frames_of(
 ) -> tuple[tuple[Frame, ...], tuple[Image, ...]]:
     """Frames and images of pictures with the names of their eyes, in the order of the table.
 
-    Pictures are of one frame where the table says so, else where stop, pan and tilt are equal and the eyes
-    differ. Raises InputError naming lines for a frame that has one eye twice, or two pointings.
+    Pictures are of one frame where the table says so, else where stop, pan and tilt are told and equal and
+    the eyes differ. Raises InputError naming lines for a frame that has one eye twice, or two pointings.
     """
     frames: list[list[tuple[Pointed, str]]] = []
     of_key: dict[tuple[object, ...], list[list[tuple[Pointed, str]]]] = {}
     for row, eye in pictures:
-        key = (row.stop, row.pan_rad, row.tilt_rad) if row.frame is None else (row.stop, row.frame)
+        key: tuple[object, ...] = (row.stop, row.pan_rad, row.tilt_rad)
+        if row.frame is not None:
+            key = (row.stop, row.frame)
+        elif row.pan_rad is None:
+            key = (row.stop, row.line, None)
         same = of_key.setdefault((row.frame is None, *key), [])
         free = [frame for frame in same if eye not in {other for _, other in frame}]
         if same and row.frame is not None:
@@ -61,7 +65,16 @@ def _require_one_pointing(row: Pointed, eye: str, frame: list[tuple[Pointed, str
 
 
 def _frame(id: str, rows: Sequence[Pointed], usual: PointingSigma) -> Frame:  # noqa: A002  as Frame has it
-    """A frame; of sigmas that its pictures have the first counts."""
+    """A frame; of sigmas that its pictures have the first counts. What is not known is 0."""
+    if rows[0].pan_rad is None or rows[0].tilt_rad is None:
+        return Frame(
+            id=id,
+            stop=rows[0].stop,
+            pan_rad=0.0,
+            tilt_rad=0.0,
+            sigma_pan_rad=UNKNOWN_RAD,
+            sigma_tilt_rad=UNKNOWN_RAD,
+        )
     pan = next((r.sigma_pan_rad for r in rows if r.sigma_pan_rad is not None), usual.pan_rad)
     tilt = next((r.sigma_tilt_rad for r in rows if r.sigma_tilt_rad is not None), usual.tilt_rad)
     return Frame(

@@ -24,7 +24,10 @@ __all__ = ["made_rig"]
 
 _POINTING_RAD = float(np.deg2rad(0.5))
 _ARMS_TOLD_M, _ARMS_UNTOLD_M = 0.01, 0.05
-_MOUNT_RAD, _TILT_AXIS_RAD, _FLEX_RAD = 0.02, 0.01, 1e-3
+_MOUNT_RAD, _FLEX_RAD = 0.02, 1e-3
+_TILT_AXIS_RAD = 2e-3
+"""Small beside that of mounts: pictures of one tilt do not tell a tilt axis that is askew from a mount that
+is rolled, and wide priors on both leave them to run apart without an effect on the pixels."""
 _SCALE = 5e-3
 """Of pans and tilts over their readings, as a share: servos have one, gears with encoders do not."""
 _ASPECT = 2e-3
@@ -50,18 +53,23 @@ class _Made:
     warnings: tuple[str, ...]
 
 
-def made_rig(pointed: Sequence[Pointed], options: PlainOptions, table: Path) -> RiggedPictures:
+def made_rig(
+    pointed: Sequence[Pointed], options: PlainOptions, table: Path, *, guessed: bool
+) -> RiggedPictures:
     """A rig with an eye for each camera, and which of them took each picture.
 
     The table says the camera; without it, pictures of one size, camera and focal length by EXIF are of one
     eye. An eye looks forward; it is rolled as EXIF says that most of its pictures were held.
 
-    Raises InputError for an option that makes no sense, without a focal length, and naming lines for a
+    `guessed` says that a focal length may be a guess, since pictures will tell it. Raises InputError for an
+    option that makes no sense, without a focal length, and naming lines for a
     camera whose EXIF is of two.
     """
     groups, left_out = _groups(pointed, table)
     up_m, forward_m, left_m = _arms_m(options)
-    made = [_made_eye(name, rows, (forward_m, left_m), options) for name, rows in groups.items()]
+    made = [
+        _made_eye(name, rows, (forward_m, left_m), options, guessed=guessed) for name, rows in groups.items()
+    ]
     arms_sigma_m = _arms_sigma_m(options)
     told = "as told by --arms" if options.arms_m else "not told (--arms): all at one point"
     arms = (
@@ -104,11 +112,16 @@ def _uncertainty(rig: Rig, focal: float, arms_sigma_m: float) -> RigUncertainty:
 
 
 def _made_eye(
-    name: str, rows: _Group, before_and_left_m: tuple[float, float], options: PlainOptions
+    name: str,
+    rows: _Group,
+    before_and_left_m: tuple[float, float],
+    options: PlainOptions,
+    *,
+    guessed: bool,
 ) -> _Made:
     """The eye that took some pictures. Raises InputError without a focal length."""
     picture = rows[0].picture
-    focal = focal_of(picture, options)
+    focal = focal_of(picture, options, guessed=guessed)
     turns, held_otherwise = _quarter_turns([row.picture for row in rows])
     camera = Brown(
         width_px=picture.width_px,

@@ -6,17 +6,17 @@ from pathlib import Path
 __all__ = ["POINTING_COLUMNS", "STOP_COLUMNS", "PlainOptions"]
 
 POINTING_COLUMNS = "file, pan_deg, tilt_deg"
-"""Columns that a table of pointing must have."""
+"""Columns of a table of known pointing."""
 STOP_COLUMNS = "stop, x_m, y_m, z_m"
 """Columns that a table of stops must have."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlainOptions:
-    """What is told of a folder of plain pictures; only the pointing must be."""
+    """What is told of a folder of plain pictures."""
 
     pointing: Path | None = None
-    """CSV file with the pointing of each picture; None: not known, which is refused."""
+    """CSV file with the pointing of each picture, or with their cameras and frames alone; None: not known."""
     stops: Path | None = None
     """CSV file with the place of each stop; a single stop needs none."""
     rig: str | None = None
@@ -27,7 +27,8 @@ class PlainOptions:
     """Standard deviation of pans and tilts for which the table has none; None: that of a template, or 0.5
     degrees."""
     focal_px: float | None = None
-    """Focal length of every camera of the rig that is made; None: by `field_rad`, or EXIF."""
+    """Focal length of every camera of the rig that is made; None: by `field_rad`, or EXIF; without
+    these, pictures of unknown pointing tell it."""
     field_rad: float | None = None
     """Horizontal field of view of every camera, of the picture as it is stored; None: not told."""
     focal_sigma: float | None = None

@@ -7,18 +7,20 @@ import numpy as np
 
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.text import visible
-from pancam_graph.data import Traverse
+from pancam_graph.data import Frame, Traverse
 from pancam_graph.io.plain._eyes import RiggedPictures, told_rig
 from pancam_graph.io.plain._find_pictures import find_pictures
 from pancam_graph.io.plain._frames import frames_of
 from pancam_graph.io.plain._made_rig import made_rig
-from pancam_graph.io.plain._options import POINTING_COLUMNS, PlainOptions
-from pancam_graph.io.plain._pointing import read_pointing
+from pancam_graph.io.plain._options import PlainOptions
+from pancam_graph.io.plain._pointing import Pointed, read_pointing, unpointed
 from pancam_graph.io.plain._stops import stops_of
 from pancam_graph.rigs import PointingSigma
 
-__all__ = ["PlainTraverse", "plain_traverse"]
+__all__ = ["PlainTraverse", "is_vague", "plain_traverse"]
 
+_VAGUE_RAD = float(np.deg2rad(2.0))
+"""Standard deviation of a pan or tilt beyond which features of pictures are not sought where it says."""
 _FEWEST_PANS = 4
 """Different pans from which a small span of them is odd."""
 
@@ -36,11 +38,12 @@ class PlainTraverse:
 def plain_traverse(folder: Path | str, options: PlainOptions) -> PlainTraverse:
     """The traverse of plain pictures in a folder, or in folders below it, with what is told of them.
 
-    Only headers of pictures are read. Pan and tilt of the table become those of the package's conventions; a
-    single stop is the world's origin. Pictures that do not fit are left out with a warning.
+    Only headers of pictures are read. Pointing that is not told is 0, with sigmas of `data.UNKNOWN_RAD`. Pan
+    and tilt of the table become those of the package's conventions; a single stop is the world's origin.
+    Pictures that do not fit are left out with a warning.
 
-    Raises InputError with one sentence naming file, line or option: where the pointing is not told, for
-    tables and rigs that are malformed, and if no picture is left.
+    Raises InputError with one sentence naming file, line or option: for tables and rigs that are malformed,
+    and if no picture is left.
     """
     folder = Path(folder)
     _require_sense(options)
@@ -48,21 +51,20 @@ def plain_traverse(folder: Path | str, options: PlainOptions) -> PlainTraverse:
     if options.rig is not None:
         told.append(Path(options.rig))
     pictures, warnings = find_pictures(folder, told)
+    table = options.pointing or folder
     if options.pointing is None:
-        raise InputError(
-            f"{folder}: expected --pointing FILE.csv with the columns {POINTING_COLUMNS}, a line for each of "
-            f"the {len(pictures)} pictures; found none, and pointing that is not known cannot be solved"
-        )
-    pointed, more = read_pointing(options.pointing, folder, pictures, clockwise=options.clockwise)
-    warnings += more
-    if options.rig is None:
-        rigged = made_rig(pointed, options, options.pointing)
+        pointed = unpointed(pictures)
     else:
-        rigged = told_rig(pointed, options.rig, options.pointing)
+        pointed, more = read_pointing(table, folder, pictures, clockwise=options.clockwise)
+        warnings += more
+    if options.rig is None:
+        rigged = made_rig(pointed, options, table, guessed=all(_is_vague(row, options) for row in pointed))
+    else:
+        rigged = told_rig(pointed, options.rig, table)
     usual = rigged.rig.pointing_sigma
     if options.sigma_rad is not None:
         usual = replace(usual, pan_rad=options.sigma_rad, tilt_rad=options.sigma_rad)
-    frames, images = frames_of(rigged.pictures, usual, options.pointing)
+    frames, images = frames_of(rigged.pictures, usual, table)
     names = list(dict.fromkeys(frame.stop for frame in frames))
     stops, more = stops_of(names, options.stops, folder, clockwise=options.clockwise)
     traverse = Traverse(
@@ -72,9 +74,22 @@ def plain_traverse(folder: Path | str, options: PlainOptions) -> PlainTraverse:
         frames=frames,
         images=images,
         folder=folder,
-        warnings=(*warnings, *rigged.warnings, *more, *_small_turns(rigged, options.pointing)),
+        warnings=(*warnings, *rigged.warnings, *more, *_small_turns(rigged, table)),
     )
     return PlainTraverse(traverse=traverse, sources=(*rigged.sources, *_pointing_sources(options, usual)))
+
+
+def is_vague(frame: Frame) -> bool:
+    """Whether a frame's pointing is known so badly that pictures are to tell it."""
+    return max(frame.sigma_pan_rad, frame.sigma_tilt_rad) > _VAGUE_RAD
+
+
+def _is_vague(row: Pointed, options: PlainOptions) -> bool:
+    """The same of a line of the table."""
+    if row.pan_rad is None:
+        return True
+    sigmas = [row.sigma_pan_rad, row.sigma_tilt_rad]
+    return max(options.sigma_rad or 0.0 if sigma is None else sigma for sigma in sigmas) > _VAGUE_RAD
 
 
 def _require_sense(options: PlainOptions) -> None:
@@ -103,11 +118,13 @@ def _require_sense(options: PlainOptions) -> None:
 
 def _small_turns(rigged: RiggedPictures, table: Path) -> tuple[str, ...]:
     """A warning where the pans of a table look like radians: many, and all within a bit of one picture."""
-    pans_rad = [row.pan_rad for row, _ in rigged.pictures]
+    pans_rad = [row.pan_rad for row, _ in rigged.pictures if row.pan_rad is not None]
+    if len(set(pans_rad)) < _FEWEST_PANS:
+        return ()
     camera = rigged.rig.eyes[0].camera.pinhole
     field_rad = 2 * np.arctan(0.5 * camera.width_px / camera.fx_px)
     span_rad = max(pans_rad) - min(pans_rad)
-    if len(set(pans_rad)) < _FEWEST_PANS or np.rad2deg(span_rad) > 2 * np.pi or span_rad > field_rad / 4:
+    if np.rad2deg(span_rad) > 2 * np.pi or span_rad > field_rad / 4:
         return ()
     return (
         f"{table}: pans span {np.rad2deg(span_rad):.3g} degrees, where a picture has "
@@ -121,6 +138,8 @@ def _pointing_sources(options: PlainOptions, usual: PointingSigma) -> tuple[str,
     places = "the single stop is the origin of the world"
     if options.stops is not None:
         places = f"places of stops by {options.stops}, the first held unless its sigmas are told"
+    if options.pointing is None:
+        return (places,)
     return (
         f"pointing: by {options.pointing}, pans {sense}; where it tells no sigmas, {pan_deg:.3g} degrees of "
         f"pan and {tilt_deg:.3g} of tilt",

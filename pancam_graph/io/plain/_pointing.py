@@ -13,8 +13,9 @@ from pancam_graph.io.plain._find_pictures import PlainPicture
 from pancam_graph.io.plain._options import POINTING_COLUMNS
 from pancam_graph.io.plain._table_cells import Row, read_rows
 
-__all__ = ["Pointed", "read_pointing"]
+__all__ = ["Pointed", "read_pointing", "unpointed"]
 
+_POINTING = ("pan_deg", "tilt_deg")
 _OPTIONAL = "sigma_pan_deg, sigma_tilt_deg, camera, frame, stop"
 _MOST_PAN_DEG = 3600.0
 _MOST_TILT_DEG = 180.0
@@ -29,10 +30,10 @@ class Pointed:
 
     picture: PlainPicture
     line: int
-    """Of the table."""
-    pan_rad: float
-    """Anticlockwise seen from above."""
-    tilt_rad: float
+    """Of the table; without one, a number."""
+    pan_rad: float | None
+    """Anticlockwise seen from above; None: not known."""
+    tilt_rad: float | None
     sigma_pan_rad: float | None
     """None: not told."""
     sigma_tilt_rad: float | None
@@ -48,12 +49,13 @@ def read_pointing(
 ) -> tuple[list[Pointed], list[str]]:
     """Pictures in the order of the table, and warnings.
 
-    Files of which there is no picture, and pictures without a row, are warned of and left out.
+    Columns or cells of pan and tilt that are empty together are of a pointing that is not known. Files of
+    which there is no picture, and pictures without a row, are warned of and left out.
 
     Raises InputError naming file, column and line for what is no table of pointing, a file that stands
     twice, and if no picture is left.
     """
-    rows, warnings = read_rows(path, POINTING_COLUMNS, _OPTIONAL)
+    rows, warnings = read_rows(path, POINTING_COLUMNS, _OPTIONAL, none_or_all=_POINTING)
     pointed: dict[str, Pointed] = {}
     unknown: list[str] = []
     with prefixed(path):
@@ -98,18 +100,43 @@ def _picture_named(row: Row, folder: Path, pictures: Mapping[str, PlainPicture])
 
 
 def _pointed(row: Row, picture: PlainPicture, *, clockwise: bool) -> Pointed:
-    pan_rad = np.deg2rad(row.number("pan_deg", -_MOST_PAN_DEG, _MOST_PAN_DEG))
+    pan_rad = tilt_rad = None
+    if any(name in row.cells for name in _POINTING):
+        pan_rad = float(np.deg2rad(row.number("pan_deg", -_MOST_PAN_DEG, _MOST_PAN_DEG)))
+        tilt_rad = float(np.deg2rad(row.number("tilt_deg", -_MOST_TILT_DEG, _MOST_TILT_DEG)))
     sigmas = [row.number_or_none(f"sigma_{joint}_deg", 0, _MOST_TILT_DEG) for joint in ("pan", "tilt")]
     sigma_pan_rad, sigma_tilt_rad = (None if s is None else float(np.deg2rad(s)) for s in sigmas)
-    above, _, below = picture.file.partition("/")
     return Pointed(
         picture=picture,
         line=row.line,
-        pan_rad=float(-pan_rad if clockwise else pan_rad),
-        tilt_rad=float(np.deg2rad(row.number("tilt_deg", -_MOST_TILT_DEG, _MOST_TILT_DEG))),
+        pan_rad=-pan_rad if clockwise and pan_rad is not None else pan_rad,
+        tilt_rad=tilt_rad,
         sigma_pan_rad=sigma_pan_rad,
         sigma_tilt_rad=sigma_tilt_rad,
         camera=row.text("camera"),
         frame=row.text("frame"),
-        stop=row.text("stop") or (above if below else SINGLE_STOP),
+        stop=row.text("stop") or _folder_stop(picture),
     )
+
+
+def _folder_stop(picture: PlainPicture) -> str:
+    above, _, below = picture.file.partition("/")
+    return above if below else SINGLE_STOP
+
+
+def unpointed(pictures: Mapping[str, PlainPicture]) -> list[Pointed]:
+    """All pictures of a folder, of which no pointing is known."""
+    return [
+        Pointed(
+            picture=picture,
+            line=number,
+            pan_rad=None,
+            tilt_rad=None,
+            sigma_pan_rad=None,
+            sigma_tilt_rad=None,
+            camera=None,
+            frame=None,
+            stop=_folder_stop(picture),
+        )
+        for number, picture in enumerate(pictures.values(), 1)
+    ]

@@ -1,6 +1,7 @@
 """Cells of a table with numbers: what stands in a row, by the name of its column."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,11 +54,13 @@ class Row:
         return f"{name}, line {self.line}"
 
 
-def read_rows(path: Path, required: str, optional: str) -> tuple[list[Row], list[str]]:
+def read_rows(
+    path: Path, required: str, optional: str, *, none_or_all: Sequence[str] = ()
+) -> tuple[list[Row], list[str]]:
     """Rows of a table with the columns `required` and some of those `optional`, and warnings of others.
 
-    Both are names with commas between. Rows of empty cells are passed over. Raises InputError naming file,
-    column and line.
+    Both are names with commas between; of those required, `none_or_all` may be missing together. Rows of
+    empty cells are passed over. Raises InputError naming file, column and line.
     """
     table = read_csv_table(path)
     must, may = required.split(", "), optional.split(", ")
@@ -67,6 +70,8 @@ def read_rows(path: Path, required: str, optional: str) -> tuple[list[Row], list
         if len(table.header) == 1 and ";" in table.header[0]:
             raise InputError(f"line 1: expected commas between {required}, found semicolons")
         known = [*must, *may]
+        if not set(none_or_all) & set(table.header):
+            must = [name for name in must if name not in none_or_all]
         where = {name: table.column(name, required) for name in known if name in must or name in table.header}
         others = [name for name in table.header if name and name not in known]
         warnings = [f"{path}: the column {n!r} is not used{nearest(n, known)}" for n in others]
