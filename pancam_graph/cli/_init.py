@@ -108,7 +108,7 @@ def _add_options(parser: CommandParser) -> None:
 
 def _work(call: Invocation) -> int:
     """Read headers and tables, write."""
-    from pancam_graph.io.plain import PlainOptions, is_vague, plain_traverse, write_plain
+    from pancam_graph.io.plain import PlainOptions, plain_traverse, write_plain
 
     told = call.arguments
     options = PlainOptions(
@@ -125,7 +125,7 @@ def _work(call: Invocation) -> int:
     )
     with call.progress.shown(f"reading {told.folder}"):
         plain = plain_traverse(told.folder, options)
-    if any(map(is_vague, plain.traverse.frames)):
+    if any(frame.is_vague for frame in plain.traverse.frames):
         plain = _with_found_pointing(plain, call)
     write_plain(plain, told.folder, overwrite=told.overwrite)
     for warning in plain.traverse.warnings:

@@ -48,6 +48,7 @@ from pancam_graph.data._solution import Solution as Solution
 from pancam_graph.data._solution import State as State
 from pancam_graph.data._solution import rms_px as rms_px
 from pancam_graph.data._traverse import UNKNOWN_RAD as UNKNOWN_RAD
+from pancam_graph.data._traverse import VAGUE_RAD as VAGUE_RAD
 from pancam_graph.data._traverse import DrivePart as DrivePart
 from pancam_graph.data._traverse import Frame as Frame
 from pancam_graph.data._traverse import Image as Image

@@ -26,10 +26,12 @@ from pancam_graph.data._points import NamedPoints
 from pancam_graph.data._sharing import Sharing
 from pancam_graph.rigs import Rig
 
-__all__ = ["UNKNOWN_RAD", "DrivePart", "Frame", "Image", "Observations", "Stop", "Traverse"]
+__all__ = ["UNKNOWN_RAD", "VAGUE_RAD", "DrivePart", "Frame", "Image", "Observations", "Stop", "Traverse"]
 
 UNKNOWN_RAD = float(np.pi)
 """Standard deviation from which on a pan or tilt is not known at all."""
+VAGUE_RAD = float(np.deg2rad(2.0))
+"""Standard deviation of a pan or tilt beyond which features are not sought where it says."""
 
 _ASYMMETRY = 1e-9
 """Largest difference of a covariance's two mixed entries, as a share of its larger variance."""
@@ -77,6 +79,11 @@ class Frame:
     def sigmas_rad(self) -> FloatArray:
         """Standard deviations (2,) of pan and tilt."""
         return np.array([self.sigma_pan_rad, self.sigma_tilt_rad])
+
+    @property
+    def is_vague(self) -> bool:
+        """Whether its pointing is known so badly that pictures are to tell it."""
+        return max(self.sigma_pan_rad, self.sigma_tilt_rad) > VAGUE_RAD
 
 
 @dataclass(frozen=True, kw_only=True)

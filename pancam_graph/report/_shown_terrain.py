@@ -11,6 +11,7 @@ from pancam_graph.data import Solution
 __all__ = ["ShownTerrain", "landmark_residuals", "shown_terrain"]
 
 _FAR_WORLD_M = 1e4
+_NOWHERE_M = 1e15
 _LEAST_EXTENT_M = 2.0
 _PAD = 0.08
 
@@ -71,7 +72,8 @@ def shown_terrain(solution: Solution) -> ShownTerrain:
     _, stops_m = pose_arrays(solution.final.world_T_mast)
     origin_m = np.round(stops_m[0]) if np.abs(stops_m).max() > _FAR_WORLD_M else np.zeros(3)
     residual_px = landmark_residuals(solution)
-    usable = np.isfinite(residual_px) & np.isfinite(solution.final.landmarks_m).all(axis=1)
+    # Of a solution that ran away distances overflow.
+    usable = np.isfinite(residual_px) & (np.abs(solution.final.landmarks_m) < _NOWHERE_M).all(axis=1)
     rows = np.flatnonzero(usable)
     points_m = solution.final.landmarks_m[rows]
     ground_m = stops_m - [0.0, 0.0, solution.traverse.rig.mast_height_m]

@@ -265,14 +265,18 @@ def test_told_pans_are_the_gauge_and_a_check(tmp_path: Path, rng: np.random.Gene
     write_pictures(folder, texture(2), RING[:7])
     told = np.rad2deg(RING[:7]) + [40.0, 0.0] + 5 * rng.normal(size=(7, 2))
     told[3, 0] += 90
-    lines = [f"{n:02d}.png,{pan},{tilt}" for n, (pan, tilt) in enumerate(told)]
-    (tmp_path / "p.csv").write_text("\n".join(["file,pan_deg,tilt_deg", *lines]))
+    told[5] = np.rad2deg(RING[5]) + np.array([40.3, 0.1])
+    lines = [f"{n:02d}.png,{pan},{tilt},{0.2 if n == 5 else ''}" for n, (pan, tilt) in enumerate(told)]
+    lines = [f"{line},{0.2 if n == 5 else ''}" for n, line in enumerate(lines)]
+    (tmp_path / "p.csv").write_text("\n".join(["file,pan_deg,tilt_deg,sigma_pan_deg,sigma_tilt_deg", *lines]))
     options = PlainOptions(pointing=tmp_path / "p.csv", sigma_rad=np.deg2rad(5), focal_px=0.95 * FOCAL_PX)
     found = find_pointing(plain_traverse(folder, options).traverse).traverse
     off = errors_deg(found, RING[:7])
     assert np.abs(off).max() < 1.5
-    assert np.all(np.abs(off) < 3 * np.rad2deg([frame.sigmas_rad for frame in found.frames]))
+    sigma = np.rad2deg([frame.sigmas_rad for frame in found.frames])
+    assert np.all(np.abs(off) < 3 * np.hypot(sigma, sigma[0]))
     assert np.rad2deg(found.pan_tilt_rad[0, 0]) == pytest.approx(40.0, abs=6.0)
+    np.testing.assert_allclose(np.rad2deg(found.pan_tilt_rad[5]), told[5])  # it is known well
     (warning,) = (w for w in found.warnings if "told pans disagree" in w)
     assert "frame003" in warning
 

@@ -20,7 +20,6 @@ from pancam_graph.io.plain import (
     Exif,
     PlainOptions,
     PlainTraverse,
-    is_vague,
     plain_traverse,
     read_exif,
     write_plain,
@@ -445,14 +444,14 @@ def test_pointing_that_is_not_told_is_unknown_and_so_may_be_the_focal_length(fol
         pointing = table(folder / "p.csv", *lines) if lines else None
         found = plain_traverse(folder, PlainOptions(pointing=pointing)).traverse
         assert len(found.frames) == len(found.images) == 3
-        assert all(is_vague(frame) and min(frame.sigmas_rad) >= UNKNOWN_RAD for frame in found.frames)
+        assert all(frame.is_vague and min(frame.sigmas_rad) >= UNKNOWN_RAD for frame in found.frames)
         assert found.rig.eyes[0].camera.pinhole.fx_px == 16.0
         assert found.rig.uncertainty.focal == 0.5
     of_one_frame = made(folder, "file,camera,frame", "a.png,l,x", "b.png,r,x", "c.png,l,y").traverse
     assert [image.frame for image in of_one_frame.images] == ["x", "x", "y"]
     told = made(folder, sigma_rad=np.deg2rad(5))
-    assert all(map(is_vague, told.traverse.frames))
-    assert not any(map(is_vague, made(folder).traverse.frames))
+    assert all(frame.is_vague for frame in told.traverse.frames)
+    assert not any(frame.is_vague for frame in made(folder).traverse.frames)
 
 
 def test_folders_that_are_none(folder: Path, tmp_path: Path) -> None:

@@ -99,11 +99,11 @@ def find_pointing(
 ) -> FoundPointing:
     """The traverse with pans, tilts and focal lengths from its pictures alone, stop by stop.
 
-    What the frames say of their pointing serves as gauge and as a check: of pans told to within a radian or
-    so, the median difference is taken off. Where none is told, the first frame of a stop has pan 0. The
-    pan axis is vertical in the mast frame, which tells the tilts. Rigs are taken as told within their
-    uncertainty; a focal length is replaced where the pictures know it better. Frames that nothing joins to
-    the largest group of their stop are left out with a warning.
+    Frames whose pointing is known well keep it. What the others say of theirs serves as gauge and as a check:
+    of pans told to within a radian or so, the median difference is taken off. Where none is told, the first
+    frame of a stop has pan 0. The pan axis is vertical in the mast frame, which tells the tilts. Rigs are
+    taken as told within their uncertainty; a focal length is replaced where the pictures know it better.
+    Frames that nothing joins to the largest group of their stop are left out with a warning.
 
     Raises InputError for one of several stops of which no pan is told, for a stop of which no two pictures
     share anything, for pictures that no head can have taken that pans and tilts, and as `read_pictures` does.
@@ -349,11 +349,17 @@ def _head_turns(
 def _with_groups(traverse: Traverse, groups: Sequence[_Group], warnings: list[str]) -> FoundPointing:
     frames: dict[int, Frame] = {}
     sources: list[str] = []
-    for stop, group in zip(traverse.stops, groups, strict=True):
+    for row, (stop, group) in enumerate(zip(traverse.stops, groups, strict=True)):
         told = [traverse.frames[row] for row in group.frames]
         pointed, more = _pointed(told, group)
         warnings += [f"stop {stop.id}: {sentence}" for sentence in more]
         frames |= dict(zip(group.frames.tolist(), pointed, strict=True))
+        told_well = np.flatnonzero(traverse.frame_stop == row)
+        frames |= {
+            int(k): traverse.frames[k]
+            for k in told_well
+            if k not in frames and not traverse.frames[k].is_vague
+        }
         sources.append(
             f"pointing of stop {stop.id}: {len(pointed)} frames, from {len(group.pairs)} pairs of pictures "
             f"that "
@@ -403,8 +409,7 @@ def _pointed(told: Sequence[Frame], group: _Group) -> tuple[list[Frame], list[st
     if not group.level_told:
         warnings.append(
             "the pictures look so nearly the same way that they do not tell which way the pan axis points; "
-            "the "
-            "mean tilt is taken as 0"
+            "the mean tilt is taken as 0"
         )
     wide_pan, wide_tilt = (np.hypot(_FLOOR_RAD, _SAFETY * s) for s in (sigma.pan_rad, sigma.tilt_rad))
     frames = [
@@ -415,6 +420,8 @@ def _pointed(told: Sequence[Frame], group: _Group) -> tuple[list[Frame], list[st
             sigma_pan_rad=float(sp),
             sigma_tilt_rad=float(st),
         )
+        if frame.is_vague
+        else frame
         for frame, p, t, sp, st in zip(told, pan, state.tilt_rad, wide_pan, wide_tilt, strict=True)
     ]
     return frames, warnings
@@ -453,7 +460,7 @@ def _with_rig(rig: Rig, groups: Sequence[_Group]) -> tuple[Rig, list[str]]:
             )
     if _arms_untold(rig):
         uncertainty = replace(uncertainty, mount_m=_ARM_LEFT_M, tilt_axis_m=_ARM_LEFT_M / 2)
-        for row, shift_m in enumerate(_scaled(largest.fit)):
+        for row, shift_m in enumerate(_scaled(rig, largest.fit)):
             told = eyes[row].head_T_camera
             place_m = told.translation() + shift_m
             eyes[row] = replace(eyes[row], head_T_camera=Pose3(told.rotation(), place_m))
@@ -468,8 +475,13 @@ def _with_rig(rig: Rig, groups: Sequence[_Group]) -> tuple[Rig, list[str]]:
     return replace(rig, eyes=tuple(eyes), uncertainty=uncertainty), sentences
 
 
-def _scaled(fit: HeadFit) -> FloatArray:
-    """Shifts of mounts (eyes, 3), metres, the longest of the usual length; 0 where none is sure."""
+def _scaled(rig: Rig, fit: HeadFit) -> FloatArray:
+    """Shifts of mounts (eyes, 3), metres; where no place is told, the longest is of the usual length.
+
+    0 where none is sure.
+    """
+    if any(np.any(eye.head_T_camera.translation()) for eye in rig.eyes):
+        return fit.state.shift_m
     length = np.linalg.norm(fit.state.shift_m, axis=1)
     longest = int(np.argmax(length))
     if length[longest] < _SAFETY * np.max(fit.sigma.shift_m[longest, :2]):

@@ -6,6 +6,5 @@ from pancam_graph.io.plain._options import POINTING_COLUMNS as POINTING_COLUMNS
 from pancam_graph.io.plain._options import STOP_COLUMNS as STOP_COLUMNS
 from pancam_graph.io.plain._options import PlainOptions as PlainOptions
 from pancam_graph.io.plain._plain_traverse import PlainTraverse as PlainTraverse
-from pancam_graph.io.plain._plain_traverse import is_vague as is_vague
 from pancam_graph.io.plain._plain_traverse import plain_traverse as plain_traverse
 from pancam_graph.io.plain._write import write_plain as write_plain

@@ -61,9 +61,9 @@ def made_rig(
     The table says the camera; without it, pictures of one size, camera and focal length by EXIF are of one
     eye. An eye looks forward; it is rolled as EXIF says that most of its pictures were held.
 
-    `guessed` says that a focal length may be a guess, since pictures will tell it. Raises InputError for an
-    option that makes no sense, without a focal length, and naming lines for a
-    camera whose EXIF is of two.
+    `guessed` says that focal length and arms may be guesses, since pictures will tell them. Raises InputError
+    for an option that makes no sense, without a focal length, and naming lines for a camera whose EXIF is of
+    two.
     """
     groups, left_out = _groups(pointed, table)
     up_m, forward_m, left_m = _arms_m(options)
@@ -71,7 +71,12 @@ def made_rig(
         _made_eye(name, rows, (forward_m, left_m), options, guessed=guessed) for name, rows in groups.items()
     ]
     arms_sigma_m = _arms_sigma_m(options)
-    told = "as told by --arms" if options.arms_m else "not told (--arms): all at one point"
+    told = (
+        "as told by --arms"
+        if options.arms_m
+        else "not told (--arms): all at one point; where they are not, near ground is not found where it is "
+        "looked for, and pictures without --pointing tell the arms"
+    )
     arms = (
         f"arms: tilt axis {up_m:g} m above the pan stage's origin, cameras {forward_m:g} m before and "
         f"{left_m:g} m left of the axes, +- {arms_sigma_m:g} m, {told}"
@@ -86,7 +91,10 @@ def made_rig(
     return RiggedPictures(
         rig=replace(rig, uncertainty=_uncertainty(rig, max(one.focal.sigma for one in made), arms_sigma_m)),
         pictures=tuple((row, eye_of[row.line]) for row in pointed if row.line in eye_of),
-        warnings=(*left_out, *(warning for one in made for warning in one.warnings)),
+        warnings=(
+            *left_out,
+            *(warning for one in made for warning in one.warnings),
+        ),
         sources=(*(one.source for one in made), arms),
     )
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.text import visible
-from pancam_graph.data import Frame, Traverse
+from pancam_graph.data import VAGUE_RAD, Traverse
 from pancam_graph.io.plain._eyes import RiggedPictures, told_rig
 from pancam_graph.io.plain._find_pictures import find_pictures
 from pancam_graph.io.plain._frames import frames_of
@@ -17,10 +17,8 @@ from pancam_graph.io.plain._pointing import Pointed, read_pointing, unpointed
 from pancam_graph.io.plain._stops import stops_of
 from pancam_graph.rigs import PointingSigma
 
-__all__ = ["PlainTraverse", "is_vague", "plain_traverse"]
+__all__ = ["PlainTraverse", "plain_traverse"]
 
-_VAGUE_RAD = float(np.deg2rad(2.0))
-"""Standard deviation of a pan or tilt beyond which features of pictures are not sought where it says."""
 _FEWEST_PANS = 4
 """Different pans from which a small span of them is odd."""
 
@@ -79,17 +77,12 @@ def plain_traverse(folder: Path | str, options: PlainOptions) -> PlainTraverse:
     return PlainTraverse(traverse=traverse, sources=(*rigged.sources, *_pointing_sources(options, usual)))
 
 
-def is_vague(frame: Frame) -> bool:
-    """Whether a frame's pointing is known so badly that pictures are to tell it."""
-    return max(frame.sigma_pan_rad, frame.sigma_tilt_rad) > _VAGUE_RAD
-
-
 def _is_vague(row: Pointed, options: PlainOptions) -> bool:
-    """The same of a line of the table."""
+    """Whether a picture is pointed so badly that pictures are to tell it."""
     if row.pan_rad is None:
         return True
     sigmas = [row.sigma_pan_rad, row.sigma_tilt_rad]
-    return max(options.sigma_rad or 0.0 if sigma is None else sigma for sigma in sigmas) > _VAGUE_RAD
+    return max(options.sigma_rad or 0.0 if sigma is None else sigma for sigma in sigmas) > VAGUE_RAD
 
 
 def _require_sense(options: PlainOptions) -> None:
