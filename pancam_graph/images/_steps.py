@@ -310,8 +310,9 @@ class Steps:
 
         def place() -> Arrays:
             self.tell("terrain of the stops", 0, 1)
-            # Terrain is to be found again within pixels: what of the rig is wrong changes that little.
-            solution = solve(traverse, SolveOptions(rig="held"))
+            # A rig that is off as its uncertainty says puts terrain where other stops do not see it. Fields are
+            # too small for that.
+            solution = solve(traverse, SolveOptions(field=False))
             # A solve scales all noise by one factor, and the ties' noise must be in the same unit.
             unit = np.median(observations.sigma_px / solution.sigma_px)
             self.tell("terrain of the stops", 1, 1)

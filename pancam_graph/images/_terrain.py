@@ -221,7 +221,11 @@ def terrain_arrays(solution: Solution) -> dict[str, FloatArray | IntArray]:
     sigma = _sigma_inverse_m(solution, tracks, to_point, image)
     good = (depth > 1e-3) & np.isfinite(sigma)
     world_R_mast, world_t_mast = pose_arrays(final.world_T_mast)
+    rig = solution.rig
     return {
+        "calibration": np.array([eye.camera.pinhole.calibration_matrix for eye in rig.eyes]),
+        "head_T_camera": np.array([eye.head_T_camera.matrix() for eye in rig.eyes]),
+        "pan_T_tilt": rig.pan_T_tilt.matrix(),
         "pan_tilt_rad": final.pan_tilt_rad,
         "world_R_mast": world_R_mast,
         "world_t_mast": world_t_mast,
@@ -235,12 +239,18 @@ def terrain_arrays(solution: Solution) -> dict[str, FloatArray | IntArray]:
 def terrain_from(
     traverse: Traverse,
     *,
+    calibration: FloatArray,
+    head_T_camera: FloatArray,
+    pan_T_tilt: FloatArray,
     pan_tilt_rad: FloatArray,
     world_R_mast: FloatArray,
     world_t_mast: FloatArray,
     **columns: Any,
 ) -> StopTerrain:
-    """The points that a solution of the traverse places, each with its surface; see `terrain_arrays`."""
+    """The points that a solution of the traverse places, each with its surface; see `terrain_arrays`.
+
+    Its traverse is at the solution, the rig too.
+    """
     frames = tuple(
         replace(f, pan_rad=float(pan), tilt_rad=float(tilt))
         for f, (pan, tilt) in zip(traverse.frames, pan_tilt_rad, strict=True)
@@ -249,8 +259,13 @@ def terrain_from(
         replace(s, world_T_mast=gtsam.Pose3(gtsam.Rot3(R), t))
         for s, R, t in zip(traverse.stops, world_R_mast, world_t_mast, strict=True)
     )
+    eyes = tuple(
+        replace(eye, camera=eye.camera.with_calibration(K), head_T_camera=gtsam.Pose3(mount))
+        for eye, K, mount in zip(traverse.rig.eyes, calibration, head_T_camera, strict=True)
+    )
+    rig = replace(traverse.rig, eyes=eyes, pan_T_tilt=gtsam.Pose3(pan_T_tilt))
     terrain = StopTerrain(
-        traverse=replace(traverse, frames=frames, stops=stops),
+        traverse=replace(traverse, rig=rig, frames=frames, stops=stops),
         **columns,
         slope=np.zeros((len(columns["track"]), 2)),
     )

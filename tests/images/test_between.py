@@ -120,6 +120,38 @@ def simulated() -> tuple[StopTerrain, tuple[gtsam.Pose3, ...]]:
     return terrain_from(ordered, **arrays), simulation.truth.world_T_mast
 
 
+def test_terrain_lies_where_the_estimated_rig_has_it() -> None:
+    """With the claimed rig, off as it says it may be, it is where other stops do not see it."""
+    options = SimulationOptions(
+        stops=1,
+        pans=4,
+        tilts_rad=(-0.3,),
+        points_per_image=30,
+        sweep_rad=None,
+        rig_error="drawn",
+        noise_px=0.1,
+    )
+    traverse = simulate(rig_template("mer-navcam"), options, seed=3).traverse
+    solution = solve(traverse, SolveOptions(field=False))
+    arrays: dict[str, Any] = terrain_arrays(solution)
+    terrain = terrain_from(traverse, **arrays)
+    claimed = {**arrays, **terrain_arrays(replace(solution, final=replace(solution.final, rig=None)))}
+    off = [distances(t, solution) for t in (terrain, terrain_from(traverse, **claimed))]
+    assert np.median(off[0]) < 1e-3  # the flex of frames is left out
+    assert np.median(off[1]) > 2e-3
+
+
+def distances(terrain: StopTerrain, solution: Solution) -> FloatArray:
+    """From the solution's points (n,), as shares of their range."""
+    parts = []
+    for i in np.unique(terrain.image).tolist():
+        rows = np.flatnonzero(terrain.image == i)
+        points = solution.final.landmarks_m[np.searchsorted(solution.landmark_track, terrain.track[rows])]
+        apart = np.linalg.norm(terrain.points_m(rows) - points, axis=1)
+        parts.append(apart / np.linalg.norm(points - solution.final.world_t_camera[i], axis=1))
+    return np.concatenate(parts)
+
+
 def seen_rows(terrain: StopTerrain, mast: gtsam.Pose3) -> Ties:
     """What the images of stop 1 see of the terrain of stop 0, without any error."""
     parts = []
@@ -513,6 +545,26 @@ def test_small_panoramas_place_the_second_stop(
     assert solution.converged
     assert place_error(small[0], solution) < 0.01
     assert relative_rms_rad(small[0], solution).max() < 0.15e-3
+
+
+@pytest.mark.slow
+def test_a_rig_that_is_off_costs_few_ties_between_stops(
+    small: tuple[Rendering, Traverse], small_found: Traverse
+) -> None:
+    """Stops' terrain was placed with the rig as it is claimed: other stops then had next to no ties."""
+    t = small[1]
+    left, right = t.rig.eyes
+    mount = right.head_T_camera
+    off = gtsam.Pose3(mount.rotation() * gtsam.Rot3.Expmap(np.array([2e-3, 2e-3, 0.0])), mount.translation())
+    rig = replace(t.rig, eyes=(left, replace(right, head_T_camera=off)))
+    found = find_observations(replace(t, rig=rig), QUICK)
+    assert found.matching is not None
+    assert small_found.matching is not None
+    n_ties = [sum(s.kept for s in matching.stops) for matching in (found.matching, small_found.matching)]
+    assert n_ties[0] > 0.7 * n_ties[1]
+    solution = solve(found, SolveOptions(field=False))
+    assert solution.converged
+    assert relative_rms_rad(small[0], solution).max() < 0.5e-3
 
 
 def place_error(rendering: Rendering, solution: Solution) -> float:
