@@ -186,8 +186,9 @@ class Solution:
     used: BoolArray
     """(observations,) whether each observation took part in the final least-squares stage."""
     reason: tuple[str, ...]
-    """(observations,) reason for leaving an observation out: "outlier", "single" (its track is seen once),
-    "behind" (its landmark lies behind the camera), "outside" (of its camera model's domain); "" if used."""
+    """(observations,) reason for leaving an observation out: "outlier", "single" (its track is seen once,
+    or, where cameras are variables, from one place alone), "behind" (its landmark lies behind the camera),
+    "outside" (of its camera model's domain); "" if used."""
     residual_initial_px: FloatArray
     """(observations, 2) projected minus measured at the start, raw image pixels; NaN where undefined."""
     residual_final_px: FloatArray

@@ -310,8 +310,8 @@ class Steps:
 
         def place() -> Arrays:
             self.tell("terrain of the stops", 0, 1)
-            # A rig that is off as its uncertainty says puts terrain where other stops do not see it. Fields are
-            # too small for that.
+            # A rig that is off as its uncertainty says puts terrain where other stops do not see it;
+            # fields are too small for that.
             solution = solve(traverse, SolveOptions(field=False))
             # A solve scales all noise by one factor, and the ties' noise must be in the same unit.
             unit = np.median(observations.sigma_px / solution.sigma_px)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pancam_graph.base.errors import InputError, SolveError
-from pancam_graph.base.geometry import BoolArray, IntArray
+from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.data import (
     FIXED,
     Freedom,
@@ -61,6 +61,12 @@ __all__ = [
 
 Reasons = NDArray[np.object_]
 """(observations,) why each was left out, in the words of `Solution.reason`; "" where it was not."""
+
+_FEW = 0.1
+"""Share of tracks seen from one place alone below which cameras that are variables do without them: their
+cameras' distance is no more than a flex, and which way it goes decides where such a point fits."""
+_ONE_PLACE_M = 5e-3
+"""Largest distance of two cameras that count as being at one place."""
 
 _SOLVERS: dict[Method, type[EliminatedSolver]] = {
     "joint": EliminatedSolver,
@@ -135,7 +141,8 @@ def prepare(
     template = template_for(traverse, options, replace(sharing, field=FIXED))
     solver_for(options).require(template)
     values = template.values(_first_state(traverse, start, cameras))
-    measurements, track, reason = _measure(traverse.observations, template, values)
+    few = _FEW if options.firm_tie == "soft" else 0.0
+    measurements, track, reason = _measure(traverse.observations, template, values, from_one_place=few)
     n = measurements.n_landmarks
     problem = Problem(
         template=template,
@@ -273,15 +280,22 @@ def _factors(template: FactorTemplate, values: gtsam.Values, factors: UserFactor
 
 
 def _measure(
-    observations: Observations, template: FactorTemplate, values: gtsam.Values
+    observations: Observations, template: FactorTemplate, values: gtsam.Values, *, from_one_place: float
 ) -> tuple[Measurements, IntArray, Reasons]:
     """Observations of tracks seen twice or more, the track of each landmark, and reasons.
 
-    Raises SolveError where no track is seen twice.
+    Tracks seen from one place alone are left out where their share is below `from_one_place`. Raises
+    SolveError where no track is seen twice.
     """
-    *_, valid = lines_of_sight(observations.image, observations.uv_px, template.views(values))
+    views = template.views(values)
+    *_, valid = lines_of_sight(observations.image, observations.uv_px, views)
     _, track = np.unique(observations.track, return_inverse=True)
-    single = valid & (np.bincount(track, valid)[track] < 2)
+    seen = np.bincount(track, valid)
+    centre_m = views.world_t_camera[observations.image[valid]]
+    at_one_place = (seen >= 2) & (_extent_m(centre_m, track[valid], len(seen)) < _ONE_PLACE_M)
+    if np.count_nonzero(at_one_place) >= from_one_place * np.count_nonzero(seen >= 2):
+        at_one_place[:] = False
+    single = valid & ((seen < 2) | at_one_place)[track]
     reason = np.full(len(observations), "", dtype=object)
     reason[~valid], reason[single] = "outside", "single"
     rows = np.flatnonzero(valid & ~single)
@@ -300,15 +314,30 @@ def _measure(
     return measurements, tracks[measurements.starts], reason
 
 
+def _extent_m(centre_m: FloatArray, track: IntArray, n_tracks: int) -> FloatArray:
+    """Diagonal (tracks,) of the box about all cameras (n, 3) that see each track (n,), metres.
+
+    Infinite for a track that none sees.
+    """
+    low, high = (np.full((n_tracks, 3), fill) for fill in (np.inf, -np.inf))
+    np.minimum.at(low, track, centre_m)
+    np.maximum.at(high, track, centre_m)
+    return np.asarray(np.linalg.norm(high - low, axis=1))
+
+
 def _left_out_warnings(observations: Observations, reason: Reasons) -> list[str]:
     """Warnings of observations that are no measurements."""
     warnings = []
-    single: BoolArray = reason == "single"
-    n_single = int(single.sum())
-    if n_single:
-        warnings.append(
-            f"{n_single} track{'s' if n_single != 1 else ''} seen once: left out, one ray places nothing"
-        )
+    _, times = np.unique(observations.track[reason == "single"], return_counts=True)
+    for n, text in (
+        (int(np.count_nonzero(times == 1)), "seen once: left out, one ray places nothing"),
+        (
+            int(np.count_nonzero(times > 1)),
+            "seen from one place alone: left out, free cameras make up its range",
+        ),
+    ):
+        if n:
+            warnings.append(f"{n} track{'s' if n != 1 else ''} {text}")
     n_outside = int((reason == "outside").sum())
     if n_outside:
         warnings.append(f"{n_outside} observations outside the domain of their camera model: left out")

@@ -10,6 +10,8 @@ from pancam_graph.base.errors import InputError
 from pancam_graph.graph import Model
 from pancam_graph.initialise import Start, start_from_telemetry
 from pancam_graph.rigs import mer_navcam
+from pancam_graph.simulate import Simulation
+from pancam_graph.solve import prepare
 from support.small_drives import SMALL
 from support.truth import errors_in_sigmas
 
@@ -39,6 +41,29 @@ def test_a_start_for_another_number_of_frames_is_refused() -> None:
     start = Start(world_T_mast=tuple(s.world_T_mast for s in t.stops), pan_tilt_rad=t.pan_tilt_rad[1:])
     with pytest.raises(InputError, match=r"start: pan_tilt_rad: expected shape .* found"):
         solve(t, start=start)
+
+
+def straight_down(seed: int) -> Simulation:
+    """Left eyes stand where right eyes stood half a turn before, and see the same ground."""
+    options = SimulationOptions(stops=2, spacing_m=0.5, pans=6, tilts_rad=(-np.pi / 2,))
+    return simulate(mer_navcam(), options, seed=seed)
+
+
+@pytest.mark.parametrize(("model", "left_out"), [("mast", 0), ("circle", 7)])
+def test_free_cameras_do_without_tracks_seen_from_one_place(model: Model, left_out: int) -> None:
+    prepared = prepare(straight_down(8011).traverse, SolveOptions(model=model))
+    assert np.count_nonzero(prepared.reason == "single") == 2 * left_out
+    assert any("7 tracks seen from one place" in w for w in prepared.warnings) == (left_out > 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [8008, 8011, 8013, 8014])
+def test_heads_that_look_straight_down_on_a_circle_converge(seed: int) -> None:
+    """With tracks seen from one place alone these four of twenty drives did not."""
+    simulation = straight_down(seed)
+    solution = solve(simulation.traverse, SolveOptions(model="circle"))
+    assert solution.passed
+    assert np.abs(errors_in_sigmas(simulation, solution)[0]).max() < 5
 
 
 @pytest.mark.parametrize("model", MODELS)
