@@ -39,6 +39,8 @@ EXACT = 1e-5
 """Sigma, metres or radians, that stands for 0: far below what pictures tell, and above rounding."""
 _ASYMMETRY = 1e-9
 """Largest difference of mixed entries of a covariance, as a share of its largest variance."""
+_FLATTEST = 1e-12
+"""Least eigenvalue of a correlation matrix: less is singular but for rounding."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -376,11 +378,13 @@ def _covariance(name: str, values: object, n: int) -> FloatArray:
         raise InputError(f"{name}: expected {n} x {n} numbers, found the shape {matrix.shape}")
     if not np.all(np.isfinite(matrix)):
         raise InputError(f"{name}: expected finite numbers, found NaN or infinity")
-    largest = float(np.abs(np.diag(matrix)).max())
-    if np.abs(matrix - matrix.T).max() > _ASYMMETRY * largest:
-        raise InputError(f"{name}: expected a symmetric matrix, found one that is not")
-    matrix = 0.5 * (matrix + matrix.T)
-    scale = np.sqrt(np.diag(matrix).clip(0))
-    if not scale.all() or np.linalg.eigvalsh(matrix / np.outer(scale, scale))[0] < 1e-12:
-        raise InputError(f"{name}: expected a positive definite matrix, found one that is not")
+    with np.errstate(over="ignore"):  # what overflows fails the tests below
+        largest = float(np.abs(np.diag(matrix)).max())
+        if not np.abs(matrix - matrix.T).max() <= _ASYMMETRY * largest:
+            raise InputError(f"{name}: expected a symmetric matrix, found one that is not")
+        matrix = 0.5 * (matrix + matrix.T)
+        scale = np.sqrt(np.diag(matrix).clip(1e-300))
+        scaled = matrix / scale[:, None] / scale
+        if not np.all(np.isfinite(scaled)) or np.linalg.eigvalsh(scaled)[0] < _FLATTEST:
+            raise InputError(f"{name}: expected a positive definite matrix, found one that is not")
     return matrix

@@ -138,6 +138,11 @@ class Observations:
         """Number of observations."""
         return len(self.image)
 
+    @cached_property
+    def tracks(self) -> frozenset[int]:
+        """Numbers of the tracks that occur."""
+        return frozenset(np.unique(self.track).tolist())
+
     @property
     def noise(self) -> PixelNoise:
         """Noise of the observations, which decides their weight."""
@@ -292,7 +297,7 @@ class Traverse:
             return known.get(landmark)
         if isinstance(landmark, int | np.integer) or landmark.isdecimal():
             track = int(landmark)
-            if self.observations is not None and np.any(self.observations.track == track):
+            if self.observations is not None and track in self.observations.tracks:
                 return track
             found = (
                 f"{landmark}, which no observation has"

@@ -11,7 +11,7 @@ from pancam_graph.elimination._panels import FreeDirectionError as FreeDirection
 from pancam_graph.elimination._panels import Panels as Panels
 from pancam_graph.elimination._panels import Root as Root
 from pancam_graph.elimination._panels import pattern as pattern
-from pancam_graph.elimination._row_spread import row_spread as row_spread
+from pancam_graph.elimination._row_spread import RowSpread as RowSpread
 from pancam_graph.elimination._system import LandmarkSystem as LandmarkSystem
 from pancam_graph.elimination._system import Room as Room
 from pancam_graph.elimination._with_rows import Rows as Rows

@@ -18,7 +18,7 @@ from pancam_graph.data import (
     StopPose,
     VerdictTest,
 )
-from pancam_graph.elimination import Covariance, row_spread
+from pancam_graph.elimination import Covariance, RowSpread
 from pancam_graph.graph import Kind, key_of
 from pancam_graph.landmarks import CameraViews, Landmarks, Measurements, evaluate, residuals
 from pancam_graph.solve._chances import CHANCE, rms_limit
@@ -118,6 +118,7 @@ def _of_landmarks(
     landmarks, views = problem.landmarks.of(ties.landmark[which]), problem.views_of_all
     residual, b, _ = evaluate(landmarks, alone, views)
     by_place = _by_place(landmarks, alone, views)
+    spreads = RowSpread(reduced.system, covariance)
     number = np.searchsorted(reduced.rows, ties.landmark[which])
     for constraint in dict.fromkeys(ties.constraint.tolist()):
         rows = np.flatnonzero(ties.constraint[which] == constraint)
@@ -136,7 +137,7 @@ def _of_landmarks(
         spread: FloatArray | None = None
         # Without the constraint nothing may join the landmark and the stop.
         if not (template.let_go.constraints[constraint] and moves):
-            spread = row_spread(reduced.system, int(number[rows[0]]), B, moves, covariance)
+            spread = spreads.of(int(number[rows[0]]), B, moves)
         yield _test(problem, constraint, r, r / weight[told], spread)
 
 

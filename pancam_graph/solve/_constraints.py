@@ -9,6 +9,7 @@ import numpy as np
 
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import IntArray
+from pancam_graph.cameras import Sensor
 from pancam_graph.data import Traverse
 from pancam_graph.graph import HardTemplate, Sensors, check_given, stop_constraints
 from pancam_graph.landmarks import Landmarks
@@ -19,7 +20,7 @@ from pancam_graph.solve._ties import ties_of
 __all__ = ["constrained", "require_constraints"]
 
 _IN_FRONT = 1e-3
-"""Inverse distance, 1/m, at which a tied landmark starts that is beyond infinity, where it has no place."""
+"""Inverse distance, 1/m, at which a landmark of known coordinates starts that is at infinity or beyond."""
 
 
 def require_constraints(traverse: Traverse, options: SolveOptions, problem: Problem) -> None:
@@ -59,7 +60,7 @@ def constrained(problem: Problem) -> Problem:
         problem,
         template=template.sensing(Sensors.of(sights)),
         ties=ties,
-        landmarks=_in_front(problem.landmarks, ties.landmark),
+        landmarks=_in_front(problem.landmarks, ties.landmark[[s.kind is Sensor.COORDINATES for s in sights]]),
     )
 
 

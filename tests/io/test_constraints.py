@@ -26,6 +26,7 @@ from pancam_graph.data import (
     StopPose,
     StopPosition,
 )
+from support.fuzzing import dumped, mutated_bytes, mutated_tree, outcome
 from support.small_drives import simulated
 
 S0, S1 = "stop0000", "stop0001"
@@ -208,3 +209,28 @@ def test_a_wrong_cell_of_points_is_named(name: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=sentence) as raised:
         read_traverse(tmp_path)
     assert "points.csv" in str(raised.value)
+
+
+def damaged(folder: Path, seeds: range) -> set[str]:
+    """What reading says of a folder whose constraints, or table of points, are damaged."""
+    write_traverse(sample(), folder)
+    content, table = json.loads((folder / "traverse.json").read_text()), (folder / "points.csv").read_text()
+    said = set()
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        changed = {**content, "constraints": mutated_tree(rng, content["constraints"])}
+        (folder / "traverse.json").write_bytes(dumped(changed if seed % 3 else content))
+        (folder / "points.csv").write_bytes(
+            mutated_bytes(rng, table.encode()) if seed % 3 == 0 else table.encode()
+        )
+        said.add(outcome(lambda: read_traverse(folder), folder))
+    return said
+
+
+def test_damaged_constraints_end_in_a_result_or_one_sentence(tmp_path: Path) -> None:
+    assert len(damaged(tmp_path, range(15))) > 5
+
+
+@pytest.mark.slow
+def test_hundreds_of_damaged_constraints_end_in_a_result_or_one_sentence(tmp_path: Path) -> None:
+    assert len(damaged(tmp_path, range(100, 700))) > 50
