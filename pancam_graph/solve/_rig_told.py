@@ -87,7 +87,9 @@ def rig_told(problem: Problem) -> RigTold | None:
             wide[quantity] = Freedom(scope=some[0].scope, free=tuple(free))
     if not wide:
         return None
-    part = part_of(problem, replace(own, **wide))
+    # Priors of what was held are the default ones, each by itself: `without_priors` takes them off again.
+    covariance = own.covariance if own.any_free else None
+    part = part_of(problem, replace(own, covariance=covariance, **wide))
     rig, link = part.template.rig_variables, part.template.linkage
     information, gradient = reduced_to_rig(part).root.last_information()
     column = {
