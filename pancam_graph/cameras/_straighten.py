@@ -97,17 +97,21 @@ def _at_pinhole(
     return np.where(valid[:, None], carried, uv_px), forward, valid
 
 
-def straightening_map(camera: Camera, straight: Pinhole, range_m: float) -> FloatArray | None:
+def straightening_map(
+    camera: Camera, straight: Pinhole, range_m: float, camera_R_straight: FloatArray | None = None
+) -> FloatArray | None:
     """Where the centres of a straightened image's pixels lie on the camera's own image.
 
+    `camera_R_straight` (3, 3) turns the pinhole against the camera, as rectification does; None: not turned.
     Pixels (height, width, 2) of the camera's image, NaN where it has none; None where all are where they
     were, within a millionth of a pixel: nothing to resample. Between every eighth pixel a cubic spline.
     """
     w, h = straight.width_px, straight.height_px
-    if camera == straight:
+    turn = np.eye(3) if camera_R_straight is None else camera_R_straight
+    if camera == straight and np.array_equal(turn, np.eye(3)):
         return None
     columns, rows = (np.unique(np.append(np.arange(0, n, _GRID_PX), n - 1)) for n in (w, h))
-    coarse = _looked_up(camera, straight, columns, rows, range_m)
+    coarse = _looked_up(camera, straight, columns, rows, range_m, turn)
     if np.isfinite(coarse).all() and len(columns) > 3 and len(rows) > 3:
         out = np.empty((h, w, 2))
         for axis in (0, 1):
@@ -115,7 +119,7 @@ def straightening_map(camera: Camera, straight: Pinhole, range_m: float) -> Floa
                 np.arange(h), np.arange(w)
             )
     else:  # no spline across the edge of the model's domain
-        out = _looked_up(camera, straight, np.arange(w), np.arange(h), range_m)
+        out = _looked_up(camera, straight, np.arange(w), np.arange(h), range_m, turn)
     same = (w, h) == (camera.width_px, camera.height_px) and bool(
         np.all(np.abs(out - _grid(np.arange(w), np.arange(h))) < _ROUNDING_PX)
     )
@@ -127,7 +131,12 @@ def _grid(columns: IntArray, rows: IntArray) -> FloatArray:
 
 
 def _looked_up(
-    camera: Camera, straight: Pinhole, columns: IntArray, rows: IntArray, range_m: float
+    camera: Camera,
+    straight: Pinhole,
+    columns: IntArray,
+    rows: IntArray,
+    range_m: float,
+    camera_R_straight: FloatArray,
 ) -> FloatArray:
     """Pixels (rows, columns, 2) of the camera's image where the pinhole sees points at a range; NaN: none."""
     out = np.empty((len(rows), len(columns), 2))
@@ -135,9 +144,11 @@ def _looked_up(
     for begin in range(0, len(rows), step):
         grid = _grid(columns, rows[begin : begin + step])
         uv = grid.reshape(-1, 2)
-        pixels, valid = camera.project(range_m * straight.unproject(uv).direction)
+        points = range_m * straight.unproject(uv).direction @ camera_R_straight.T
+        pixels, valid = camera.project(points)
         # Where a lens folds back, a direction may get a pixel whose own line of sight is another.
-        again, _, known = straight_pixels(camera, straight, pixels, np.full(len(uv), range_m))
-        valid &= known & (np.linalg.norm(again - uv, axis=1) < _AGAIN_PX)
+        rays = camera.unproject(pixels)
+        off = np.cross(points - rays.origin_m, rays.direction)
+        valid &= rays.valid & (np.linalg.norm(off, axis=1) * straight.fx_px < _AGAIN_PX * range_m)
         out[begin : begin + step] = np.where(valid[:, None], pixels, np.nan).reshape(grid.shape)
     return out

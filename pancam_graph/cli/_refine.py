@@ -136,6 +136,12 @@ def _add_options(parser: CommandParser) -> None:
         action=Flag,
         help="write mosaics of each stop before and after too, around the horizon and from above",
     )
+    add(
+        "--terrain",
+        action=Flag,
+        help="write heights, an orthoimage, a mesh and a cloud of the ground that stereo frames see; needs "
+        "the extra: pip install 'pancam-graph[terrain]'",
+    )
     add("--csv", action=Flag, help="write residuals.csv too, a line for each observation")
     add("--report", action=Flag, default=True, help="write report.html (default)")
 
@@ -164,6 +170,10 @@ def _work(call: Invocation) -> int:
     options = SolveOptions(**chosen, sharing=sharing, landmark_covariances=True)
 
     begin = time.perf_counter()
+    if arguments.terrain:
+        from pancam_graph.terrain import require_extra
+
+        require_extra()
     check_out(arguments.out)
     with progress.shown(f"reading {arguments.folder}"), resumable(arguments.out):
         traverse = read_input(arguments.folder)
@@ -206,6 +216,10 @@ def _work(call: Invocation) -> int:
             from pancam_graph.mosaic import MosaicOptions
 
             results["mosaics"] = MosaicOptions()
+        if arguments.terrain:
+            from pancam_graph.terrain import TerrainOptions
+
+            results["terrain"] = TerrainOptions()
         solution = write_results(solution, arguments.out, **results, progress=progress.counted)
     print_summary(solution, str(arguments.out), quiet=arguments.quiet)
     return 0 if solution.passed else 1

@@ -10,9 +10,10 @@ from pancam_graph.cli._init import INIT
 from pancam_graph.cli._refine import REFINE
 from pancam_graph.cli._render import RENDER
 from pancam_graph.cli._simulate import SIMULATE
+from pancam_graph.cli._terrain import TERRAIN
 
 __all__ = ["COMMANDS"]
 
 COMMANDS: Mapping[str, Command] = {
-    c.name: c for c in (REFINE, INIT, CHECK, SIMULATE, RENDER, DRIVE, COMPLETION)
+    c.name: c for c in (REFINE, INIT, CHECK, TERRAIN, SIMULATE, RENDER, DRIVE, COMPLETION)
 }

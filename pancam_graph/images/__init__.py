@@ -11,6 +11,9 @@ from pancam_graph.images._cache_folder import cache_folder as cache_folder
 from pancam_graph.images._cache_folder import is_cache as is_cache
 
 if TYPE_CHECKING:
+    from pancam_graph.images._evening import Evening as Evening
+    from pancam_graph.images._evening import Small as Small
+    from pancam_graph.images._evening import even_out as even_out
     from pancam_graph.images._front_end import find_masks as find_masks
     from pancam_graph.images._front_end import find_observations as find_observations
     from pancam_graph.images._front_end_options import FrontEndOptions as FrontEndOptions
@@ -21,6 +24,9 @@ if TYPE_CHECKING:
     from pancam_graph.images.pointing import find_pointing as find_pointing
 else:
     _LATE = {
+        "Evening": "_evening",
+        "Small": "_evening",
+        "even_out": "_evening",
         "find_masks": "_front_end",
         "find_observations": "_front_end",
         "FrontEndOptions": "_front_end_options",

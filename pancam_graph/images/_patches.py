@@ -7,19 +7,19 @@ spline coefficients.
 """
 
 import math
-from typing import TypeAlias
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pancam_graph.base.compiled import entry, inlined, part
+from pancam_graph.base import splines
+from pancam_graph.base.compiled import Compiling, inlined, part
 from pancam_graph.base.geometry import FloatArray, IntArray
+from pancam_graph.base.splines import Coefficients, spline_at
 from pancam_graph.images._local_map import HALF_WIDTH_PX
 
 __all__ = ["MAX_REACH_PX", "QUALITIES", "Coefficients", "align_patches"]
 
-Coefficients: TypeAlias = NDArray[np.float32]
-"""Coefficients (height, width) of cubic splines."""
+_entry = Compiling(parts_from=(Path(splines.__file__).parent,)).entry
 
 MAX_REACH_PX = 12
 """The furthest that a search goes along u or v of image a."""
@@ -33,31 +33,6 @@ _CONVERGED_PX = 0.01
 _MAX_STEP_PX = 1.0
 _MAX_AFFINE_STEP = 0.1
 _SAME_PEAK_PX = 2
-
-
-@part
-def _at(coefficients: Coefficients, u: float, v: float) -> float:
-    """Brightness at a pixel; outside the image, that of the nearest pixel inside."""
-    height, width = coefficients.shape
-    u = min(max(u, 0.0), width - 1.0)
-    v = min(max(v, 0.0), height - 1.0)
-    i, j = math.floor(u), math.floor(v)
-    x, y = u - i, v - j
-    a0, a3 = (1 - x) ** 3 / 6, x**3 / 6
-    a1, a2 = 2 / 3 - x * x + x**3 / 2, 2 / 3 - (1 - x) ** 2 + (1 - x) ** 3 / 2
-    b0, b3 = (1 - y) ** 3 / 6, y**3 / 6
-    b1, b2 = 2 / 3 - y * y + y**3 / 2, 2 / 3 - (1 - y) ** 2 + (1 - y) ** 3 / 2
-    # Beyond the edge the coefficients are mirrored.
-    i0, i2, i3 = abs(i - 1), min(i + 1, 2 * width - 3 - i), min(i + 2, 2 * width - 4 - i)
-    value = 0.0
-    for k in range(4):
-        row = abs(j - 1 + k)
-        if row > height - 1:
-            row = 2 * height - 2 - row
-        b = b0 if k == 0 else b1 if k == 1 else b2 if k == 2 else b3
-        c = coefficients[row]
-        value += b * (a0 * c[i0] + a1 * c[i] + a2 * c[i2] + a3 * c[i3])
-    return value
 
 
 @part
@@ -93,7 +68,7 @@ def _search(
     for j in range(_SIDE + 2 * ry):
         for i in range(_SIDE + 2 * rx):
             du, dv = i - HALF_WIDTH_PX - rx, j - HALF_WIDTH_PX - ry
-            around[j, i] = _at(image_b, x + m00 * du + m01 * dv, y + m10 * du + m11 * dv)
+            around[j, i] = spline_at(image_b, x + m00 * du + m01 * dv, y + m10 * du + m11 * dv)
     best, best_i, best_j = -2.0, rx, ry
     for j in range(2 * ry + 1):
         for i in range(2 * rx + 1):
@@ -135,8 +110,8 @@ def _differentiate(
     determinant = m00 * m11 - m01 * m10
     for k in range(len(weight)):
         pu, pv = u + offset[k, 0], v + offset[k, 1]
-        gu = (_at(image_a, pu + 0.5, pv) - _at(image_a, pu - 0.5, pv)) / contrast
-        gv = (_at(image_a, pu, pv + 0.5) - _at(image_a, pu, pv - 0.5)) / contrast
+        gu = (spline_at(image_a, pu + 0.5, pv) - spline_at(image_a, pu - 0.5, pv)) / contrast
+        gv = (spline_at(image_a, pu, pv + 0.5) - spline_at(image_a, pu, pv - 0.5)) / contrast
         gx, gy = (gu * m11 - gv * m10) / determinant, (gv * m00 - gu * m01) / determinant
         jacobian[k] = (
             gx,
@@ -183,7 +158,7 @@ def _invert(normal: FloatArray, inverse: FloatArray) -> None:
             inverse[r, c] = inverse[c, r] = value
 
 
-@entry
+@_entry
 def align_patches(
     first: int,
     last: int,
@@ -223,7 +198,7 @@ def align_patches(
     for row in range(first, last):
         u, v = uv_a[row]
         for k in range(n_taps):
-            template[k] = _at(image_a, u + offset[k, 0], v + offset[k, 1])
+            template[k] = spline_at(image_a, u + offset[k, 0], v + offset[k, 1])
         contrast = _standardise(template, weight)
         m00, m01, m10, m11 = affine[row, 0, 0], affine[row, 0, 1], affine[row, 1, 0], affine[row, 1, 1]
         for k in range(n_taps):
@@ -258,7 +233,7 @@ def align_patches(
         for step in range(steps + 1):
             for k in range(n_taps):
                 du, dv = offset[k, 0], offset[k, 1]
-                patch[k] = _at(
+                patch[k] = spline_at(
                     image_b, x + m00 * du + m01 * dv + bent[k, 0], y + m10 * du + m11 * dv + bent[k, 1]
                 )
             _standardise(patch, weight)

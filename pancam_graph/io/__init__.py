@@ -7,11 +7,13 @@ from pancam_graph.io._camera_entry import CameraEntry as CameraEntry
 from pancam_graph.io._camera_entry import camera_entry as camera_entry
 from pancam_graph.io._entries import MOSAIC_FORMAT as MOSAIC_FORMAT
 from pancam_graph.io._entries import SOLUTION_FORMAT as SOLUTION_FORMAT
+from pancam_graph.io._entries import TERRAIN_FORMAT as TERRAIN_FORMAT
 from pancam_graph.io._entries import VERSION as VERSION
 from pancam_graph.io._entries import Entry as Entry
 from pancam_graph.io._entries import Label as Label
 from pancam_graph.io._entries import PoseEntry as PoseEntry
 from pancam_graph.io._entries import SparseEntry as SparseEntry
+from pancam_graph.io._entries import Text as Text
 from pancam_graph.io._image_files import GreyImage as GreyImage
 from pancam_graph.io._image_files import read_image as read_image
 from pancam_graph.io._inputs import read_input as read_input

@@ -16,6 +16,7 @@ __all__ = [
     "MOSAIC_FORMAT",
     "RIG_FORMAT",
     "SOLUTION_FORMAT",
+    "TERRAIN_FORMAT",
     "TRAVERSE_FORMAT",
     "VERSION",
     "Entry",
@@ -29,6 +30,7 @@ TRAVERSE_FORMAT = "pancam-graph/traverse"
 RIG_FORMAT = "pancam-graph/rig"
 SOLUTION_FORMAT = "pancam-graph/solution"
 MOSAIC_FORMAT = "pancam-graph/mosaics"
+TERRAIN_FORMAT = "pancam-graph/terrain"
 VERSION = 1
 
 Text = Annotated[str, Field(min_length=0)]

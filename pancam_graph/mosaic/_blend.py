@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pancam_graph.base.geometry import FloatArray
-from pancam_graph.mosaic._evening import Evening, Small, even_out
+from pancam_graph.images import Evening, Small, even_out
 from pancam_graph.mosaic._warp import Layer
 
 __all__ = ["Look", "blend", "choose_look"]
@@ -58,7 +58,7 @@ def choose_look(
     while area / shrink**2 > _SEAM_PIXELS and shrink < 8:
         shrink *= 2
     brightest = max(float(np.quantile(_some(layer.grey, layer.valid), 0.999)) for _, layer in layers)
-    small = [Small.of(number, layer, shrink, 250.0 / max(brightest, 1e-6)) for number, layer in layers]
+    small = [_small(number, layer, shrink, 250.0 / max(brightest, 1e-6)) for number, layer in layers]
     evening = evening or even_out(small)
     labels = _labels(layers, small, evening, (height_px, width_px))
     shown = np.concatenate(
@@ -78,6 +78,29 @@ def choose_look(
 def _some(grey: NDArray[np.float32], wanted: NDArray[np.bool_]) -> FloatArray:
     """Brightness of some pixels, every fourth of every fourth row."""
     return np.asarray(grey[::4, ::4][wanted[::4, ::4]], dtype=np.float64)
+
+
+def _small(number: int, layer: Layer, shrink: int, scale: float) -> Small:
+    """A layer, `shrink` times smaller, its brightness multiplied with `scale`."""
+    height, width = (-(-n // shrink) for n in layer.grey.shape)
+    pad = (0, height * shrink - layer.grey.shape[0], 0, width * shrink - layer.grey.shape[1])
+    bands = []
+    for band, border in (
+        (layer.grey * np.float32(scale), cv2.BORDER_REPLICATE),
+        (layer.chosen.astype(np.float32), cv2.BORDER_CONSTANT),
+        (layer.radius_squared.astype(np.float32), cv2.BORDER_REPLICATE),
+    ):
+        padded = cv2.copyMakeBorder(band, *pad, border)
+        bands.append(cv2.resize(padded, (width, height), interpolation=cv2.INTER_AREA))
+    grey, chosen, radius_squared = (np.asarray(b, dtype=np.float32) for b in bands)
+    return Small(
+        number=number,
+        left_px=layer.left_px // shrink,
+        top_px=layer.top_px // shrink,
+        grey=grey,
+        chosen=np.asarray(chosen > 1 - 1e-4),
+        radius_squared=radius_squared,
+    )
 
 
 def _evened(number: int, layer: Layer, evening: Evening) -> NDArray[np.float32]:

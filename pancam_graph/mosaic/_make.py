@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.data import Solution
+from pancam_graph.images import Evening
 from pancam_graph.io import same_pictures
 from pancam_graph.mosaic._blend import blend, choose_look
-from pancam_graph.mosaic._evening import Evening
 from pancam_graph.mosaic._mosaic_options import MosaicOptions
 from pancam_graph.mosaic._placed import (
     POINTINGS,

@@ -1,4 +1,10 @@
-"""The results folder: every file that an adjustment writes."""
+"""The results folder: every file that an adjustment writes.
+
+What reads and writes terrain is imported when it is asked for: a solve needs no OpenCV.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
 
 from pancam_graph.results._camera_models import write_cameras as write_cameras
 from pancam_graph.results._colmap import write_colmap as write_colmap
@@ -11,3 +17,15 @@ from pancam_graph.results._rig import calibrated_rig as calibrated_rig
 from pancam_graph.results._rig import write_rig as write_rig
 from pancam_graph.results._solution_json import SolutionFile as SolutionFile
 from pancam_graph.results._solution_json import read_solution_json as read_solution_json
+
+if TYPE_CHECKING:
+    from pancam_graph.results._refined_drive import read_drive as read_drive
+    from pancam_graph.results._terrain import write_terrain_of as write_terrain_of
+else:
+    _LATE = {"read_drive": "_refined_drive", "write_terrain_of": "_terrain"}
+
+    def __getattr__(name: str) -> object:
+        if name not in _LATE:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        value = globals()[name] = getattr(import_module(f"{__name__}.{_LATE[name]}"), name)
+        return value

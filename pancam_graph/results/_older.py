@@ -5,10 +5,22 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pancam_graph.base.errors import InputError
-from pancam_graph.io import MOSAIC_FORMAT, SOLUTION_FORMAT, VERSION, read_json
+from pancam_graph.io import MOSAIC_FORMAT, SOLUTION_FORMAT, TERRAIN_FORMAT, VERSION, read_json
 from pancam_graph.results._exported import require_export
 
-__all__ = ["EXPORT_FOLDER", "MOSAIC_FOLDER", "ONE_FILE", "SOLUTION_FILE", "Older"]
+__all__ = [
+    "EXPORT_FOLDER",
+    "MOSAIC_FOLDER",
+    "ONE_FILE",
+    "SOLUTION_FILE",
+    "TERRAIN",
+    "TERRAIN_FOLDER",
+    "Older",
+]
+
+
+TERRAIN = "terrain"
+"""Name of the output that may also be added to older results."""
 
 
 def _nothing(path: Path, expected: str) -> None:
@@ -59,6 +71,27 @@ def _no_mosaics(folder: Path) -> list[str]:
     return [f"{folder.name}/{n}" for n in names if n not in known or not (folder / n).is_file()]
 
 
+def _no_terrain(folder: Path) -> list[str]:
+    """Files in a folder, and in its folders, that its index does not know; all where there is no index."""
+    from pancam_graph.terrain import TERRAIN_INDEX  # noqa: PLC0415  it imports OpenCV
+
+    if folder.is_symlink() or not folder.is_dir():
+        return [f"{folder.name}/"]
+    try:
+        index = read_json(folder / TERRAIN_INDEX, TERRAIN_FORMAT, VERSION)
+    except InputError:
+        known = set[str]()
+    else:
+        known = {TERRAIN_INDEX}
+        for entry in index["products"] if isinstance(index.get("products"), list) else []:
+            files = entry.get("files") if isinstance(entry, dict) else None
+            known |= {f for f in files.values() if isinstance(f, str)} if isinstance(files, dict) else set()
+    found = sorted(p for p in folder.rglob("*") if p.is_symlink() or not p.is_dir())
+    names = [p.relative_to(folder).as_posix() for p in found]
+    # GDAL, and so QGIS, keeps statistics of a raster beside it.
+    return [f"{folder.name}/{n}" for n in names if n.removesuffix(".aux.xml") not in known]
+
+
 ONE_FILE = Older(strangers=_not_a_file)
 """A file of any content."""
 SOLUTION_FILE = Older(strangers=_not_a_file, require=_require_solution)
@@ -66,3 +99,5 @@ EXPORT_FOLDER = Older(strangers=_not_a_folder, is_folder=True, require=require_e
 """A folder that lists its own files in `export.json`."""
 MOSAIC_FOLDER = Older(strangers=_no_mosaics, is_folder=True)
 """A folder that lists its own files in its index."""
+TERRAIN_FOLDER = Older(strangers=_no_terrain, is_folder=True)
+"""A folder that lists its own files, and those of its folders, in its index."""

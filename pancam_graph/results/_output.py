@@ -11,6 +11,7 @@ from pancam_graph.results._older import ONE_FILE, Older
 if TYPE_CHECKING:  # these import OpenCV, and names of outputs must be cheap
     from pancam_graph.mosaic import MosaicOptions, WrittenMosaics
     from pancam_graph.results._brightness import Brightness
+    from pancam_graph.terrain import TerrainOptions
 
 __all__ = ["Output", "OutputWriter", "Written"]
 
@@ -24,6 +25,10 @@ class Written:
     brightness: "Brightness"
     mosaic_options: "MosaicOptions | None"
     """How mosaics are drawn; None: none are written."""
+    terrain_options: "TerrainOptions | None"
+    """How terrain is made; None: none is written."""
+    out: Path
+    """Where all will be once it is complete."""
     progress: Callable[[str, int, int], None] | None
     """Told of a stage, how many of its parts are done, and how many there are."""
     seconds: Callable[[], float]
@@ -53,7 +58,7 @@ class Output:
 
     name: str
     """Name of the file or folder; an export is asked for by this name."""
-    when: Literal["always", "report", "csv", "mosaics", "export"]
+    when: Literal["always", "report", "csv", "mosaics", "terrain", "export"]
     """The option with which it is written."""
     writer: Callable[[], OutputWriter]
     """Imports the module that writes it and returns its writer; names and choices are listed without."""

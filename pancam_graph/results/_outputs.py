@@ -11,7 +11,7 @@ from collections.abc import Iterable
 
 from pancam_graph.base.errors import InputError
 from pancam_graph.data import Traverse
-from pancam_graph.results._older import EXPORT_FOLDER, MOSAIC_FOLDER, SOLUTION_FILE
+from pancam_graph.results._older import EXPORT_FOLDER, MOSAIC_FOLDER, SOLUTION_FILE, TERRAIN, TERRAIN_FOLDER
 from pancam_graph.results._output import Output, OutputWriter
 
 __all__ = ["EXPORTS", "OUTPUTS", "SOLUTION", "check_exports"]
@@ -62,6 +62,12 @@ def _mosaics() -> OutputWriter:
     return MOSAICS
 
 
+def _terrain() -> OutputWriter:
+    from pancam_graph.results._terrain import TERRAIN_WRITER
+
+    return TERRAIN_WRITER
+
+
 def _report() -> OutputWriter:
     from pancam_graph.results._report import REPORT
 
@@ -100,6 +106,7 @@ OUTPUTS = (
     Output(name="residuals.npz", when="always", writer=_residuals),
     Output(name="residuals.csv", when="csv", writer=_residuals_csv),
     Output(name="mosaics", when="mosaics", writer=_mosaics, older=MOSAIC_FOLDER),
+    Output(name=TERRAIN, when="terrain", writer=_terrain, older=TERRAIN_FOLDER),
     Output(name="report.html", when="report", writer=_report),
     # Last: it says how long the others took, and what they warned of.
     Output(name=SOLUTION, when="always", writer=_solution, older=SOLUTION_FILE),

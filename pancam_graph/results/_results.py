@@ -12,11 +12,13 @@ from pancam_graph.data import Solution
 from pancam_graph.images import CACHE, is_cache
 from pancam_graph.io import refused_by_schema
 from pancam_graph.results._brightness import brightness_of
+from pancam_graph.results._older import TERRAIN
 from pancam_graph.results._output import Written
 from pancam_graph.results._outputs import OUTPUTS, SOLUTION, check_exports
 
 if TYPE_CHECKING:
     from pancam_graph.mosaic import MosaicOptions
+    from pancam_graph.terrain import TerrainOptions
 
 __all__ = ["check_out", "recover_results", "write_results"]
 
@@ -63,6 +65,8 @@ def recover_results(out: Path | str) -> None:
     Does nothing for a folder that no killed run wrote to.
     """
     recover(Path(out), keep=CACHE)
+    if Path(out).is_dir():
+        recover(Path(out) / TERRAIN)
 
 
 def write_results(
@@ -73,21 +77,28 @@ def write_results(
     csv: bool = False,
     exports: Sequence[str] = (),
     mosaics: "MosaicOptions | None" = None,
+    terrain: "TerrainOptions | None" = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Solution:
     """Write the results of a solution into the folder `out`: all `OUTPUTS` that are asked for.
 
     Everything is written into a folder beside and renamed when complete: an older folder of results stays
     whole until then, and is there as before if anything fails. `csv`: whether residuals are written as CSV
-    too. `exports` are names of `EXPORTS`. With options of `mosaics`, a folder of them is among the results;
-    `progress` is told of each. Returns the solution with the time that writing took as its `seconds.report`,
-    and with warnings of images that the mosaics lack.
+    too. `exports` are names of `EXPORTS`. With options of `mosaics` and of `terrain`, folders of them are
+    among the results; `progress` is told of each. Returns the solution with the time that writing took as its
+    `seconds.report`, and with warnings of images that mosaics and terrain lack, or why there is no terrain.
     Raises InputError as `check_out` and `check_exports` do, and where writing fails.
     """
     out = Path(out)
     check_out(out)
     exports = check_exports(solution.traverse, exports)
-    asked = {"always": True, "report": report, "csv": csv, "mosaics": mosaics is not None}
+    asked = {
+        "always": True,
+        "report": report,
+        "csv": csv,
+        "mosaics": mosaics is not None,
+        "terrain": terrain is not None,
+    }
     chosen = [o for o in OUTPUTS if asked.get(o.when, o.name in exports)]
     started = time.perf_counter()
     try:
@@ -96,6 +107,8 @@ def write_results(
                 solution=solution,
                 brightness=brightness_of(solution),
                 mosaic_options=mosaics,
+                terrain_options=terrain,
+                out=out,
                 progress=progress,
                 seconds=lambda: time.perf_counter() - started,
             )

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
@@ -31,6 +32,7 @@ from pancam_graph.io import (
     Label,
     PoseEntry,
     SparseEntry,
+    Text,
     camera_entry,
     read_json,
     validated,
@@ -220,6 +222,8 @@ class SolutionFile(Entry):
     fields: list[FieldEntry] = Field(default_factory=list)
     """Of each eye of the rig; no such key where none was free."""
     warnings: list[str]
+    folder: Text | None = None
+    """The folder that was refined, relative to that of the results; the key is missing without one."""
     cross_validation: CrossValidationEntry | None = None
     """Where it was asked for; else the key is missing."""
     incremental: IncrementalEntry | None = None
@@ -232,18 +236,22 @@ def read_solution_json(path: Path | str) -> SolutionFile:
     return validated(SolutionFile, read_json(path, SOLUTION_FORMAT, VERSION), path)
 
 
-def solution_json(solution: Solution) -> bytes:
-    """A solution as the content of `solution.json`; null in place of what is not finite."""
+def solution_json(solution: Solution, out: Path | None = None) -> bytes:
+    """A solution as the content of `solution.json`; null in place of what is not finite.
+
+    `out` is the folder of results, from which the way to the pictures is told.
+    """
     missing = {
         "method": solution.method == "joint",
         "verdict": solution.verdict is None,
         "rig": solution.treatment is None,
         "refined": not solution.refined,
         "fields": not any(isinstance(eye.camera, FieldCamera) for eye in solution.rig.eyes),
+        "folder": out is None or solution.traverse.folder is None,
         "cross_validation": solution.cross_validation is None,
         "incremental": solution.incremental is None,
     }
-    data = solution_file(solution).model_dump(exclude={name for name, gone in missing.items() if gone})
+    data = solution_file(solution, out).model_dump(exclude={name for name, gone in missing.items() if gone})
     entries = ",\n".join(f"{_compact(name)}: {_by_line(value)}" for name, value in data.items())
     return f"{{\n{entries}\n}}\n".encode()
 
@@ -258,8 +266,8 @@ def _by_line(value: object) -> str:
 _compact = json.JSONEncoder(allow_nan=False, ensure_ascii=False).encode
 
 
-def solution_file(solution: Solution) -> SolutionFile:
-    """A solution as the model of its file."""
+def solution_file(solution: Solution, out: Path | None = None) -> SolutionFile:
+    """A solution as the model of its file; see `solution_json`."""
     traverse, final = solution.traverse, solution.final
     stops = [
         SolvedStopEntry(id=stop.id, world_T_mast=_pose(pose), covariance=_covariance(covariance))
@@ -332,10 +340,20 @@ def solution_file(solution: Solution) -> SolutionFile:
         fields=_fields(solution),
         # Warnings of the reader come first, and once, also where the solver passed them on.
         warnings=list(dict.fromkeys([*traverse.warnings, *solution.warnings])),
+        folder=None if out is None or traverse.folder is None else _way(traverse.folder, out),
         method=solution.method,
         cross_validation=None if validation is None else CrossValidationEntry.of(validation, traverse),
         incremental=None if solution.incremental is None else IncrementalEntry.of(solution.incremental),
     )
+
+
+def _way(folder: Path, out: Path) -> str:
+    """The way from one folder to another; whole where there is none, as between drives of Windows."""
+    try:
+        way = os.path.relpath(folder.resolve(), out.resolve())
+    except ValueError:
+        way = str(folder.resolve())
+    return way.encode(errors="replace").decode()
 
 
 def _flex_of_frame(solution: Solution, row: int, flex: tuple[Flex, ...]) -> dict[str, float] | None:
@@ -396,7 +414,7 @@ def _covariance(covariance: FloatArray) -> list[list[float]] | None:
 def _write(written: Written, path: Path) -> Written:
     solution = written.solution
     timed = solution.with_seconds(report=solution.seconds.report + written.seconds())
-    path.write_bytes(solution_json(timed))
+    path.write_bytes(solution_json(timed, path.parent))
     return replace(written, solution=timed)
 
 

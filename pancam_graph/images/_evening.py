@@ -3,12 +3,10 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pancam_graph.base.geometry import BoolArray, FloatArray
-from pancam_graph.mosaic._warp import Layer
 
 __all__ = ["Evening", "Small", "even_out"]
 
@@ -60,7 +58,7 @@ class Evening:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Small:
-    """A layer at a fraction of its size."""
+    """An image on a common grid of pixels, in the box that it covers; most often shrunk."""
 
     number: int
     """Number of its image."""
@@ -70,29 +68,6 @@ class Small:
     chosen: BoolArray
     """Where the whole pixel has data that no mask covers."""
     radius_squared: NDArray[np.float32]
-
-    @staticmethod
-    def of(number: int, layer: Layer, shrink: int, scale: float) -> "Small":
-        """A layer, `shrink` times smaller, its brightness multiplied with `scale`."""
-        height, width = (-(-n // shrink) for n in layer.grey.shape)
-        pad = (0, height * shrink - layer.grey.shape[0], 0, width * shrink - layer.grey.shape[1])
-        bands = []
-        for band, border in (
-            (layer.grey * np.float32(scale), cv2.BORDER_REPLICATE),
-            (layer.chosen.astype(np.float32), cv2.BORDER_CONSTANT),
-            (layer.radius_squared.astype(np.float32), cv2.BORDER_REPLICATE),
-        ):
-            padded = cv2.copyMakeBorder(band, *pad, border)
-            bands.append(cv2.resize(padded, (width, height), interpolation=cv2.INTER_AREA))
-        grey, chosen, radius_squared = (np.asarray(b, dtype=np.float32) for b in bands)
-        return Small(
-            number=number,
-            left_px=layer.left_px // shrink,
-            top_px=layer.top_px // shrink,
-            grey=grey,
-            chosen=np.asarray(chosen > 1 - 1e-4),
-            radius_squared=radius_squared,
-        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

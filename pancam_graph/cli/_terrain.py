@@ -1,0 +1,89 @@
+"""The subcommand terrain: dense surfaces of a drive that was refined earlier."""
+
+import math
+from pathlib import Path
+
+from pancam_graph.base.text import shortened
+from pancam_graph.cli._command import Command, Invocation
+from pancam_graph.cli._parser import CommandParser
+from pancam_graph.cli._streams import write
+
+__all__ = ["TERRAIN"]
+
+_DESCRIPTION = """\
+Make terrain of refined stereo frames: heights with sigmas, orthoimage, hillshade, mesh and cloud.
+
+OUT is a folder of results. OUT/terrain gets terrain.json, dem.tif (bands height, sigma, count, disagreement),
+orthoimage.tif, hillshade.png, slope.png, mesh.glb and cloud.laz of the drive, and OUT/terrain/STOP those of
+each stop; an older one is replaced once all is complete. terrain.json says by how much the surfaces of frames
+differ where they see the same ground, with telemetry's and with the refined pointing.
+
+Needs the extra: pip install 'pancam-graph[terrain]'.
+
+Exit status: 0 written, 1 written of a solution that failed a test or did not converge, 2 bad input or a fault
+(nothing is written), 130 interrupted.
+"""
+
+
+def _add_options(parser: CommandParser) -> None:
+    add = parser.add_argument
+    add("out", metavar="OUT", type=Path, help="folder of results")
+    add(
+        "--cell",
+        type=float,
+        metavar="M",
+        help="side of a cell, metres (default: as far as points lie apart on the ground 6 m away)",
+    )
+    add(
+        "--reach",
+        type=float,
+        default=25.0,
+        metavar="M",
+        help="farthest ground from a mast, metres (%(default)s)",
+    )
+    add(
+        "--images",
+        type=Path,
+        metavar="FOLDER",
+        help="the folder that was refined, where it is not any more where it was then",
+    )
+
+
+def _work(call: Invocation) -> int:
+    """Read the solution and its pictures, match, write."""
+    from pancam_graph.results import read_drive, read_solution_json, write_terrain_of
+    from pancam_graph.terrain import TerrainOptions, require_extra
+
+    arguments, progress = call.arguments, call.progress
+    options = TerrainOptions(cell_m=arguments.cell, reach_m=arguments.reach)
+    require_extra()
+    with progress.shown(f"reading {arguments.out}"):
+        drive = read_drive(arguments.out, arguments.images)
+        terrain = write_terrain_of(drive, arguments.out, options, progress=progress.counted)
+    for warning in terrain.warnings:
+        write("stderr", shortened(f"warning: {warning}"))
+    grid = terrain.drive.grid
+    call.say(
+        f"{arguments.out / 'terrain'}: {len(terrain.pairs)} stereo frames of {len(terrain.stops)} stops, "
+        f"cells of {grid.cell_m:g} m"
+    )
+    before, after = (terrain.agreement.median_m(p) for p in ("telemetry", "refined"))
+    if math.isfinite(before) and math.isfinite(after):
+        call.say(
+            f"surfaces of frames differ by {100 * before:.1f} cm with telemetry, {100 * after:.1f} cm "
+            f"refined (median of {len(terrain.agreement.pairs)} pairs of frames)"
+        )
+    file = read_solution_json(arguments.out / "solution.json")
+    passed = file.converged and (file.verdict is None or file.verdict.passed)
+    if not passed:
+        call.say("the solution failed a test or did not converge: see pancam-graph check")
+    return 0 if passed else 1
+
+
+TERRAIN = Command(
+    name="terrain",
+    summary="make heights, orthoimage, mesh and cloud of a refined drive",
+    description=_DESCRIPTION,
+    add_options=_add_options,
+    work=_work,
+)

@@ -1,0 +1,68 @@
+"""Terrain as an output of the folder of results, written with the others or later."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from pancam_graph.base.errors import InputError
+from pancam_graph.base.whole_files import whole_folder
+from pancam_graph.images import cache_folder
+from pancam_graph.results._older import TERRAIN, TERRAIN_FOLDER
+from pancam_graph.results._output import OutputWriter, Written
+from pancam_graph.terrain import (
+    Drive,
+    Terrain,
+    TerrainOptions,
+    drive_of,
+    make_terrain,
+    require_extra,
+    write_terrain,
+)
+
+__all__ = ["TERRAIN_WRITER", "write_terrain_of"]
+
+
+def write_terrain_of(
+    drive: Drive,
+    out: Path | str,
+    options: TerrainOptions = TerrainOptions(),  # noqa: B008  frozen
+    *,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Terrain:
+    """Write the terrain of a drive into the folder of results `out`, whole; an older one is replaced.
+
+    `drive` is what `read_drive` gives. Raises InputError as `make_terrain` and `write_terrain` do, for other
+    things in the place of the terrain, and where writing fails.
+    """
+    require_extra()
+    path = Path(out) / TERRAIN
+    strangers = TERRAIN_FOLDER.strangers(path) if path.exists() or path.is_symlink() else []
+    if strangers:
+        raise InputError(
+            f"{path}: expected an older terrain or nothing, found other things in it: {strangers[0]}"
+        )
+    terrain = make_terrain(drive, options, progress=progress, cache=cache_folder(out))
+    try:
+        with whole_folder(path) as folder:
+            write_terrain(terrain, drive.traverse, folder, options, progress=progress)
+    except OSError as error:
+        raise InputError(f"{path}: expected a place where terrain can be written, found: {error}") from error
+    return terrain
+
+
+def _write(written: Written, folder: Path) -> Written:
+    options, solution = written.terrain_options, written.solution
+    assert options is not None  # without options nobody asked for terrain
+    try:
+        terrain = make_terrain(
+            drive_of(solution), options, progress=written.progress, cache=cache_folder(written.out)
+        )
+        write_terrain(terrain, solution.traverse, folder, options, progress=written.progress)
+        warnings = terrain.warnings
+    except InputError as error:  # a solve that took long must not be lost for it
+        warnings = (str(error),)
+        folder.rmdir()
+    return replace(written, solution=replace(solution, warnings=(*solution.warnings, *warnings)))
+
+
+TERRAIN_WRITER = OutputWriter(write=_write)

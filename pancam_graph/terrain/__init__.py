@@ -1,0 +1,13 @@
+"""Terrain from refined stereo: dense surfaces with sigmas, as grids, pictures, meshes and clouds."""
+
+from pancam_graph.terrain._agreement import Agreement as Agreement
+from pancam_graph.terrain._agreement import PairAgreement as PairAgreement
+from pancam_graph.terrain._drive import Drive as Drive
+from pancam_graph.terrain._drive import drive_of as drive_of
+from pancam_graph.terrain._extra import require_extra as require_extra
+from pancam_graph.terrain._make import Fused as Fused
+from pancam_graph.terrain._make import Terrain as Terrain
+from pancam_graph.terrain._make import make_terrain as make_terrain
+from pancam_graph.terrain._terrain_options import TerrainOptions as TerrainOptions
+from pancam_graph.terrain._write import TERRAIN_INDEX as TERRAIN_INDEX
+from pancam_graph.terrain._write import write_terrain as write_terrain

@@ -1,0 +1,85 @@
+"""Grids as GeoTIFF: height, sigma, count, disagreement, and the orthoimage."""
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pancam_graph.terrain._extra import needed
+from pancam_graph.terrain._grid import Grid
+from pancam_graph.terrain._make import Fused
+
+__all__ = ["BANDS", "crs_wkt", "write_dem", "write_orthoimage"]
+
+BANDS = ("height", "sigma", "count", "disagreement")
+"""Names of the bands of `dem.tif`, in their order."""
+_UNITS = ("metre", "metre", "frames", "metre")
+_SMALLEST_OVERVIEW = 256
+_TILE_PX = 256
+
+
+def crs_wkt(name: str) -> str:
+    """The world frame of a traverse as a coordinate system: local metres, x to the right, y up, z up."""
+    plain = "".join(c if c.isalnum() or c in " .-_" else "_" for c in name)[:80] or "traverse"
+    return (
+        f'LOCAL_CS["pancam-graph world of {plain}",LOCAL_DATUM["first mast, z up",32767],'
+        'UNIT["metre",1],AXIS["x",EAST],AXIS["y",NORTH]]'
+    )
+
+
+def write_dem(fused: Fused, path: Path, crs: str) -> None:
+    """Write the bands of a surface; NaN where nothing is seen, which is the value for no data."""
+    bands = [fused.height_m, fused.sigma_m, fused.count, fused.disagreement_m]
+    bands[2] = np.where(fused.count > 0, fused.count, np.float32(np.nan))
+    _write(path, fused.grid, crs, bands, BANDS, _UNITS, np.nan)
+
+
+def write_orthoimage(grey: NDArray[np.uint8], grid: Grid, path: Path, crs: str) -> None:
+    """Write brightness, 1 to 255; 0 is no data."""
+    _write(path, grid, crs, [grey], ("brightness",), ("",), 0)
+
+
+def _write(
+    path: Path,
+    grid: Grid,
+    crs: str,
+    bands: Sequence[NDArray[Any]],
+    names: Sequence[str],
+    units: Sequence[str],
+    nodata: float,
+) -> None:
+    rasterio = needed("rasterio")
+    logging.getLogger("rasterio").setLevel(logging.ERROR)
+    resampling = needed("rasterio.enums").Resampling.average
+    whole_numbers = bands[0].dtype == np.uint8
+    place = needed("rasterio.transform").from_origin(grid.left_m, grid.top_m, grid.cell_m, grid.cell_m)
+    with rasterio.open(
+        path,
+        "w",
+        driver="GTiff",
+        height=grid.rows,
+        width=grid.columns,
+        count=len(bands),
+        dtype=bands[0].dtype,
+        crs=rasterio.crs.CRS.from_wkt(crs),
+        transform=place,
+        nodata=nodata,
+        tiled=True,
+        blockxsize=_TILE_PX,
+        blockysize=_TILE_PX,
+        compress="deflate",
+        predictor=2 if whole_numbers else 3,
+        zlevel=4,
+        BIGTIFF="IF_SAFER",
+    ) as file:
+        for number, (band, name, unit) in enumerate(zip(bands, names, units, strict=True), start=1):
+            file.write(band, number)
+            file.set_band_description(number, name)
+            if unit:
+                file.set_band_unit(number, unit)
+        levels = [2**k for k in range(1, 12) if max(grid.rows, grid.columns) >= _SMALLEST_OVERVIEW * 2**k]
+        if levels:
+            file.build_overviews(levels, resampling)

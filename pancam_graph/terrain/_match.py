@@ -1,0 +1,170 @@
+"""Disparities of a rectified pair: semi-global matching, then slanted windows."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pancam_graph.base.geometry import BoolArray, FloatArray
+from pancam_graph.base.splines import spline_taps
+from pancam_graph.base.threads import in_parallel
+from pancam_graph.terrain import kernel
+from pancam_graph.terrain._rectify import Rectified
+
+__all__ = ["Match", "disparity_limits", "match", "rectified_picture", "refined"]
+
+_BLUR_PX = 0.3
+"""Blur of what slanted windows compare: more of it hides the detail that says most, and with none the noise
+between pixels differs from that at pixels."""
+_WIDEST_START_PX = 1100
+"""Widest picture in which semi-global matching works; a wider one is made smaller for it."""
+_BLOCK_PX = 5
+_LEAST_SIGMA_PX, _PER_SPREAD, _POWER = 0.02, 4.1, 1.35
+"""Standard deviation of a disparity by the spread of its windows, pixels: `_PER_SPREAD spread^_POWER` and the
+least one, added in squares. Windows that look unlike have relief in them, and err by more than their spread
+says: from rendered images with truth (docs/terrain.md)."""
+_GRAIN = 64
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Match:
+    """Disparities of the left picture's pixels."""
+
+    disparity_px: NDArray[np.float32]
+    """(height, width); NaN where none was found."""
+    sigma_px: NDArray[np.float32]
+    """(height, width) standard deviation."""
+    grey: NDArray[np.float32]
+    """(height, width) samples of the left picture."""
+
+
+def rectified_picture(
+    picture: NDArray[Any], usable: BoolArray, uv_px: FloatArray
+) -> tuple[NDArray[np.float32], BoolArray]:
+    """A picture at pixels (h, w, 2), by its cubic spline, and where it is usable there."""
+    taps = spline_taps(0.0)
+    spline: Any = cv2.sepFilter2D(
+        picture.astype(np.float32), cv2.CV_32F, taps, taps, borderType=cv2.BORDER_REFLECT_101
+    )
+    out = np.empty(uv_px.shape[:2], dtype=np.float32)
+    uv_px = np.ascontiguousarray(uv_px)
+    in_parallel(lambda a, b: kernel.resample(a, b, spline, uv_px, out), len(out), grain=_GRAIN)
+    column, row = (np.nan_to_num(np.rint(uv_px[..., k]), nan=-1).astype(np.int64) for k in (0, 1))
+    inside = (column >= 0) & (row >= 0)
+    there = inside & usable[np.clip(row, 0, usable.shape[0] - 1), np.clip(column, 0, usable.shape[1] - 1)]
+    return out, there
+
+
+def match(
+    left: NDArray[np.float32],
+    right: NDArray[np.float32],
+    there: tuple[BoolArray, BoolArray],
+    disparities: tuple[float, float],
+) -> Match:
+    """Disparities of a pair of rectified pictures (h, w), within limits.
+
+    `there` says which pixels of each picture show terrain. Pixels of the left that the right one does not see
+    have none: what each finds in the other must agree.
+    """
+    start = _started(left, right, there, disparities)
+    disparity, spread = refined(left, right, start)
+    u = np.arange(left.shape[1], dtype=np.float32)[None] - disparity
+    at = np.rint(np.nan_to_num(u, nan=-1)).astype(np.int64)
+    inside = (at >= 0) & (at < left.shape[1])
+    seen = there[0] & inside & np.take_along_axis(there[1], np.where(inside, at, 0), axis=1)
+    disparity = np.where(seen, disparity, np.float32(np.nan))
+    sigma = np.sqrt((_PER_SPREAD * spread**_POWER) ** 2 + _LEAST_SIGMA_PX**2)
+    return Match(disparity_px=disparity, sigma_px=sigma.astype(np.float32), grey=left)
+
+
+def _started(
+    left: NDArray[np.float32],
+    right: NDArray[np.float32],
+    there: tuple[BoolArray, BoolArray],
+    disparities: tuple[float, float],
+) -> NDArray[np.float32]:
+    """Disparities by semi-global matching (Hirschmueller 2008); NaN where none was found."""
+    height, width = left.shape
+    smaller = -(-width // _WIDEST_START_PX)
+    low = int(np.floor(disparities[0] / smaller)) - 1
+    count = -(-(int(np.ceil(disparities[1] / smaller)) - low + 1) // 16) * 16
+    dark, bright = (
+        (float(q) for q in np.quantile(left[there[0]], (0.002, 0.998))) if there[0].any() else (0.0, 1.0)
+    )
+    pictures = []
+    # Beside the picture there is room for the disparities of its outer columns.
+    before, behind = max(low + count, 0), max(-low, 0)
+    for picture in (left, right):
+        scaled = np.clip((picture - dark) * (255 / max(bright - dark, 1e-6)), 0, 255).astype(np.uint8)
+        if smaller > 1:
+            scaled = cv2.resize(
+                scaled, (-(-width // smaller), -(-height // smaller)), interpolation=cv2.INTER_AREA
+            )
+        pictures.append(cv2.copyMakeBorder(scaled, 0, 0, before, behind, cv2.BORDER_REPLICATE))
+    create: Any = cv2.StereoSGBM.create
+    matcher = create(
+        minDisparity=low,
+        numDisparities=count,
+        blockSize=_BLOCK_PX,
+        P1=8 * _BLOCK_PX**2,
+        P2=32 * _BLOCK_PX**2,
+        disp12MaxDiff=1,
+        uniquenessRatio=5,
+        speckleWindowSize=100,
+        speckleRange=2,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    )
+    found = matcher.compute(*pictures)[:, before : before + pictures[0].shape[1] - before - behind]
+    start = np.where(found >= 16 * low, found.astype(np.float32) / 16, np.float32(np.nan))
+    if smaller > 1:
+        start = cv2.resize(smaller * start, (width, height), interpolation=cv2.INTER_NEAREST)
+    return np.where(there[0], start, np.float32(np.nan)).astype(np.float32)
+
+
+def refined(
+    left: NDArray[np.float32], right: NDArray[np.float32], start_px: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Disparities (h, w) from a start that is right within a pixel, and their spread.
+
+    See `refine_rows` and `blend_rows`.
+    """
+    taps, both = spline_taps(_BLUR_PX), np.array([1, 4, 1]) / 6
+    splines: list[Any] = [
+        cv2.sepFilter2D(p.astype(np.float32), cv2.CV_32F, taps, taps, borderType=cv2.BORDER_REFLECT_101)
+        for p in (left, right)
+    ]
+    own: Any = cv2.sepFilter2D(splines[0], cv2.CV_32F, both, both, borderType=cv2.BORDER_REFLECT_101)
+    rows = cv2.sepFilter2D(splines[1], cv2.CV_32F, np.ones(1), both, borderType=cv2.BORDER_REFLECT_101)
+    padded = np.pad(rows, ((0, 0), (1, 2)), mode="reflect")
+    finer = np.empty((*left.shape, kernel.FINER), dtype=np.float32)
+    for k in range(kernel.FINER):
+        x = k / kernel.FINER
+        weights = (
+            (1 - x) ** 3 / 6,
+            2 / 3 - x * x + x**3 / 2,
+            2 / 3 - (1 - x) ** 2 + (1 - x) ** 3 / 2,
+            x**3 / 6,
+        )
+        finer[..., k] = sum(np.float32(a) * padded[:, n : n + left.shape[1]] for n, a in enumerate(weights))
+    finer = finer.reshape(left.shape[0], -1)
+    disparity, spread, blended, deviation = (np.full(left.shape, np.nan, dtype=np.float32) for _ in range(4))
+    slope = np.zeros((2, *left.shape), dtype=np.float32)
+    start_px = np.ascontiguousarray(start_px, dtype=np.float32)
+
+    def refine(begin: int, end: int) -> None:
+        kernel.refine_rows(begin, end, own, finer, start_px, disparity, slope, spread)
+
+    def blend(begin: int, end: int) -> None:
+        kernel.blend_rows(begin, end, disparity, slope, spread, blended, deviation)
+
+    in_parallel(refine, len(left), grain=_GRAIN)
+    in_parallel(blend, len(left), grain=_GRAIN)
+    return blended, deviation
+
+
+def disparity_limits(rectified: Rectified, nearest_m: float, farthest_m: float) -> tuple[float, float]:
+    """Disparities of the nearest and of the farthest depth, the smaller first."""
+    per_m = rectified.left.fx_px * rectified.baseline_m
+    return rectified.shift_px + per_m / farthest_m, rectified.shift_px + per_m / nearest_m

@@ -1,0 +1,28 @@
+"""Options of terrain."""
+
+from dataclasses import dataclass
+
+from pancam_graph.base.errors import InputError
+
+__all__ = ["TerrainOptions"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TerrainOptions:
+    """How fine and how large surfaces are. Raises InputError for a number that is not above 0."""
+
+    cell_m: float | None = None
+    """Side of a cell of the grid; None: as far as points lie apart along the ground, 6 m from the mast."""
+    reach_m: float = 25.0
+    """Ground farther than this from the mast of its frame is left out."""
+    most_cloud_points: int = 4_000_000
+    """Points of a cloud; of more, some are left out evenly."""
+    most_mesh_cells: int = 250_000
+    """Cells of the mesh; of more, the mesh is coarser than the grid."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        for name in ("cell_m", "reach_m", "most_cloud_points", "most_mesh_cells"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise InputError(f"terrain: {name}: expected a number above 0, found {value}")

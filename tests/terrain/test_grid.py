@@ -1,0 +1,106 @@
+"""Grids: what one frame sees, fused with others, and how far frames differ."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pancam_graph.base.errors import InputError
+from pancam_graph.terrain import Agreement, TerrainOptions
+from pancam_graph.terrain._agreement import agreement_of
+from pancam_graph.terrain._grid import Grid, Layer, grid_around
+from pancam_graph.terrain._make import fuse
+from pancam_graph.terrain.kernel import raster_quads
+
+GRID = Grid(left_m=0.0, top_m=2.0, cell_m=0.1, rows=20, columns=20)
+
+
+def drawn(step: float, *, jump: bool = False) -> NDArray[np.float32]:
+    """Bands (5, 20, 20) of points `step` cells apart on the plane z = 1 + 0.1 column - 0.05 row."""
+    count = int(20 / step) + 1
+    row, column = np.mgrid[:count, :count] * step - 0.3
+    points = np.stack([column, row, 1 + 0.1 * column - 0.05 * row], axis=-1)
+    disparity = np.full((count, count), 5, dtype=np.float32)
+    if jump:
+        disparity[:, count // 2 :] += 1
+    flat = np.full((count, count), 0.01, dtype=np.float32)
+    total = np.zeros((5, 20, 20), dtype=np.float32)
+    raster_quads(points, flat, 100 * flat, disparity, 0.6, 1.5, total)
+    return total
+
+
+def test_sparse_points_of_one_surface_have_no_holes_between_them() -> None:
+    total = drawn(2.7)
+    row, column = np.mgrid[:18, :18]
+    between = total[3, :18, :18] == 0
+    assert between.sum() > 200
+    assert (total[0, :18, :18] > 0).all()
+    truth = 1 + 0.1 * column - 0.05 * row
+    np.testing.assert_allclose(total[1, :18, :18][between], truth[between], atol=1e-5)
+    np.testing.assert_allclose(total[2, :18, :18][between], 1.0, rtol=1e-5)
+
+
+def test_what_an_edge_hides_stays_empty() -> None:
+    hidden = (drawn(2.7)[0] > 0) & (drawn(2.7, jump=True)[0] == 0)
+    assert 10 < hidden.sum() < 80
+    assert np.ptp(np.nonzero(hidden)[1]) <= 3  # between the two columns of points beside the jump
+
+
+def test_dense_points_are_averaged_as_if_few_were_independent() -> None:
+    total = drawn(0.25)
+    assert total[3, 5:15, 5:15].min() >= 9
+    np.testing.assert_allclose(total[4, 5:15, 5:15], 0.01 * 1.5 / total[3, 5:15, 5:15], rtol=1e-4)
+
+
+def layer(frame: int, height: float, sigma: float, first_row: int = 2, rows: int = 15) -> Layer:
+    flat = np.ones((rows, 12), dtype=np.float32)
+    return Layer(
+        frame=frame,
+        first_row=first_row,
+        first_column=3,
+        height_m=flat * np.float32(height),
+        variance_m2=flat * np.float32(sigma**2),
+        grey=flat * 50,
+    )
+
+
+def test_frames_are_fused_by_their_variances_and_one_that_is_far_off_counts_little() -> None:
+    two = fuse(GRID, [layer(0, 1.0, 0.01), layer(1, 1.01, 0.02)])
+    assert (two.grid.rows, two.grid.columns) == (15, 12)
+    assert (two.grid.left_m, two.grid.top_m) == pytest.approx((0.3, 1.8))
+    assert two.height_m[4, 4] == pytest.approx(1.002)
+    assert two.sigma_m[4, 4] == pytest.approx(np.sqrt(1 / (1 / 1e-4 + 1 / 4e-4)), rel=1e-4)
+    assert two.count[4, 4] == 2
+    assert two.disagreement_m[4, 4] == pytest.approx(0.004, rel=1e-3)
+    three = fuse(GRID, [layer(0, 1.0, 0.01), layer(1, 1.004, 0.01), layer(2, 3.0, 0.01)])
+    assert abs(three.height_m[4, 4] - 1.002) < 0.005  # the mean is 0.67 off
+    assert three.sigma_m[4, 4] > 0.01  # and the frames say that something is wrong
+
+
+def test_cells_that_one_frame_sees_have_no_disagreement_and_others_are_empty() -> None:
+    fused = fuse(GRID, [layer(0, 1.0, 0.01, rows=5), layer(1, 1.0, 0.01, first_row=12, rows=4)])
+    assert fused.height_m.shape == (14, 12)
+    assert np.isnan(fused.disagreement_m).all()
+    assert np.isnan(fused.height_m[5:10]).all()
+    assert (fused.count[5:10] == 0).all()
+
+
+def test_agreement_is_the_median_difference_before_and_after() -> None:
+    refined = [layer(0, 1.0, 0.01), layer(1, 1.02, 0.01), layer(2, 1.0, 0.01, first_row=17, rows=2)]
+    telemetry = [layer(0, 1.0, 0.01), layer(1, 1.12, 0.01), layer(2, 9.0, 0.01, first_row=17, rows=2)]
+    found = agreement_of(refined, telemetry, np.array([0, 1, 1]))
+    assert [p.frames for p in found.pairs] == [(0, 1)]  # frame 2 shares too few cells
+    assert found.pairs[0].cells == 180
+    assert found.median_m("telemetry") == pytest.approx(0.12, rel=1e-4)
+    assert found.median_m("refined") == pytest.approx(0.02, rel=1e-4)
+    assert found.median_sigmas == pytest.approx(0.02 / np.hypot(0.01, 0.01), rel=1e-4)
+    assert np.isnan(found.median_m("refined", same_stop=True))
+    assert np.isnan(Agreement(pairs=()).median_m("refined"))
+
+
+def test_a_cell_too_small_for_memory_is_refused_with_one_that_fits() -> None:
+    centres = np.array([[0.0, 0.0, 1.5], [100.0, 0.0, 1.5]])
+    with pytest.raises(InputError, match=r"150 m x 50 m, that is a cell of 0\.012 m or more, found 0\.001 m"):
+        grid_around(centres, 25.0, 0.001)
+    assert grid_around(centres, 25.0, 0.012).columns == 12501
+    with pytest.raises(InputError, match="terrain: cell_m: expected a number above 0, found 0"):
+        TerrainOptions(cell_m=0.0)

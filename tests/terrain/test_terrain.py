@@ -1,0 +1,206 @@
+"""Terrain of a plane with known truth, from pictures to files that other libraries open."""
+
+import json
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pancam_graph import Solution
+from pancam_graph.base.errors import InputError
+from pancam_graph.cli import main
+from pancam_graph.results import check_out, read_drive, write_results
+from pancam_graph.rigs import stereo_pan_tilt
+from pancam_graph.terrain import Terrain, TerrainOptions, drive_of, make_terrain
+from pancam_graph.terrain import _extra as extra
+from support.mosaic_scenes import PLACE_M, Scene, solved, without_file
+
+RIG = stereo_pan_tilt(field_rad=np.deg2rad(55.0), width_px=224, height_px=224)
+SCENE = Scene(
+    cameras=tuple(eye.name for eye in RIG.eyes),
+    rig=RIG,
+    error_rad=((0.0, 0.01), (0.0, -0.01)),
+    exposure=(1.0, 1.25, 0.9),
+)
+OPTIONS = TerrainOptions(reach_m=5.0, cell_m=0.05)
+
+
+@pytest.fixture(scope="module")
+def plane(tmp_path_factory: pytest.TempPathFactory) -> Solution:
+    return solved(SCENE, tmp_path_factory.mktemp("plane"))
+
+
+@pytest.fixture(scope="module")
+def terrain(plane: Solution) -> Terrain:
+    return make_terrain(drive_of(plane), OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def results(plane: Solution, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("results") / "out"
+    write_results(plane, out, report=False, terrain=OPTIONS)
+    return out
+
+
+def test_heights_of_a_plane_err_as_their_sigmas_say(terrain: Terrain) -> None:
+    fused = terrain.drive
+    x, y = fused.grid.middles()
+    away = np.hypot(x - PLACE_M[0], (y - PLACE_M[1])[:, None])
+    seen = np.isfinite(fused.height_m) & (away < 4)
+    assert seen.sum() > 3000
+    off, sigma = fused.height_m[seen], fused.sigma_m[seen]
+    assert np.abs(np.median(off)) < 0.002
+    assert np.sqrt(np.mean(off**2)) < 0.008
+    # A plane without relief is matched better than the ground that the sigmas are calibrated on.
+    assert 0.02 < np.mean((off / sigma) ** 2) < 1.4
+    assert (fused.count[np.isfinite(fused.height_m)] >= 1).all()
+    assert list(terrain.stops) == ["A/1"]
+
+
+def test_refined_surfaces_agree_and_those_of_telemetry_do_not(terrain: Terrain) -> None:
+    assert [p.frames for p in terrain.agreement.pairs] == [(0, 1), (0, 2), (1, 2)]
+    # Two tilts that are 20 mrad apart put ground 2.5 m away 5 cm apart.
+    assert terrain.agreement.median_m("telemetry") > 0.02
+    assert terrain.agreement.median_m("refined") < 0.003
+    assert terrain.agreement.median_m("refined", same_stop=True) < 0.003
+
+
+def test_exposures_are_evened_out(terrain: Terrain) -> None:
+    fused = terrain.drive
+    both = fused.count > 1
+    assert both.sum() > 200
+    third = fused.grid.columns // 3
+    means = [float(np.nanmean(fused.grey[:, k * third : (k + 1) * third])) for k in range(3)]
+    assert max(means) < 1.12 * min(means)  # exposures differ by 1.4
+
+
+def test_files_are_opened_by_other_libraries(results: Path, terrain: Terrain) -> None:
+    rasterio, laspy = pytest.importorskip("rasterio"), pytest.importorskip("laspy")
+    index = json.loads((results / "terrain" / "terrain.json").read_text())
+    assert index["format"] == "pancam-graph/terrain"
+    assert index["cell_m"] == 0.05
+    assert set(index["disagreement_m"]) == {"telemetry", "refined"}
+    assert index["disagreement_m"]["refined"] < 0.2 * index["disagreement_m"]["telemetry"]
+    assert [p["stop"] for p in index["products"]] == [None, "A/1"]
+    assert index["products"][1]["files"]["dem"] == "001_A-1/dem.tif"  # an id that is no name of a folder
+    for product in index["products"]:
+        for file in product["files"].values():
+            assert (results / "terrain" / file).stat().st_size > 500
+    grid = terrain.drive.grid
+    with rasterio.open(results / "terrain" / "dem.tif") as dem:
+        assert dem.descriptions == ("height", "sigma", "count", "disagreement")
+        assert "pancam-graph world" in dem.crs.to_wkt()
+        assert dem.crs.linear_units.startswith("met")
+        assert np.isnan(dem.nodata)
+        left, top = dem.transform * (0, 0)
+        assert (left, top) == pytest.approx((grid.left_m, grid.top_m), abs=1e-3)
+        np.testing.assert_array_equal(dem.read(1), terrain.drive.height_m)
+    with rasterio.open(results / "terrain" / "orthoimage.tif") as picture:
+        grey = picture.read(1)
+        np.testing.assert_array_equal(grey > 0, np.isfinite(terrain.drive.height_m))
+        assert picture.nodata == 0
+    cloud = laspy.read(results / "terrain" / "cloud.laz")
+    xyz = np.asarray(cloud.xyz)
+    assert len(xyz) == index["products"][0]["points"] > 10000
+    assert np.median(np.abs(xyz[:, 2])) < 0.005
+    assert set(np.unique(cloud.frame)) == {0, 1, 2}
+    assert 0 < np.median(cloud.sigma_m) < 0.1
+
+
+def test_the_mesh_lies_on_the_heights(results: Path, terrain: Terrain) -> None:
+    data = (results / "terrain" / "mesh.glb").read_bytes()
+    magic, version, length = struct.unpack_from("<4sII", data)
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    size, kind = struct.unpack_from("<I4s", data, 12)
+    assert kind == b"JSON"
+    document = json.loads(data[20 : 20 + size])
+    binary = data[28 + size :]
+    view = document["bufferViews"][0]
+    position = np.frombuffer(binary, "<f4", document["accessors"][0]["count"] * 3, view["byteOffset"])
+    position = position.reshape(-1, 3) + 0.0
+    origin = document["asset"]["extras"]["world_origin_m"]
+    world = np.stack([position[:, 0], -position[:, 2], position[:, 1]], axis=1) + origin
+    place = np.rint(terrain.drive.grid.place(world)).astype(int)
+    np.testing.assert_allclose(terrain.drive.height_m[place[:, 1], place[:, 0]], world[:, 2], atol=1e-5)
+    index = np.frombuffer(
+        binary, "<u4", document["accessors"][2]["count"], document["bufferViews"][2]["byteOffset"]
+    )
+    corners = world[index.reshape(-1, 3)]
+    up = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2]
+    assert (up > 0).all()  # triangles turn so that their outside is up
+
+
+def test_terrain_of_older_results_replaces_itself_and_nothing_else(
+    results: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = (results / "solution.json").read_bytes()
+    assert main(["terrain", str(results), "--cell", "0.1", "--reach", "4"]) == 0
+    said = capsys.readouterr().out
+    assert "3 stereo frames of 1 stops, cells of 0.1 m" in said
+    assert "surfaces of frames differ by" in said
+    assert (results / "solution.json").read_bytes() == before
+    index = json.loads((results / "terrain" / "terrain.json").read_text())
+    assert index["cell_m"] == 0.1
+    check_out(results)  # a new refine may replace them all
+    (results / "terrain" / "mine.txt").write_text("mine")
+    with pytest.raises(InputError, match=r"found other things in it: terrain/mine\.txt"):
+        check_out(results)
+    assert main(["terrain", str(results)]) == 2
+    assert "expected an older terrain or nothing, found other things in it" in capsys.readouterr().err
+    (results / "terrain" / "mine.txt").unlink()
+
+
+def test_poses_of_a_file_are_those_of_the_solution(results: Path, plane: Solution) -> None:
+    read, made = read_drive(results), drive_of(plane)
+    np.testing.assert_allclose(read.world_R_camera, made.world_R_camera, atol=1e-12)
+    np.testing.assert_allclose(read.world_t_camera, made.world_t_camera, atol=1e-12)
+    np.testing.assert_allclose(read.angle_sigma_rad, made.angle_sigma_rad)
+
+
+@pytest.mark.parametrize(
+    ("scene", "lost", "says"),
+    [
+        (Scene(cameras=("left",)), (), "expected frames with pictures of two eyes, found one eye in each"),
+        (SCENE, (0, 1, 2, 3, 4, 5), "expected image files, found none"),
+    ],
+    ids=["one eye", "no pictures"],
+)
+def test_what_has_no_stereo_is_said_in_a_sentence(
+    scene: Scene, lost: tuple[int, ...], says: str, tmp_path: Path
+) -> None:
+    solution = solved(scene, tmp_path)
+    for row in lost:
+        solution = without_file(solution, row)
+    with pytest.raises(InputError, match=says):
+        make_terrain(drive_of(solution))
+    out = tmp_path.parent / f"{tmp_path.name}-out"
+    written = write_results(solution, out, report=False, terrain=OPTIONS)
+    assert says in written.warnings[-1]  # and the solve is not lost
+    assert not (out / "terrain").exists()
+
+
+def test_a_frame_that_lacks_an_eye_is_left_out_and_named(plane: Solution) -> None:
+    made = make_terrain(drive_of(without_file(plane, 3)), OPTIONS)
+    assert [p.frame for p in made.pairs] == [0, 2]
+    assert "frames without a stereo pair of pictures are left out: f1" in made.warnings[0]
+
+
+def test_a_package_that_is_missing_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(extra, "_PACKAGES", ("no_such_package",))
+    with pytest.raises(
+        InputError, match=r"no_such_package, found none: pip install 'pancam-graph\[terrain\]'"
+    ):
+        extra.require_extra()
+
+
+def test_pictures_of_another_drive_are_refused(results: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="expected the folder that was refined"):
+        read_drive(results, tmp_path / "gone")
+    other = solved(replace(SCENE, pans_rad=SCENE.pans_rad[:2]), tmp_path)
+    from pancam_graph.io import write_traverse
+
+    write_traverse(other.traverse, tmp_path)
+    with pytest.raises(InputError, match=r"images: expected those of .*, found those of another drive"):
+        read_drive(results, tmp_path)
