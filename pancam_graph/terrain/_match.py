@@ -21,6 +21,9 @@ between pixels differs from that at pixels."""
 _WIDEST_START_PX = 1100
 """Widest picture in which semi-global matching works; a wider one is made smaller for it."""
 _BLOCK_PX = 5
+_MARGIN_PX = 3
+_AGREE_PX = 1.5
+"""By how much the disparities that each picture finds in the other may differ."""
 _LEAST_SIGMA_PX, _PER_SPREAD, _POWER = 0.02, 4.1, 1.35
 """Standard deviation of a disparity by the spread of its windows, pixels: `_PER_SPREAD spread^_POWER` and the
 least one, added in squares. Windows that look unlike have relief in them, and err by more than their spread
@@ -43,7 +46,7 @@ class Match:
 def rectified_picture(
     picture: NDArray[Any], usable: BoolArray, uv_px: FloatArray
 ) -> tuple[NDArray[np.float32], BoolArray]:
-    """A picture at pixels (h, w, 2), by its cubic spline, and where it is usable there."""
+    """A picture at pixels (h, w, 2), by its cubic spline, and where windows of it are usable there."""
     taps = spline_taps(0.0)
     spline: Any = cv2.sepFilter2D(
         picture.astype(np.float32), cv2.CV_32F, taps, taps, borderType=cv2.BORDER_REFLECT_101
@@ -54,7 +57,10 @@ def rectified_picture(
     column, row = (np.nan_to_num(np.rint(uv_px[..., k]), nan=-1).astype(np.int64) for k in (0, 1))
     inside = (column >= 0) & (row >= 0)
     there = inside & usable[np.clip(row, 0, usable.shape[0] - 1), np.clip(column, 0, usable.shape[1] - 1)]
-    return out, there
+    # A window across the edge of a picture compares with nothing on one side.
+    square = np.ones((2 * _MARGIN_PX + 1,) * 2, np.uint8)
+    inner = cv2.erode(there.astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    return out, np.asarray(inner > 0)
 
 
 def match(
@@ -93,16 +99,15 @@ def _started(
     dark, bright = (
         (float(q) for q in np.quantile(left[there[0]], (0.002, 0.998))) if there[0].any() else (0.0, 1.0)
     )
-    pictures = []
-    # Beside the picture there is room for the disparities of its outer columns.
-    before, behind = max(low + count, 0), max(-low, 0)
+    small = []
     for picture in (left, right):
         scaled = np.clip((picture - dark) * (255 / max(bright - dark, 1e-6)), 0, 255).astype(np.uint8)
         if smaller > 1:
-            scaled = cv2.resize(
-                scaled, (-(-width // smaller), -(-height // smaller)), interpolation=cv2.INTER_AREA
-            )
-        pictures.append(cv2.copyMakeBorder(scaled, 0, 0, before, behind, cv2.BORDER_REPLICATE))
+            size = -(-width // smaller), -(-height // smaller)
+            scaled = cv2.resize(scaled, size, interpolation=cv2.INTER_AREA)
+        small.append(scaled)
+    # Beside the picture there is room for the disparities of its outer columns.
+    before, behind = max(low + count, 0), max(-low, 0)
     create: Any = cv2.StereoSGBM.create
     matcher = create(
         minDisparity=low,
@@ -110,14 +115,24 @@ def _started(
         blockSize=_BLOCK_PX,
         P1=8 * _BLOCK_PX**2,
         P2=32 * _BLOCK_PX**2,
-        disp12MaxDiff=1,
         uniquenessRatio=5,
         speckleWindowSize=100,
         speckleRange=2,
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
-    found = matcher.compute(*pictures)[:, before : before + pictures[0].shape[1] - before - behind]
-    start = np.where(found >= 16 * low, found.astype(np.float32) / 16, np.float32(np.nan))
+
+    def sought(first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.float32]:
+        wide = (cv2.copyMakeBorder(p, 0, 0, before, behind, cv2.BORDER_REPLICATE) for p in (first, second))
+        found = matcher.compute(*wide)[:, before : before + first.shape[1]].astype(np.float32) / 16
+        return np.where(found >= low, found, np.float32(np.nan))
+
+    start = sought(*small)
+    # Mirrored, the right picture is the one that looks for its pixels in the other.
+    back = sought(*(np.ascontiguousarray(p[:, ::-1]) for p in small[::-1]))[:, ::-1]
+    column = np.arange(start.shape[1]) - np.nan_to_num(start)
+    at = np.clip(np.rint(column), 0, start.shape[1] - 1).astype(np.int64)
+    agree = np.abs(np.take_along_axis(back, at, axis=1) - start) <= _AGREE_PX
+    start = np.where(agree, start, np.float32(np.nan))
     if smaller > 1:
         start = cv2.resize(smaller * start, (width, height), interpolation=cv2.INTER_NEAREST)
     return np.where(there[0], start, np.float32(np.nan)).astype(np.float32)

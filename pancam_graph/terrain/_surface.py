@@ -27,7 +27,7 @@ _STEEPEST = 0.2
 """Least upward part of a normal with which the error of a depth is carried into one of the height."""
 _ACROSS_PX = 0.05
 """Standard deviation of where a pixel looks, across its line of sight."""
-_INDEPENDENT = 1.5
+_INDEPENDENT = 1.0
 """Points of a frame, of those within one cell, that err independently: windows of neighbours overlap."""
 _JUMP_PX = 0.6
 """Difference of two neighbours' disparities between which something is hidden: on level ground it is the

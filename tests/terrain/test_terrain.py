@@ -11,6 +11,7 @@ import pytest
 from pancam_graph import Solution
 from pancam_graph.base.errors import InputError
 from pancam_graph.cli import main
+from pancam_graph.io import write_traverse
 from pancam_graph.results import check_out, read_drive, write_results
 from pancam_graph.rigs import stereo_pan_tilt
 from pancam_graph.terrain import Terrain, TerrainOptions, drive_of, make_terrain
@@ -29,7 +30,10 @@ OPTIONS = TerrainOptions(reach_m=5.0, cell_m=0.05)
 
 @pytest.fixture(scope="module")
 def plane(tmp_path_factory: pytest.TempPathFactory) -> Solution:
-    return solved(SCENE, tmp_path_factory.mktemp("plane"))
+    folder = tmp_path_factory.mktemp("plane")
+    solution = solved(SCENE, folder)
+    write_traverse(solution.traverse, folder)
+    return solution
 
 
 @pytest.fixture(scope="module")
@@ -53,14 +57,16 @@ def test_heights_of_a_plane_err_as_their_sigmas_say(terrain: Terrain) -> None:
     off, sigma = fused.height_m[seen], fused.sigma_m[seen]
     assert np.abs(np.median(off)) < 0.002
     assert np.sqrt(np.mean(off**2)) < 0.008
-    # A plane without relief is matched better than the ground that the sigmas are calibrated on.
-    assert 0.02 < np.mean((off / sigma) ** 2) < 1.4
+    # Sigmas are calibrated on ground with relief; a few cells at the edges of pictures err by more.
+    squared = (off / sigma) ** 2
+    assert 0.1 < np.mean(np.minimum(squared, 16)) < 1.6
+    assert 0.1 < np.median(squared) / 0.455 < 1.4
     assert (fused.count[np.isfinite(fused.height_m)] >= 1).all()
     assert list(terrain.stops) == ["A/1"]
 
 
 def test_refined_surfaces_agree_and_those_of_telemetry_do_not(terrain: Terrain) -> None:
-    assert [p.frames for p in terrain.agreement.pairs] == [(0, 1), (0, 2), (1, 2)]
+    assert [p.frames for p in terrain.agreement.pairs] == [(0, 1), (1, 2)]
     # Two tilts that are 20 mrad apart put ground 2.5 m away 5 cm apart.
     assert terrain.agreement.median_m("telemetry") > 0.02
     assert terrain.agreement.median_m("refined") < 0.003
@@ -92,9 +98,9 @@ def test_files_are_opened_by_other_libraries(results: Path, terrain: Terrain) ->
     with rasterio.open(results / "terrain" / "dem.tif") as dem:
         assert dem.descriptions == ("height", "sigma", "count", "disagreement")
         assert "pancam-graph world" in dem.crs.to_wkt()
-        assert dem.crs.linear_units.startswith("met")
+        assert 'UNIT["metre",1' in dem.crs.to_wkt()
         assert np.isnan(dem.nodata)
-        left, top = dem.transform * (0, 0)
+        left, top = dem.transform.c, dem.transform.f
         assert (left, top) == pytest.approx((grid.left_m, grid.top_m), abs=1e-3)
         np.testing.assert_array_equal(dem.read(1), terrain.drive.height_m)
     with rasterio.open(results / "terrain" / "orthoimage.tif") as picture:
@@ -199,8 +205,6 @@ def test_pictures_of_another_drive_are_refused(results: Path, tmp_path: Path) ->
     with pytest.raises(InputError, match="expected the folder that was refined"):
         read_drive(results, tmp_path / "gone")
     other = solved(replace(SCENE, pans_rad=SCENE.pans_rad[:2]), tmp_path)
-    from pancam_graph.io import write_traverse
-
     write_traverse(other.traverse, tmp_path)
     with pytest.raises(InputError, match=r"images: expected those of .*, found those of another drive"):
         read_drive(results, tmp_path)
