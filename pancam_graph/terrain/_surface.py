@@ -1,6 +1,7 @@
 """The surface that one stereo frame sees: from two pictures to a range image, and to layers of a grid."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -32,7 +33,7 @@ _INDEPENDENT = 1.0
 _JUMP_PX = 0.6
 """Difference of two neighbours' disparities between which something is hidden: on level ground it is the
 baseline over the mast's height, 0.13."""
-_EDGE_PX, _EDGE_JUMP_PX = 5, 2.0
+_EDGE_PX, _EDGE_JUMP_PX = 7, 1.6
 """Width of the square around a point in which disparities may not differ by more: a window that lies across
 an edge gives the background the disparity of what stands before it."""
 
@@ -71,7 +72,7 @@ class Surface:
     """Height of the camera above the ground at the foot of the mast."""
     tilt_sigma_rad: float
 
-    @property
+    @cached_property
     def points_m(self) -> FloatArray:
         """World points (h, w, 3); NaN where nothing was found."""
         rays, origin = self.world_T_point
@@ -86,11 +87,9 @@ class Surface:
         from the camera along the ground are left out.
         """
         _, origin = self.world_T_point
-        points = self.points_m
-        variance = self._height_variance_m2(points)
-        far = np.hypot(points[..., 0] - origin[0], points[..., 1] - origin[1])
+        far = np.hypot(self.points_m[..., 0] - origin[0], self.points_m[..., 1] - origin[1])
         with np.errstate(invalid="ignore"):
-            points[~(far <= reach_m)] = np.nan
+            points = np.where((far <= reach_m)[..., None], self.points_m, np.nan)
         if move is not None:
             points = points @ move[0].T + move[1]
         if not np.isfinite(points[..., 2]).any():
@@ -103,7 +102,9 @@ class Surface:
             return None
         places[..., :2] -= low
         total = np.zeros((5, high[1] - low[1], high[0] - low[0]), dtype=np.float32)
-        kernel.raster_quads(places, variance, self.grey, self.disparity_px, _JUMP_PX, _INDEPENDENT, total)
+        kernel.raster_quads(
+            places, self.height_variance_m2, self.grey, self.disparity_px, _JUMP_PX, _INDEPENDENT, total
+        )
         seen = total[0] > 0
         height, grey = (np.where(seen, total[k], np.float32(np.nan)) for k in (1, 2))
         # An error of the pointing moves the whole frame: cells do not average it out.
@@ -120,9 +121,10 @@ class Surface:
             grey=grey,
         )
 
-    def _height_variance_m2(self, points_m: FloatArray) -> NDArray[np.float32]:
+    @cached_property
+    def height_variance_m2(self) -> NDArray[np.float32]:
         """Variance (h, w) of the height of the surface at a place, from that of depths and the normals."""
-        rays, _ = self.world_T_point
+        (rays, _), points_m = self.world_T_point, self.points_m
         k = _NORMAL_PX
         right, down = np.full_like(points_m, np.nan), np.full_like(points_m, np.nan)
         right[:, k:-k] = points_m[:, 2 * k :] - points_m[:, : -2 * k]
