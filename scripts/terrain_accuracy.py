@@ -72,7 +72,7 @@ def print_disparities(rendering: Rendering) -> None:
     everywhere = np.ones(depth.shape, dtype=bool)
     high = 1.2 * float(np.nanmax(truth))
     found = match(pictures[0], pictures[1], (everywhere, everywhere), (0.0, high))
-    plain = semi_global(pictures[0], pictures[1], high)
+    plain = semi_global(pictures[0].astype(float), pictures[1].astype(float), high)
     for name, disparity in (("semi-global", plain), ("slanted windows", found.disparity_px.astype(float))):
         near = both & (depth > 2) & (depth < 20)
         off = disparity - truth

@@ -24,10 +24,10 @@ _BLOCK_PX = 5
 _MARGIN_PX = 3
 _AGREE_PX = 1.5
 """By how much the disparities that each picture finds in the other may differ."""
-_LEAST_SIGMA_PX, _PER_SPREAD, _POWER = 0.02, 4.1, 1.35
-"""Standard deviation of a disparity by the spread of its windows, pixels: `_PER_SPREAD spread^_POWER` and the
-least one, added in squares. Windows that look unlike have relief in them, and err by more than their spread
-says: from rendered images with truth (docs/terrain.md)."""
+_PER_SPREAD, _LEAST_SIGMA_PX = 1.65, 0.01
+"""Standard deviation of a disparity over the spread of its windows, and what is added to it in squares.
+Windows look unlike for their relief, several of their pixels for the same reason: from rendered images with
+truth (docs/terrain.md)."""
 _GRAIN = 64
 
 
@@ -81,7 +81,7 @@ def match(
     inside = (at >= 0) & (at < left.shape[1])
     seen = there[0] & inside & np.take_along_axis(there[1], np.where(inside, at, 0), axis=1)
     disparity = np.where(seen, disparity, np.float32(np.nan))
-    sigma = np.sqrt((_PER_SPREAD * spread**_POWER) ** 2 + _LEAST_SIGMA_PX**2)
+    sigma = np.sqrt((_PER_SPREAD * spread) ** 2 + _LEAST_SIGMA_PX**2)
     return Match(disparity_px=disparity, sigma_px=sigma.astype(np.float32), grey=left)
 
 
@@ -141,10 +141,7 @@ def _started(
 def refined(
     left: NDArray[np.float32], right: NDArray[np.float32], start_px: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Disparities (h, w) from a start that is right within a pixel, and their spread.
-
-    See `refine_rows` and `blend_rows`.
-    """
+    """Disparities (h, w) from a start that is right within a pixel, and their spread; see `refine_rows`."""
     taps, both = spline_taps(_BLUR_PX), np.array([1, 4, 1]) / 6
     splines: list[Any] = [
         cv2.sepFilter2D(p.astype(np.float32), cv2.CV_32F, taps, taps, borderType=cv2.BORDER_REFLECT_101)
@@ -164,19 +161,14 @@ def refined(
         )
         finer[..., k] = sum(np.float32(a) * padded[:, n : n + left.shape[1]] for n, a in enumerate(weights))
     finer = finer.reshape(left.shape[0], -1)
-    disparity, spread, blended, deviation = (np.full(left.shape, np.nan, dtype=np.float32) for _ in range(4))
-    slope = np.zeros((2, *left.shape), dtype=np.float32)
+    disparity, spread = (np.empty(left.shape, dtype=np.float32) for _ in range(2))
     start_px = np.ascontiguousarray(start_px, dtype=np.float32)
-
-    def refine(begin: int, end: int) -> None:
-        kernel.refine_rows(begin, end, own, finer, start_px, disparity, slope, spread)
-
-    def blend(begin: int, end: int) -> None:
-        kernel.blend_rows(begin, end, disparity, slope, spread, blended, deviation)
-
-    in_parallel(refine, len(left), grain=_GRAIN)
-    in_parallel(blend, len(left), grain=_GRAIN)
-    return blended, deviation
+    in_parallel(
+        lambda a, b: kernel.refine_rows(a, b, own, finer, start_px, disparity, spread),
+        len(left),
+        grain=_GRAIN,
+    )
+    return disparity, spread
 
 
 def disparity_limits(rectified: Rectified, nearest_m: float, farthest_m: float) -> tuple[float, float]:

@@ -4,5 +4,4 @@ from pancam_graph.terrain.kernel._fuse import fuse_cells as fuse_cells
 from pancam_graph.terrain.kernel._raster import raster_quads as raster_quads
 from pancam_graph.terrain.kernel._resample import resample as resample
 from pancam_graph.terrain.kernel._slanted import FINER as FINER
-from pancam_graph.terrain.kernel._slanted import blend_rows as blend_rows
 from pancam_graph.terrain.kernel._slanted import refine_rows as refine_rows

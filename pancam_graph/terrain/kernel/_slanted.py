@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pancam_graph.terrain.kernel._compiling import entry
 
-__all__ = ["FINER", "blend_rows", "refine_rows"]
+__all__ = ["FINER", "refine_rows"]
 
 FINER = 8
 """Columns of the second image a pixel: between them brightness is linear."""
@@ -31,12 +31,6 @@ _LEAST_WEIGHT = 0.25
 _FLAT = 1.0
 """Weight of a prior of slopes about those of the start, a share of what the window says of its middle."""
 
-_BLEND_PX = 3
-"""How far away windows are whose planes are blended."""
-_BLEND_WEIGHT_PX = 2.0
-"""Distance at which a plane's weight is a quarter."""
-_LEAST_SPREAD_PX = 0.01
-
 
 @entry
 def refine_rows(
@@ -46,16 +40,14 @@ def refine_rows(
     right: NDArray[np.float32],
     start_px: NDArray[np.float32],
     disparity_px: NDArray[np.float32],
-    slope: NDArray[np.float32],
     spread_px: NDArray[np.float32],
 ) -> None:
     """Refine the disparities of rows `first` to `last`.
 
     `left` (h, w) and `right` (h, FINER w) are rectified: a pixel (x, y) of the left lies at (x - d, y) of the
     right, whose columns are `1 / FINER` pixel apart. `start_px` (h, w) is right within a pixel; NaN: not
-    known. Written are `disparity_px`, NaN where nothing is found, its change a pixel to the right and down
-    (`slope`, (2, h, w)), and `spread_px`: the deviation of what is left between the windows, carried through
-    the inverse of the normal matrix.
+    known. Written are `disparity_px`, NaN where nothing is found, and `spread_px`: the deviation of what is
+    left between the windows, carried through the inverse of the normal matrix.
     """
     h, w = left.shape
     side = 2 * _HALF_PX + 1
@@ -183,49 +175,4 @@ def refine_rows(
                     break
             if found:
                 disparity_px[y, x] = d
-                slope[0, y, x], slope[1, y, x] = a, b
                 spread_px[y, x] = math.sqrt(max(left_over / s0 * inverse, 0.0))
-
-
-@entry
-def blend_rows(
-    first: int,
-    last: int,
-    disparity_px: NDArray[np.float32],
-    slope: NDArray[np.float32],
-    spread_px: NDArray[np.float32],
-    blended_px: NDArray[np.float32],
-    deviation_px: NDArray[np.float32],
-) -> None:
-    """Let the planes of neighbouring windows say what the disparity of rows `first` to `last` is.
-
-    Windows overlap, and some of them see more than others: the mean of their planes at a pixel is weighted
-    with the inverse squares of `spread_px` and the distance; a plane of another surface has little weight.
-    `disparity_px` (h, w), `slope` (2, h, w) and `spread_px` (h, w) are as `refine_rows` writes them. Written
-    are the mean, and the root of the weighted mean of squared spreads.
-    """
-    h, w = disparity_px.shape
-    for y in range(first, last):
-        for x in range(w):
-            d = float(disparity_px[y, x])
-            blended_px[y, x] = math.nan
-            deviation_px[y, x] = math.nan
-            if math.isnan(d):
-                continue
-            total = mean = square = 0.0
-            for j in range(max(y - _BLEND_PX, 0), min(y + _BLEND_PX, h - 1) + 1):
-                for i in range(max(x - _BLEND_PX, 0), min(x + _BLEND_PX, w - 1) + 1):
-                    beside = float(disparity_px[j, i])
-                    if math.isnan(beside):
-                        continue
-                    right, down = x - i, y - j
-                    said = beside + slope[0, j, i] * right + slope[1, j, i] * down
-                    off = (said - d) / _SAME_SURFACE_PX
-                    variance = float(spread_px[j, i]) ** 2 + _LEAST_SPREAD_PX**2
-                    far = (right * right + down * down) / _BLEND_WEIGHT_PX**2
-                    ww = (1 - far / (1 + far)) ** 2 / (variance * (1 + off * off) ** 2)
-                    total += ww
-                    mean += ww * said
-                    square += ww * variance
-            blended_px[y, x] = mean / total
-            deviation_px[y, x] = math.sqrt(square / total)
