@@ -24,7 +24,7 @@ _BLOCK_PX = 5
 _MARGIN_PX = 3
 _AGREE_PX = 1.5
 """By how much the disparities that each picture finds in the other may differ."""
-_PER_SPREAD, _LEAST_SIGMA_PX = 1.65, 0.01
+_PER_SPREAD, _LEAST_SIGMA_PX = 1.65, 0.02
 """Standard deviation of a disparity over the spread of its windows, and what is added to it in squares.
 Windows look unlike for their relief, several of their pixels for the same reason: from rendered images with
 truth (docs/terrain.md)."""
