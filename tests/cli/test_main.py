@@ -56,7 +56,11 @@ def test_python_m_is_the_command() -> None:
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        ([], "expected a subcommand (refine, init, check, terrain, simulate, render, drive, completion), found none"),
+        (
+            [],
+            "expected a subcommand (refine, init, check, terrain, simulate, render, drive, completion), "
+            "found none",
+        ),
         (["refin"], "found 'refin'; is 'refine' meant?"),
         (["--versoin"], "expected one of its options, found --versoin; is '--version' meant?"),
         (["refine", "F", "--moddel", "mast"], "found --moddel; is '--model' meant?"),
