@@ -28,8 +28,8 @@ _STEEPEST = 0.2
 """Least upward part of a normal with which the error of a depth is carried into one of the height."""
 _ACROSS_PX = 0.05
 """Standard deviation of where a pixel looks, across its line of sight."""
-_INDEPENDENT = 1.0
-"""Points of a frame, of those within one cell, that err independently: windows of neighbours overlap."""
+_ALIKE = 2.0
+"""Points of a frame in one cell of which one counts as a measurement: windows of neighbours overlap."""
 _JUMP_PX = 0.6
 """Difference of two neighbours' disparities between which something is hidden: on level ground it is the
 baseline over the mast's height, 0.13."""
@@ -103,7 +103,7 @@ class Surface:
         places[..., :2] -= low
         total = np.zeros((5, high[1] - low[1], high[0] - low[0]), dtype=np.float32)
         kernel.raster_quads(
-            places, self.height_variance_m2, self.grey, self.disparity_px, _JUMP_PX, _INDEPENDENT, total
+            places, self.height_variance_m2, self.grey, self.disparity_px, _JUMP_PX, _ALIKE, total
         )
         seen = total[0] > 0
         height, grey = (np.where(seen, total[k], np.float32(np.nan)) for k in (1, 2))
