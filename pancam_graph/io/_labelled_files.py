@@ -5,13 +5,17 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+import gtsam
+
 from pancam_graph.base.errors import InputError
 from pancam_graph.io._feed import feed_image, feed_records, picture_of_record
 from pancam_graph.io._labelled_image import LabelledImage
+from pancam_graph.io._pds4_exomars import exomars_image, is_exomars
 from pancam_graph.io._pds4_image import rover_image_of_xml
 from pancam_graph.io._pds_image import read_labelled_image
 from pancam_graph.io._pds_label import may_have_label
 from pancam_graph.io._picture_size import looks_like_picture
+from pancam_graph.io._site_files import SITE_FILE, site_poses
 from pancam_graph.io._xml import read_xml
 
 __all__ = ["LABEL_SUFFIXES", "LabelledFiles", "labelled_files"]
@@ -31,6 +35,8 @@ class LabelledFiles:
     """Why images cannot be used, by the names of their files without the ending."""
     warnings: list[str] = field(default_factory=list)
     """What is said of files with many records."""
+    site_poses: dict[int, gtsam.Pose3] = field(default_factory=dict)
+    """`before_T_site`, z up, by site, of .svf files."""
     unread: list[Path] = field(default_factory=list)
     """Files that have no label, and are none."""
 
@@ -59,10 +65,20 @@ def labelled_files(folder: Path) -> LabelledFiles:
         if label.stem not in known:
             _add(found, label, _without_image)
     _add_feed(found, by_suffix[".json"], files)
+    for file in (f for f in files if f.suffix.lower() == SITE_FILE):
+        try:
+            found.site_poses |= site_poses([file])
+        except InputError as error:
+            found.unusable[file.name] = error
     found.images.sort(key=lambda image: image.file.name)
     used = {image.file for image in found.images} | {image.label_file for image in found.images}
+    used |= {file for image in found.images for file in files if _labels(file, image.file)}
     said = set(found.unusable)
-    found.unread = [f for f in files if f not in used and not {f.stem, f.name} & said and f.is_file()]
+    found.unread = [
+        f
+        for f in files
+        if f not in used and not {f.stem, f.name} & said and f.suffix.lower() != SITE_FILE and f.is_file()
+    ]
     return found
 
 
@@ -71,6 +87,11 @@ def _add(found: LabelledFiles, file: Path, read: Callable[[Path], LabelledImage]
         found.images.append(read(file))
     except InputError as error:
         found.unusable.setdefault(file.stem, error)
+
+
+def _labels(file: Path, picture: Path) -> bool:
+    """Whether a file has the name of a label of a picture, which may have another one besides."""
+    return file.stem == picture.stem and file.suffix.lower() in LABEL_SUFFIXES
 
 
 def _add_feed(found: LabelledFiles, jsons: list[Path], files: list[Path]) -> None:
@@ -104,7 +125,7 @@ def _of_xml(label: Path) -> LabelledImage:
     root = read_xml(label)
     if root.name != _PRODUCT:
         raise InputError(f"{label}: expected a PDS4 label ({_PRODUCT}), found {root.name[:60]!r}")
-    return rover_image_of_xml(root)
+    return exomars_image(root) if is_exomars(root) else rover_image_of_xml(root)
 
 
 def _without_image(label: Path) -> LabelledImage:

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import gtsam
 
-from pancam_graph.base.geometry import FloatArray
 from pancam_graph.cameras import CAHV
 from pancam_graph.rigs import MastKinematics, PointingSigma, RigUncertainty
 
@@ -54,8 +53,10 @@ class LabelledImage:
     """What a user should know of how the label was read; the same for all images that it is true of."""
     levelled: bool = True
     """Whether the label has the rover's attitude; else `world_T_rover` has none."""
-    site_offset_m: FloatArray | None = None
-    """(3,) origin of the image's site in the frame of the site before it; None where the label has none."""
+    placed: bool = True
+    """Whether the label has the rover's place; else `world_T_rover` has none."""
+    site_before_T_site: gtsam.Pose3 | None = None
+    """The image's site in the frame of the site before it, z up; None where the label does not say it."""
 
     @property
     def unit(self) -> str:

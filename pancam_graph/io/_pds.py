@@ -1,4 +1,4 @@
-"""Rover images with PDS3 labels to a traverse: Mars Exploration Rovers, Curiosity, Perseverance.
+"""Rover images with labels to a traverse: Mars Exploration Rovers, Curiosity, Perseverance, ExoMars.
 
 What becomes what (docs/conventions.md for the frames):
 - world: the site frame of the labels turned to z up, so x is north, y west;
@@ -17,7 +17,7 @@ Label pixels count from 0 at the centre of the first one, as ours do.
 
 import logging
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -32,6 +32,7 @@ from pancam_graph.data import Frame, Image, Stop, Traverse
 from pancam_graph.io._input_format import InputFormat
 from pancam_graph.io._labelled_files import LABEL_SUFFIXES, labelled_files
 from pancam_graph.io._labelled_image import LabelledImage
+from pancam_graph.io._one_group import counted, named_files, one_group
 from pancam_graph.io._pds_exposures import one_of_each_exposure
 from pancam_graph.io._picture_size import looks_like_picture
 from pancam_graph.io._pictures import left_out
@@ -78,16 +79,17 @@ LOCALISATION_SIGMA = LocalisationSigma()
 
 
 def read_pds(folder: Path | str) -> Traverse:
-    """Read all *.IMG files of a folder, with PDS3 labels attached or in a .LBL beside each.
+    """Read all labelled images of a folder: PDS3, PDS4, and the raw-image feed (`labelled_files`).
 
     The traverse has no observations yet: they are to be found in its images. Of several products of one
-    exposure the best is used (`one_of_each_exposure`). Files that cannot be used are left out: no regular
-    file, shorter than the label says, without a label or an entry of it (camera model, rover pose, mast
-    angles), of a camera that is not on the mast. Warnings say what was left out, where the rig misses a
-    label's camera by more than 0.1 mm or 0.1 mrad, and where labels of one stop disagree.
+    exposure the best is used (`one_of_each_exposure`), of several rovers or sites the largest group that can
+    be solved together (`one_group`). Files that cannot be used are left out: no regular file, shorter than
+    the label says, without a label or an entry of it (camera model, rover pose, mast angles), of a camera
+    that is not on the mast. Warnings say what was left out, where the rig misses a label's camera by more
+    than 0.1 mm or 0.1 mrad, and where labels of one stop disagree.
 
-    Raises InputError naming file and entry for a folder without .IMG files, for images of two rovers or two
-    site frames, and, where no file can be used, for the first of them.
+    Raises InputError naming the folder without a labelled image, and, where no file can be used, file and
+    entry for the first of them.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -103,10 +105,20 @@ def read_pds(folder: Path | str) -> Traverse:
         )
     if not products:
         raise next(iter(unusable.values()))
-    kinematics = _common_mast(products)
-    exposures = one_of_each_exposure(products)
+    group = one_group(products, found.site_poses)
+    exposures = one_of_each_exposure(group.images)
     images = exposures.images
-    warnings = [*left_out(unusable), *found.warnings, *exposures.warnings, *_remarks(images)]
+    kinematics = images[0].mast
+    warnings = [
+        *_left_out(unusable),
+        *found.warnings,
+        *group.warnings,
+        *exposures.warnings,
+        *_remarks(images),
+    ]
+    if found.unread and (unusable or group.warnings):  # all is accounted for where something is left out
+        names = named_files([file.name for file in found.unread])
+        warnings.append(f"not read, for they are no labels and no labelled pictures: {names}")
     eye_of, eye_names = _sort_eyes(images)
     stop_ids, stops = _sort_stops(images, kinematics, warnings)
     frame_of, frames_first = _sort_frames(images, eye_of)
@@ -169,10 +181,17 @@ PDS3 = InputFormat(
 )
 
 
+def _left_out(unusable: Mapping[str, InputError]) -> list[str]:
+    """Warnings of files that cannot be used: the first five with their reasons, and names of others."""
+    said = left_out(unusable)
+    others = list(unusable)[len(said) - 1 :]
+    return [*said[:-1], f"{said[-1]}: {named_files(others)}"] if len(unusable) > len(said) else said
+
+
 def _remarks(images: Sequence[LabelledImage]) -> list[str]:
     """What is true of images, once for all of which it is true."""
     count = Counter(image.remark for image in images if image.remark)
-    said = [f"{number} of {len(images)} images: {remark}" for remark, number in count.items()]
+    said = [f"{number} of {counted(len(images))}: {remark}" for remark, number in count.items()]
     unlevel = sorted({_stop_id(image.stop) for image in images if not image.levelled})
     if unlevel:
         said.append(
@@ -184,23 +203,6 @@ def _remarks(images: Sequence[LabelledImage]) -> list[str]:
 
 def _kind(path: Path) -> str:
     return "a file" if path.exists() else "none"
-
-
-def _common_mast(images: Sequence[LabelledImage]) -> MastKinematics:
-    """The mast of all images. Raises InputError if they are of two rovers or in two site frames."""
-    first = images[0]
-    for image in images:
-        if image.host != first.host:
-            raise InputError(
-                f"{image.label_file}: INSTRUMENT_HOST_ID: expected {first.host} as in "
-                f"{first.label_file.name}, found {image.host}: images of two rovers"
-            )
-        if image.stop[0] != first.stop[0]:
-            raise InputError(
-                f"{image.label_file}: ROVER_MOTION_COUNTER: expected site {first.stop[0]} as in "
-                f"{first.label_file.name}, found {image.stop[0]}: poses in two site frames"
-            )
-    return first.mast
 
 
 def _sort_eyes(images: Sequence[LabelledImage]) -> tuple[IntArray, list[str]]:

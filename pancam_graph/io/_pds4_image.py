@@ -8,7 +8,6 @@ import re
 from pathlib import Path
 
 import gtsam
-import numpy as np
 
 from pancam_graph.base.errors import CameraError, GeometryError, InputError
 from pancam_graph.base.geometry import FloatArray, pose_from_wxyz
@@ -22,7 +21,7 @@ from pancam_graph.io._pds_rovers import rover_of
 from pancam_graph.io._xml import XmlElement
 from pancam_graph.rigs import camera_z_up, pose_z_up
 
-__all__ = ["rover_image_of_xml"]
+__all__ = ["motion_counter", "rover_image_of_xml"]
 
 _SITE = "SITE_FRAME"
 _VECTORS = {
@@ -69,7 +68,7 @@ def rover_image_of_xml(root: XmlElement, picture: Path | None = None) -> Labelle
         pan_tilt_rad = rover.mast.pan_tilt_rad(*rover.joints.readings_rad(*_mast_angles(root)))
     except (CameraError, GeometryError) as error:
         raise InputError(f"{root.file}: {error}") from error
-    counter = _counter(root)
+    counter = motion_counter(root)
     subframe = root.first("Subframe")
     return LabelledImage(
         file=file,
@@ -91,7 +90,7 @@ def rover_image_of_xml(root: XmlElement, picture: Path | None = None) -> Labelle
         pan_tilt_rad=pan_tilt_rad,
         world_T_rover=pose_z_up(site_T_rover),
         model=camera_z_up(model),
-        site_offset_m=_site_offset(root, counter["SITE"]),
+        site_before_T_site=_site_pose(root, counter["SITE"]),
     )
 
 
@@ -104,7 +103,9 @@ def _instrument_name(root: XmlElement) -> str:
 
 def _frame(reference: XmlElement) -> str:
     """The frame that a Coordinate_Space_Reference or Coordinate_Space_Present names, without its counters."""
-    told = reference.said("coordinate_space_frame_type", "") or reference.said("local_identifier_reference")
+    told = reference.said("coordinate_space_frame_type", "") or reference.said(
+        "local_identifier_reference", ""
+    )
     return _INDEXED.sub("", told.upper())
 
 
@@ -176,7 +177,7 @@ def _mast_angles(root: XmlElement) -> tuple[dict[str, float], str]:
     return angles, f"{root.file}: Device_Angle: index_id"
 
 
-def _counter(root: XmlElement) -> dict[str, int]:
+def motion_counter(root: XmlElement) -> dict[str, int]:
     """The first motion counter that knows site and drive, by name."""
     found: dict[str, int] = {}
     for counter in root.every("Motion_Counter"):
@@ -191,17 +192,16 @@ def _counter(root: XmlElement) -> dict[str, int]:
     )
 
 
-def _site_offset(root: XmlElement, site: int) -> FloatArray | None:
-    """Origin of the image's site in the frame of the site before it, z up; None where that is not told."""
+def _site_pose(root: XmlElement, site: int) -> gtsam.Pose3 | None:
+    """The image's site in the frame of the site before it, z up; None where that is not told."""
     for space in root.every("Coordinate_Space_Definition"):
         present, reference = (
             space.first("Coordinate_Space_Present"),
             space.first("Coordinate_Space_Reference"),
         )
-        if present is None or reference is None or _frame(present) != _SITE:
+        if present is None or reference is None or _frame(present) != _SITE or _frame(reference) != _SITE:
             continue
-        before = reference.first("index_value_number")
-        if before is None or (before.text, _frame(reference)) != (str(site - 1), _SITE):
-            continue
-        return np.asarray(pose_z_up(_pose(space, {_SITE})).translation())
+        own, before = present.first("index_value_number"), reference.first("index_value_number")
+        if own is not None and before is not None and (own.text, before.text) == (str(site), str(site - 1)):
+            return pose_z_up(_pose(space, {_SITE}))
     return None

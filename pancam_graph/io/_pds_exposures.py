@@ -7,6 +7,9 @@ one scene do, and every sigma would be too small.
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
 
 from pancam_graph.cameras import CAHV
 from pancam_graph.io._labelled_image import LabelledImage
@@ -14,6 +17,7 @@ from pancam_graph.io._labelled_image import LabelledImage
 __all__ = ["Exposures", "one_of_each_exposure"]
 
 _NAMED = 5
+_FAR_M = 100.0
 _TYPE = re.compile(r"(?:[12][A-Z]|[A-Z]{2}[A-Z0-9]_)\d{9}(?:_\d{3})?_?([A-Z]{3})")
 """Product type in the names of MER, MSL and Mars 2020, behind the clock."""
 _TYPES = ("RAD", "MRD", "RAS", "ILF", "ILT")
@@ -30,37 +34,61 @@ class Exposures:
 
 
 def one_of_each_exposure(images: Sequence[LabelledImage]) -> Exposures:
-    """The best product of each exposure: one spacecraft, instrument and start of the clock.
+    """The best product of each exposure: one spacecraft, camera and clock, one part of the detector.
 
-    Best is raw geometry before linearised, then more pixels, more bits, and radiometric correction. Products
-    whose first line or sample differ are tiles of the exposure, which show different things, and are all
-    kept; so is an image whose label has no SPACECRAFT_CLOCK_START_COUNT.
+    Best is raw geometry before linearised, then more pixels, more bits, and radiometric correction. Images of
+    one exposure of which neither sees the middle of the other are tiles, which show different things, and are
+    all kept; so is an image whose label has no clock.
     """
     products: dict[tuple[object, ...], list[LabelledImage]] = {}
     for image in images:
         products.setdefault(_exposure(image), []).append(image)
-    left_out: set[str] = set()
+    kept: list[LabelledImage] = []
     warnings: list[str] = []
     for same in products.values():
-        best, *others = sorted(same, key=_rank)
-        if others:
-            names = sorted(image.file.name for image in others)
-            left_out |= set(names)
-            warnings.append(
-                f"{best.file.name}: used of {len(same)} products of one exposure; left out: "
-                f"{', '.join(names)}"
-            )
+        used: dict[Path, list[str]] = {}
+        best: list[LabelledImage] = []
+        for image in sorted(same, key=_rank):
+            other = next((better for better in best if _show_the_same(better, image)), None)
+            if other is None:
+                best.append(image)
+            else:
+                used.setdefault(other.file, []).append(image.file.name)
+        kept += best
+        warnings += [
+            f"{file.name}: used of {len(names) + 1} products of one exposure; "
+            f"left out: {', '.join(sorted(names))}"
+            for file, names in used.items()
+        ]
     more = len(warnings) - _NAMED
     if more > 0:
         warnings[_NAMED:] = [f"{more} more exposures have several products, of which one each is used"]
-    kept = tuple(image for image in images if image.file.name not in left_out)
-    return Exposures(images=kept, warnings=tuple(warnings))
+    chosen = set(map(id, kept))
+    return Exposures(images=tuple(i for i in images if id(i) in chosen), warnings=tuple(warnings))
 
 
 def _exposure(image: LabelledImage) -> tuple[object, ...]:
     if image.clock_start is None:
         return (image.file,)
-    return image.host, image.instrument, image.clock_start, image.first_line_sample
+    return image.host, _camera(image), image.clock_start
+
+
+def _camera(image: LabelledImage) -> str:
+    """The camera without what labels of one camera may or may not add: NAVCAM_LEFT, NAV_LEFT_B."""
+    return image.instrument.replace("NAVCAM", "NAV")
+
+
+def _show_the_same(one: LabelledImage, other: LabelledImage) -> bool:
+    """Whether one image of an exposure sees the middle of the other; tiles overlap by a few pixels."""
+    return _sees_middle(one.model, other.model) or _sees_middle(other.model, one.model)
+
+
+def _sees_middle(camera: CAHV, other: CAHV) -> bool:
+    middle = np.array([[(other.width_px - 1) / 2, (other.height_px - 1) / 2]])
+    rays = other.unproject(middle)
+    pixel, valid = camera.project(rays.origin_m + _FAR_M * rays.direction)
+    size = np.array([camera.width_px, camera.height_px])
+    return bool(valid[0] and (pixel[0] >= -0.5).all() and (pixel[0] < size - 0.5).all())
 
 
 def _rank(image: LabelledImage) -> tuple[object, ...]:

@@ -21,6 +21,7 @@ __all__ = ["read_labelled_image"]
 _CAMERA_GROUPS = ("GEOMETRIC_CAMERA_MODEL", "GEOMETRIC_CAMERA_MODEL_PARMS")
 _LONGEST_SERIAL = 40
 _CLOCK = "SPACECRAFT_CLOCK_START_COUNT"
+_SITE_GROUPS = ("SITE_COORDINATE_SYSTEM", "SITE_COORDINATE_SYSTEM_PARMS", "SITE_COORD_SYSTEM_PARMS")
 _ROVER_GROUPS = ("ROVER_COORDINATE_SYSTEM", "ROVER_COORDINATE_SYSTEM_PARMS", "ROVER_COORD_SYSTEM_PARMS")
 
 
@@ -74,7 +75,19 @@ def read_labelled_image(file: Path) -> LabelledImage:
         world_T_rover=pose_z_up(site_T_rover),
         model=camera_z_up(model),
         serial=_serial(label),
+        site_before_T_site=_site_pose(label, counter["SITE"]),
     )
+
+
+def _site_pose(label: PdsLabel, site: int) -> gtsam.Pose3 | None:
+    """The image's site in the frame of the site before it, z up; None where the label does not say that."""
+    items = next((label.top.items[name] for name in _SITE_GROUPS if name in label.top.items), None)
+    if not isinstance(items, dict):
+        return None
+    told = items.get("COORDINATE_SYSTEM_INDEX"), items.get("REFERENCE_COORD_SYSTEM_INDEX")
+    if told != (site, site - 1):
+        return None
+    return pose_z_up(_pose(label.group(*_SITE_GROUPS), {"SITE_FRAME"}))
 
 
 def _serial(label: PdsLabel) -> str:

@@ -29,7 +29,7 @@ _MAX_PARSED = 1 << 17
 """Characters of the longest text that is parsed, which takes some seconds; labels have a quarter of it."""
 _BLOCK = re.compile(r"[ \t]*(?P<end>BEGIN_|END_)?(?P<kind>GROUP|OBJECT)[ \t]*=(?P<rest>.*)")
 _WANTED = re.compile(
-    r"IMAGE|GEOMETRIC_CAMERA_MODEL(_PARMS)?|(ROVER|PMA|RSM)_(COORD_|COORDINATE_)SYSTEM(_PARMS)?"
+    r"IMAGE|GEOMETRIC_CAMERA_MODEL(_PARMS)?|(ROVER|PMA|RSM|SITE)_(COORD_|COORDINATE_)SYSTEM(_PARMS)?"
     r"|(PMA|RSM)_ARTICULATION_STATE(_PARMS)?"
 )
 _NO_VALUE = 1e29

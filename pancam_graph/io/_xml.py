@@ -32,10 +32,15 @@ class XmlElement:
 
     file: Path
     name: str
-    unit: str = ""
+    attributes: dict[str, str] = field(default_factory=dict)
     text: str = ""
     """Its text without blanks around it; that of its children is theirs."""
     children: list["XmlElement"] = field(default_factory=list)
+
+    @property
+    def unit(self) -> str:
+        """Its unit, as the label writes it; "" without one."""
+        return self.attributes.get("unit", "").strip()
 
     def every(self, name: str) -> Iterator["XmlElement"]:
         """All elements of a name within it, at any depth, in their order."""
@@ -158,7 +163,7 @@ class _Builder:
     def _start(self, name: str, attributes: dict[str, str]) -> None:
         if len(self._open) > _MAX_DEPTH:
             raise _RefusedError(f"elements nested deeper than {_MAX_DEPTH}")
-        element = XmlElement(self._file, name.rpartition(":")[2], attributes.get("unit", "").strip())
+        element = XmlElement(self._file, name.rpartition(":")[2], attributes)
         self._open[-1].children.append(element)
         self._open.append(element)
         self._texts.append([])

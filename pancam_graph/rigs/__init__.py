@@ -6,6 +6,7 @@ from pancam_graph.rigs._covariance import POSE_ENTRIES as POSE_ENTRIES
 from pancam_graph.rigs._covariance import RIG_ENTRIES as RIG_ENTRIES
 from pancam_graph.rigs._covariance import RigCovariance as RigCovariance
 from pancam_graph.rigs._covariance import RigEntry as RigEntry
+from pancam_graph.rigs._exomars import EXOMARS_MAST as EXOMARS_MAST
 from pancam_graph.rigs._exomars import exomars_pancam as exomars_pancam
 from pancam_graph.rigs._mars2020 import MARS2020_MAST as MARS2020_MAST
 from pancam_graph.rigs._mars2020 import mars2020_mastcam_z as mars2020_mastcam_z

@@ -6,10 +6,27 @@ import gtsam
 import numpy as np
 
 from pancam_graph.rigs._eyes import design_eye
+from pancam_graph.rigs._mast import MastKinematics
 from pancam_graph.rigs._mer import MER_POINTING, mer_uncertainty
 from pancam_graph.rigs._rig import Rig
 
-__all__ = ["EXOMARS_TEMPLATES", "exomars_pancam"]
+__all__ = ["EXOMARS_MAST", "EXOMARS_TEMPLATES", "exomars_pancam"]
+
+EXOMARS_MAST = MastKinematics(
+    name="exomars",
+    azimuth_point_m=(0.0, 0.0, -1.64),
+    azimuth_axis=(0.0, 0.0, 1.0),
+    elevation_point_m=(0.0, 0.0, -1.64),
+    elevation_axis=(0.0, 1.0, 0.0),
+    elevation_given_at_rad=0.0,
+    home_azimuth_rad=0.0,
+    home_elevation_rad=0.0,
+    pointing_sigma=MER_POINTING,
+    mast_height_m=2.0,
+    source="ESA ExoMars frame and structure kernels (design values)",
+)
+"""Pan-tilt unit of ExoMars: axes that meet 1.64 m above the rover frame. Of the pivot's other coordinates
+nothing is known here; they move stops and no image."""
 
 
 def exomars_pancam() -> Rig:

@@ -21,6 +21,7 @@ from pancam_graph.cameras import CAHVORE
 from pancam_graph.data import Freedom, Sharing
 from pancam_graph.images._cache import Cache
 from pancam_graph.io import read_image, read_input, read_mask, read_pds, read_traverse, rig_json, use_rig
+from pancam_graph.io._site_files import site_poses
 from pancam_graph.io.plain import PlainOptions, plain_traverse, write_plain
 from pancam_graph.rigs import mer_navcam
 from pancam_graph.smoother import SmootherOptions
@@ -283,6 +284,25 @@ def labels_of_pds4(folder: Path) -> Case:
         (folder / "a.xml").write_bytes(mutated_bytes(rng, label) if rng.random() < 0.3 else label)
         said = outcome(lambda: read_pds(folder), folder)
         return said or outcome(lambda: read_image(folder / "a.dat"), folder)
+
+    return case
+
+
+@kind_of_case
+def files_of_sites(folder: Path) -> Case:
+    text = (
+        '<rmc_file>\n<priority>\n<entry solution_id="a"/>\n<entry solution_id="b"/>\n</priority>\n'
+        '<solution solution_id="b" name="SITE_FRAME" index1="5">\n'
+        '<reference_frame name="SITE_FRAME" index1="4"/>\n'
+        '<offset x="1.25" y="-3.5" z="0.1"/>\n<orientation s="1.0" v1="0.0" v2="0.0" v3="0.0"/>\n'
+        "</solution>\n</rmc_file>\n"
+    )
+    file = folder / "a.svf"
+
+    def case(rng: np.random.Generator) -> str:
+        label = mutated_text(rng, text).encode("utf-8", "replace")
+        file.write_bytes(mutated_bytes(rng, label) if rng.random() < 0.3 else label)
+        return outcome(lambda: site_poses([file]), folder)
 
     return case
 

@@ -217,15 +217,20 @@ def test_two_rovers_in_a_traverse_are_refused_by_name(truth: Traverse) -> None:
     assert len(read_traverse(truth.folder).images) == 3
 
 
-def test_two_rovers_in_a_folder_of_labels_are_refused_by_name(
+def test_of_two_rovers_in_a_folder_of_labels_one_is_used_and_the_other_named(
     opportunity_folder: Path, tmp_path: Path
 ) -> None:
     for k, file in enumerate(sorted(opportunity_folder.glob("*.IMG"))[:2]):
         host = rb'(INSTRUMENT_HOST_ID\s*=\s*"?)MER1'
         data = re.sub(host, rb"\g<1>MER2" if k else rb"\g<1>MER1", file.read_bytes())
         (tmp_path / file.name).write_bytes(data)
-    with pytest.raises(InputError, match=r"1N491020519.*IMG: INSTRUMENT_HOST_ID: expected MER1 .*two rovers"):
-        read_pds(tmp_path)
+    traverse = read_pds(tmp_path)
+    assert [image.id for image in traverse.images] == ["1N491020376ILFCNY9P0706L0M1"]
+    (warning,) = traverse.warnings
+    assert warning == (
+        "1 image of MER2 left out, for a run is of one rover, MER1 with 1 image here: "
+        "1N491020519ILFCNY9P0706L0M1.IMG"
+    )
 
 
 def test_what_a_label_calls_missing_is_missing(tmp_path: Path) -> None:

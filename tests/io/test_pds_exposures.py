@@ -19,6 +19,7 @@ def product(
     tile: int = 1,
 ) -> None:
     head = navcam_b_head()
+    head = replace(head, V=head.V - (tile - 1) * head.A)  # lines above the tile are not in its pixels
     text = label_text(Shot(head=head, joints=POINTINGS[pointing]), msl_mast())
     if linear:
         text = text.replace("MODEL_TYPE = CAHVOR", "MODEL_TYPE = CAHV")
@@ -64,12 +65,30 @@ def test_other_clocks_other_eyes_no_clock_and_tiles_are_kept(tmp_path: Path) -> 
     product(tmp_path, "NRB_1", clock=None, pointing=1)
     product(tmp_path, "NRB_2", pointing=2)
     product(tmp_path, "NRB_3", pointing=3, clock="1")
-    product(tmp_path, "NRB_4", pointing=2, tile=953)
+    product(tmp_path, "NRB_4", pointing=2, tile=5)
     other = tmp_path / "NRB_5.IMG"
     other.write_bytes((tmp_path / "NRB_2.IMG").read_bytes().replace(b"= NAV_RIGHT_B", b"= NAV_RIGHT_A"))
     files, warnings = names(tmp_path)
     assert files == [f"NRB_{k}.IMG" for k in range(6)]
     assert not any("products" in warning for warning in warnings)
+
+
+def test_a_subframe_and_a_thumbnail_yield_to_the_full_frame(tmp_path: Path) -> None:
+    product(tmp_path, "NRB_516721703EDR_F")
+    head = navcam_b_head()
+    for name, model, first in (
+        ("NRB_516721703RAD_S", replace(head, width_px=4, height_px=3, V=head.V - 2 * head.A), 3),
+        ("NRB_516721703RAD_T", replace(head, width_px=4, height_px=3, H=head.H / 2, V=head.V / 2), 1),
+    ):
+        part = label_text(Shot(head=model, joints=POINTINGS[0]), msl_mast())
+        part = part.replace("INSTRUMENT_ID", f'SPACECRAFT_CLOCK_START_COUNT = "0{CLOCK}"\r\nINSTRUMENT_ID', 1)
+        write(tmp_path, name, part.replace("  LINES = 3", f"  FIRST_LINE = {first}\r\n  LINES = 3"), model)
+    files, warnings = names(tmp_path)
+    assert files == ["NRB_516721703EDR_F.IMG"]
+    assert warnings == (
+        "NRB_516721703EDR_F.IMG: used of 3 products of one exposure; left out: NRB_516721703RAD_S.IMG, "
+        "NRB_516721703RAD_T.IMG",
+    )
 
 
 def test_of_many_exposures_with_several_products_a_few_are_named(tmp_path: Path) -> None:

@@ -109,23 +109,3 @@ def test_folders_without_rover_images_are_named(tmp_path: Path) -> None:
     (tmp_path / "a.IMG").write_bytes(b"garbage" * 1000)
     with pytest.raises(InputError, match=r"a\.IMG: expected a PDS3 label"):
         read_pds(tmp_path)
-
-
-def test_two_rovers_and_two_sites_are_refused(tmp_path: Path) -> None:
-    write(tmp_path, "NRB_0", label_text(Shot(head=navcam_b_head(), joints=POINTINGS[0]), msl_mast()))
-    shot = Shot(head=MARS2020_NAVCAM, joints=POINTINGS[0], instrument="NAVCAM_LEFT")
-    other = write(tmp_path, "ZLF_0", label_text(shot, mars2020_mast(as_designed=True), host="M20"))
-    with pytest.raises(
-        InputError, match=r"ZLF_0\.IMG: INSTRUMENT_HOST_ID: expected MSL as in NRB_0\.IMG, found M20"
-    ):
-        read_pds(tmp_path)
-    other.unlink()
-    write(
-        tmp_path,
-        "NRB_1",
-        label_text(Shot(head=navcam_b_head(), joints=POINTINGS[0], counter=(5, 0, 1)), msl_mast()),
-    )
-    with pytest.raises(
-        InputError, match=r"NRB_1\.IMG: ROVER_MOTION_COUNTER: expected site 4 as in NRB_0\.IMG"
-    ):
-        read_pds(tmp_path)
