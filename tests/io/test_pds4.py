@@ -181,7 +181,7 @@ OUTSIDE = '<!DOCTYPE a [<!ENTITY b SYSTEM "file:///etc/hostname">]>'
         (">SITE<", ">PLACE<", "Motion_Counter: expected SITE and DRIVE, found PLACE, DRIVE, POSE"),
         ("Forward", "Reverse", "expected rotation_direction Forward, found 'Reverse'"),
         (">ROVER_NAV_FRAME</geom:coord", ">LOCAL</geom:coord", "expected a Coordinate_Space_Definition of"),
-        (r"(<geom:q\w+>)[^<]*", r"\g<1>0", "Quaternion_Plus_Direction: a quaternion"),
+        (r"(<geom:q\w+>)[^<]*", r"\g<1>0", "Quaternion_Plus_Direction: expected a quaternion"),
         ("UnsignedByte", "ComplexMSB8", "expected a data_type of UnsignedByte, SignedByte"),
         (">Band<", ">Time<", "expected axes Line and Sample"),
         ("<elements>976", "<elements>977", "bytes or more for 977 lines of 1296 samples"),

@@ -63,7 +63,7 @@ def changed(pattern: str, by: str) -> Callable[[str], str]:
         ),
         (
             changed(r"QUATERNION = \(.*?\)", "QUATERNION = (0, 0, 0, 0)"),
-            "ORIGIN_ROTATION_QUATERNION: a quaternion",
+            "ORIGIN_ROTATION_QUATERNION: expected a quaternion",
         ),
         (
             changed("= SITE_FRAME", "= ORBITAL"),
