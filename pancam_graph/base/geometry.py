@@ -177,7 +177,7 @@ def rotation_from_wxyz(wxyz: Sequence[float] | FloatArray) -> FloatArray:
     q = np.asarray(wxyz, dtype=float)
     norm = float(np.linalg.norm(q))
     if q.shape != (4,) or not np.isfinite(norm) or norm < 1e-12:
-        raise GeometryError(f"expected a quaternion of 4 finite numbers, norm above 0, found {q.tolist()}")
+        raise GeometryError(f"expected a quaternion of 4 finite numbers of norm above 0, found {q.tolist()}")
     w, x, y, z = (float(c) for c in q / norm)
     return np.array(
         [
