@@ -84,6 +84,12 @@ def pds4_folder() -> Path:
 
 
 @pytest.fixture(scope="session")
+def msl_label_folder() -> Path:
+    """Labels of Curiosity, one of them with its image."""
+    return shared("data/msl_labels")
+
+
+@pytest.fixture(scope="session")
 def feed_folder() -> Path:
     """A Navcam picture of Perseverance with its record, from the public feed of raw images."""
     return shared("data/mars2020_raw")

@@ -39,12 +39,12 @@ class ImageContent:
 def read_image(path: Path) -> GreyImage:
     """Read an image as (rows, columns), 8 or 16 bits, grey.
 
-    A file that ends in .img, .dat or .raw is read through its label (PDS4, an .xml beside it; PDS3,
-    attached or a .LBL beside it): integers of 8, 16 or 32 bits and reals in either byte order. Negative
-    samples, and those that the label calls missing or invalid, become 0; of reals and of integers of 32 bits
-    the largest becomes 65,000. Anything else is left to OpenCV (PNG, TIFF, JPEG, PGM, BMP, WebP, JPEG 2000),
-    without turning or stretching. Colour becomes luma; an alpha channel is left out. Pixel [0, 0] is the top
-    left one.
+    A file that ends in .img, .vic, .dat or .raw is read through its label (PDS4, an .xml beside it; PDS3,
+    attached or a .LBL beside it; VICAR, attached): integers of 8, 16 or 32 bits and reals in either byte
+    order. Negative samples, and those that the label calls missing or invalid, become 0; of reals and of
+    integers of 32 bits the largest becomes 65,000. Anything else is left to OpenCV (PNG, TIFF, JPEG, PGM,
+    BMP, WebP, JPEG 2000), without turning or stretching. Colour becomes luma; an alpha channel is left out.
+    Pixel [0, 0] is the top left one.
 
     Raises ImageError for a file that is missing, no regular file, unreadable, truncated, of more than
     `MAX_PIXELS` by its header, or not of 8 or 16 bits.

@@ -20,7 +20,7 @@ from pancam_graph.io._xml import read_xml
 
 __all__ = ["LABEL_SUFFIXES", "LabelledFiles", "labelled_files"]
 
-LABEL_SUFFIXES = frozenset({".img", ".lbl", ".xml", ".json"})
+LABEL_SUFFIXES = frozenset({".img", ".vic", ".lbl", ".xml", ".json"})
 """How files with labels end, in small letters."""
 _PRODUCT = "Product_Observational"
 
@@ -52,7 +52,7 @@ def labelled_files(folder: Path) -> LabelledFiles:
     for label in by_suffix[".xml"]:
         _add(found, label, _of_xml)
     labelled = {image.file for image in found.images}
-    for file in by_suffix[".img"]:
+    for file in sorted(by_suffix[".img"] + by_suffix[".vic"]):
         if file in labelled:
             continue
         failed = found.unusable.pop(file.stem, None)

@@ -1,4 +1,4 @@
-"""PDS3 labels (ODL text) of rover images, attached in front of the image or detached in a .LBL beside it.
+"""PDS3 labels (ODL text) of rover images, in front of the image or in a .LBL beside it; also VICAR labels.
 
 Only what this package needs is read: the groups of the camera model, the rover and the mast, and
 the layout of the pixels. Names differ between missions; the accessors take all spellings.
@@ -18,6 +18,7 @@ from pancam_graph.base.errors import ImageError, InputError
 from pancam_graph.base.geometry import FloatArray
 from pancam_graph.base.regular_files import instead_of_file, is_missing
 from pancam_graph.io._image_layout import ImageLayout, Storage, require_sides
+from pancam_graph.io._vicar_label import VICAR_START, vicar_entries
 
 __all__ = ["LabelGroup", "PdsLabel", "may_have_label", "read_label"]
 
@@ -257,9 +258,13 @@ def read_label(file: Path) -> PdsLabel:
             head = _head(label_file)
         if not _looks_like_label(head):
             raise InputError(
-                f"{label_file}: expected a PDS3 label that starts with PDS_VERSION_ID or ODL_VERSION_ID, "
-                f"found {_shown(head)}"
+                f"{label_file}: expected a label that starts with PDS_VERSION_ID, ODL_VERSION_ID or "
+                f"LBLSIZE, found {_shown(head)}"
             )
+    if head.startswith(VICAR_START):
+        return PdsLabel(
+            file=file, label_file=file, top=LabelGroup(str(label_file), vicar_entries(file, head))
+        )
     end = _END.search(head)
     if end is None:
         raise InputError(
@@ -357,7 +362,7 @@ def _head(file: Path) -> bytes:
 
 def _looks_like_label(head: bytes) -> bool:
     text = re.sub(rb"\A(?:\s|/\*.*?\*/)*", b"", head[:4096], flags=re.DOTALL)
-    return text.startswith(_STARTS)
+    return text.startswith(_STARTS) or head.startswith(VICAR_START)
 
 
 def _shown(head: bytes) -> str:

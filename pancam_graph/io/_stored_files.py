@@ -9,7 +9,7 @@ from pancam_graph.io._stored_image import STORED_IMAGES, StoredImage
 
 __all__ = ["STORED_SUFFIXES", "read_stored_image"]
 
-STORED_SUFFIXES = frozenset({".img", ".dat", ".raw"})
+STORED_SUFFIXES = frozenset({".img", ".vic", ".dat", ".raw"})
 """How files with uncompressed samples end, in small letters."""
 
 

@@ -289,6 +289,28 @@ def labels_of_pds4(folder: Path) -> Case:
 
 
 @kind_of_case
+def labels_of_vicar(folder: Path) -> Case:
+    text = (
+        "LBLSIZE=512  FORMAT='HALF'\n ORG='BSQ'\n NL=3  NS=4  NB=1\n RECSIZE=8  N2=3  N3=1  NBB=0  NLB=0 "
+        "EOL=1 "
+        "INTFMT='HIGH'\n PROPERTY='IMAGE_DATA'\n MISSING_CONSTANT=(0,1)\n ANGLE=(1.5,2.5)  "
+        "ANGLE__UNIT=('rad','deg')\n "
+        "PROPERTY='IDENTIFICATION'\n INSTRUMENT_HOST_ID='MER1'\n NOTE='it''s'\n"
+    )
+    file = folder / "a.VIC"
+
+    def case(rng: np.random.Generator) -> str:
+        label = mutated_text(rng, text).encode("utf-8", "replace")
+        label = mutated_bytes(rng, label) if rng.random() < 0.3 else label
+        file.write_bytes(
+            label.ljust(512, b"\0") + bytes(range(24)) + b"LBLSIZE=40  PROPERTY='X' A=1".ljust(40)
+        )
+        return outcome(lambda: read_image(file), folder)
+
+    return case
+
+
+@kind_of_case
 def files_of_sites(folder: Path) -> Case:
     text = (
         '<rmc_file>\n<priority>\n<entry solution_id="a"/>\n<entry solution_id="b"/>\n</priority>\n'
