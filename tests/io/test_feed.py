@@ -203,3 +203,32 @@ def test_a_record_without_its_picture_and_foreign_json_are_told_apart(
     (tmp_path / "a.json").write_text('{"a": ')
     with pytest.raises(InputError, match=r"a\.json: line 1, column 7: expected JSON, found an error"):
         read_input(tmp_path)
+
+
+def test_an_attitude_that_is_missing_comes_from_the_stop_or_leaves_it_out(
+    real: dict[str, Any], tmp_path: Path
+) -> None:
+    absent = {"attitude": None}
+    records = [
+        record_of(real, 0),
+        record_of(real, 1) | absent,
+        record_of(real, 2, drive=700) | absent,
+    ]
+    for record in records:
+        picture(tmp_path, record)
+    (tmp_path / "a.json").write_text(json.dumps(records))
+    traverse = read_input(tmp_path)
+    assert [stop.id for stop in traverse.stops] == ["site32-drive604"]
+    assert len(traverse.images) == 2
+    name = str(records[2]["link"]).rpartition("/")[2]
+    assert (
+        "1 image left out, for no label of their stop has the rover's place and attitude: " + name
+    ) in traverse.warnings
+    assert not any("no attitude" in warning for warning in traverse.warnings)
+    # Without any attitude the stops are apart: the one with most images is solved.
+    (tmp_path / "a.json").write_text(json.dumps([record | absent for record in records]))
+    alone = read_input(tmp_path)
+    assert len(alone.images) == 2
+    assert any(
+        warning.startswith("1 image of site and drive (32, 700) left out") for warning in alone.warnings
+    )
