@@ -41,6 +41,10 @@ class LabelledFiles:
     """Files that have no label, and are none."""
 
 
+class _NoLabelError(InputError):
+    """A file of another kind than a label."""
+
+
 def labelled_files(folder: Path) -> LabelledFiles:
     """The images of a folder that have a label: PDS4, PDS3, or a record of the feed.
 
@@ -49,8 +53,14 @@ def labelled_files(folder: Path) -> LabelledFiles:
     found = LabelledFiles()
     files = sorted(file for file in folder.iterdir())
     by_suffix = {suffix: [f for f in files if f.suffix.lower() == suffix] for suffix in LABEL_SUFFIXES}
+    foreign: dict[str, InputError] = {}  # XML of other kinds, which is of no interest where there are images
     for label in by_suffix[".xml"]:
-        _add(found, label, _of_xml)
+        try:
+            found.images.append(_of_xml(label))
+        except _NoLabelError as error:
+            foreign[label.stem] = error
+        except InputError as error:
+            found.unusable[label.stem] = error
     labelled = {image.file for image in found.images}
     for file in sorted(by_suffix[".img"] + by_suffix[".vic"]):
         if file in labelled:
@@ -71,6 +81,8 @@ def labelled_files(folder: Path) -> LabelledFiles:
         except InputError as error:
             found.unusable[file.name] = error
     found.images.sort(key=lambda image: image.file.name)
+    if not found.images:
+        found.unusable = {**foreign, **found.unusable}
     used = {image.file for image in found.images} | {image.label_file for image in found.images}
     used |= {file for image in found.images for file in files if _labels(file, image.file)}
     said = set(found.unusable)
@@ -124,7 +136,7 @@ def _add_feed(found: LabelledFiles, jsons: list[Path], files: list[Path]) -> Non
 def _of_xml(label: Path) -> LabelledImage:
     root = read_xml(label)
     if root.name != _PRODUCT:
-        raise InputError(f"{label}: expected a PDS4 label ({_PRODUCT}), found {root.name[:60]!r}")
+        raise _NoLabelError(f"{label}: expected a PDS4 label ({_PRODUCT}), found {root.name[:60]!r}")
     return exomars_image(root) if is_exomars(root) else rover_image_of_xml(root)
 
 
