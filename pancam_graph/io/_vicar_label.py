@@ -48,6 +48,8 @@ def vicar_entries(file: Path, head: bytes) -> dict[str, Any]:
     size = 0 if told is None else int(told[1])
     if not 0 < size <= _MAX_LABEL_BYTES:
         raise InputError(f"{file}: LBLSIZE: expected 1 to {_MAX_LABEL_BYTES} bytes, found {size}")
+    if len(head) < size:
+        raise InputError(f"{file}: LBLSIZE: expected a label of {size} bytes, found {len(head)}")
     system, properties = _sections(file, head[:size])
     begin = _place(file, system, size)
     if system.get("EOL") == 1:

@@ -107,5 +107,5 @@ def test_folders_without_rover_images_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected a folder of rover images, found none"):
         read_pds(tmp_path / "nowhere")
     (tmp_path / "a.IMG").write_bytes(b"garbage" * 1000)
-    with pytest.raises(InputError, match=r"a\.IMG: expected a PDS3 label"):
+    with pytest.raises(InputError, match=r"a\.IMG: expected a label that starts with PDS_VERSION_ID"):
         read_pds(tmp_path)
