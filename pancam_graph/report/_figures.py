@@ -169,7 +169,7 @@ def make_corrections(solution: Solution) -> Figure:
         layout=layout(
             **axes,
             xaxis=axis(
-                "frame, counted from 0 in the order of the traverse",
+                "frame, counted from 0",
                 range=[-0.6, len(number) - 0.4],
                 anchor="y2",
                 tickformat="d",

@@ -2,6 +2,9 @@
 
 import json
 
+import numpy as np
+
+from pancam_graph.base.geometry import FloatArray, wrap_angle
 from pancam_graph.data import Solution
 from pancam_graph.mosaic import WrittenMosaics
 from pancam_graph.report._cross_validation import cross_validation_section
@@ -117,6 +120,7 @@ def headline(solution: Solution) -> list[tuple[str, str, str, bool]]:
     parts = (("reading", seconds.read), ("start", seconds.initialise), ("solving", seconds.solve))
     share = 100 * rejected / max(len(solution.used), 1)
     return [
+        *_pointing(solution),
         (
             "residual, RMS",
             f"{short(solution.rms_initial_px)} → {short(solution.rms_final_px)} px",
@@ -148,6 +152,35 @@ def headline(solution: Solution) -> list[tuple[str, str, str, bool]]:
             False,
         ),
     ]
+
+
+def _pointing(solution: Solution) -> list[tuple[str, str, str, bool]]:
+    """How far pan and tilt moved; nothing where no frame has both.
+
+    A turn that all frames of a stop share is mostly an error of the rover's heading, or of the encoders'
+    zero: what a panorama gains is the movement between neighbouring frames.
+    """
+    moved_mrad = 1e3 * wrap_angle(solution.correction_rad)
+    if not np.isfinite(moved_mrad).all(axis=1).any():
+        return []
+    same_stop = np.diff(solution.traverse.frame_stop) == 0
+    pan, tilt = (short(v) for v in _rms(moved_mrad))
+    remark = "RMS of all frames; "
+    if same_stop.any():
+        pan_apart, tilt_apart = (short(v) for v in _rms(np.diff(moved_mrad, axis=0)[same_stop]))
+        remark += f"between neighbouring frames of a stop {pan_apart} and {tilt_apart} mrad; "
+    known = [s for s in solution.angle_sigma_rad.T if (np.isfinite(s) & (s > 0)).any()]
+    sigmas = " and ".join(short(1e3 * float(np.median(s[np.isfinite(s) & (s > 0)]))) for s in known)
+    remark += f"formal sigma now {sigmas} mrad (median)" if known else "held by the telemetry"
+    return [("pan and tilt moved by", f"{pan} and {tilt} mrad", remark, False)]
+
+
+def _rms(values: FloatArray) -> FloatArray:
+    """Root mean squares of the finite numbers in each column (n, k); NaN where none is."""
+    finite = np.isfinite(values)
+    squares = np.where(finite, values, 0.0) ** 2
+    counted = finite.sum(axis=0)
+    return np.asarray(np.sqrt(np.where(counted > 0, squares.sum(axis=0) / np.maximum(counted, 1), np.nan)))
 
 
 def _outcome(solution: Solution) -> str:
@@ -207,12 +240,12 @@ def _vector_figure(shown: int, *, seen: int) -> Figure:
         traces=(),
         layout=layout(
             **axes,
-            margin={"l": 60, "r": 15, "t": 45, "b": 50},
+            margin={"l": 60, "r": 15, "t": 45, "b": 85},
             legend={
                 "orientation": "h",
-                "x": 1,
-                "xanchor": "right",
-                "y": 1.0,
+                "x": 0,
+                "y": 0,
+                "yref": "container",
                 "yanchor": "bottom",
                 "itemsizing": "constant",
             },

@@ -20,6 +20,49 @@ function filled(select, names) {
   return select;
 }
 
+// On a phone legends lie below their figures, where they hide nothing.
+function fitted(layout, width) {
+  if (width >= 600 || !layout.legend || layout.legend.y < 0) return layout;
+  const margin = { ...layout.margin };
+  margin.b += 62;
+  return { ...layout, margin, legend: { ...layout.legend, orientation: "h", x: 0, xanchor: "left", y: 0,
+    yanchor: "bottom", yref: "container" } };
+}
+
+// A picture of the scene, for paper.
+async function drawStill() {
+  const scene = document.getElementById("scene");
+  const picture = await Plotly.toImage(scene, { format: "png", width: 1100, height: 620 });
+  let still = scene.parentElement.querySelector(".still");
+  if (!still) {
+    still = document.createElement("img");
+    still.className = "still";
+    still.alt = "The scene, as chosen on the screen";
+    scene.after(still);
+  }
+  still.src = picture;
+}
+
+// Paper is narrower than a screen; figures are drawn again for it, and then for the screen once more.
+const PAPER_PX = 700;
+function fitToPaper() {
+  document.querySelectorAll(".js-plotly-plot:not(#scene)").forEach((place) => {
+    const width = Math.min(PAPER_PX, place.clientWidth);
+    place.dataset.height = place.style.height;
+    const height = Math.round(place.clientHeight * Math.sqrt(width / place.clientWidth));
+    place.style.height = `${height}px`;
+    Plotly.relayout(place, { width, height });
+  });
+}
+function fitToScreen() {
+  document.querySelectorAll(".js-plotly-plot:not(#scene)").forEach((place) => {
+    place.style.height = place.dataset.height;
+    Plotly.relayout(place, { width: null, height: null, autosize: true });
+  });
+}
+addEventListener("beforeprint", fitToPaper);
+addEventListener("afterprint", fitToScreen);
+
 function drawScene(page) {
   const scene = page.figures.find((figure) => figure.id === "scene");
   const roles = scene.data.map((trace) => trace.meta);
@@ -34,7 +77,7 @@ function drawScene(page) {
       layout[`scene.${name}axis.range`] = view.range[i];
       layout[`scene.${name}axis.nticks`] = view.ticks[i];
     });
-    Plotly.update("scene", { visible: roles.map((role) => role !== hidden) }, layout);
+    Plotly.update("scene", { visible: roles.map((role) => role !== hidden) }, layout).then(drawStill);
   });
 }
 
@@ -91,11 +134,10 @@ function drawVectors(page) {
       xref: `x${n}`, yref: `y${n}`, x: -0.5, y: -0.5, sizex: image.width, sizey: image.height,
       xanchor: "left", yanchor: "top", sizing: "stretch", layer: "below" }));
     const place = document.getElementById("vectors");
-    const narrow = place.clientWidth < 900;  // where a title and the legend have no room beside each other
-    if (narrow) Object.assign(layout, { margin: { ...layout.margin, t: 70, b: 85 },
-      legend: { ...layout.legend, x: 0, xanchor: "left", y: 0, yanchor: "bottom", yref: "container" } });
+    const narrow = place.clientWidth < 900;  // where a title has no room in one line
+    if (narrow) layout.margin = { ...layout.margin, t: 70 };
     layout.annotations = ["before", "after"].map((side, i) => ({
-      text: `<b>${side}</b>${narrow ? "<br>" : ", "}vectors ${
+      text: `<b>${side}</b>${narrow ? "<br>" : ", vectors "}${
         factors[i] === 1 ? "at true length" : `${factors[i].toLocaleString("en")} times enlarged`}`,
       align: "left",
       xref: `x${i ? "2" : ""} domain`, yref: "paper", x: 0, y: 1.005, xanchor: "left", yanchor: "bottom",
@@ -104,7 +146,7 @@ function drawVectors(page) {
       ? `${image.shown} of the ${image.total} observations are drawn. ` : "") +
       (image.picture === null ? "There is no picture of this image, so its frame is empty." : "");
     // As high as two panels side by side need, for any shape of image.
-    const high = 0.485 * (place.clientWidth - 75) * image.height / image.width + (narrow ? 160 : 100);
+    const high = 0.485 * (place.clientWidth - 75) * image.height / image.width + (narrow ? 160 : 135);
     place.style.height = `${Math.round(Math.min(Math.max(high, 300), 860))}px`;
     Plotly.react(place, data, layout, config);
     Plotly.Plots.resize(place);
@@ -154,10 +196,13 @@ function sayFailed(place, error) {
     const page = JSON.parse(await unpacked("packed-figures"));
     for (const { id, data, layout } of page.figures) {
       if (id === "vectors") continue;
-      await Plotly.newPlot(id, data, layout, config).catch((e) => sayFailed(document.getElementById(id), e));
+      const place = document.getElementById(id);
+      await Plotly.newPlot(place, data, fitted(layout, place.clientWidth), config)
+        .catch((e) => sayFailed(place, e));
     }
     drawScene(page);
     drawVectors(page);
+    await drawStill().catch(() => {});  // a page without WebGL has said so already
     document.documentElement.dataset.drawn = "yes";
   } catch (error) {
     document.querySelectorAll(".plot:empty").forEach((place) => sayFailed(place, error));

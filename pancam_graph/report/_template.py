@@ -25,12 +25,12 @@ PAGE = (
 {headline}
 </dl>
 </header>
-{scene}
-<div class="pair">
+{mosaics}<div class="pair">
 {map}
 {histogram}
 </div>
-{mosaics}{vectors}
+{scene}
+{vectors}
 {corrections}
 {rig}{cross_validation}
 <section>

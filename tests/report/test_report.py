@@ -74,6 +74,21 @@ def test_words_of_the_head(solution: Solution) -> None:
     assert figures["time"][0] == "1.8 s"
 
 
+def test_how_far_the_pointing_moved_stands_first(solution: Solution) -> None:
+    """Absolute, and between neighbouring frames of a stop: a turn that they share is not a gain."""
+    frames = solution.traverse.frames
+    alternating = np.where(np.arange(len(frames)) % 2 == 0, 1e-3, -1e-3)
+    told = solution.traverse.pan_tilt_rad
+    turned = told + np.column_stack([np.full(len(frames), 5e-3), alternating])
+    turned[3] = np.nan
+    moved = replace(solution, final=replace(solution.final, pan_tilt_rad=turned))
+    name, value, remark, bad = headline(moved)[0]
+    assert (name, value, bad) == ("pan and tilt moved by", "5.00 and 1.00 mrad", False)
+    assert "between neighbouring frames of a stop 0 and 2.00 mrad" in remark
+    nowhere = replace(solution, final=replace(solution.final, pan_tilt_rad=np.full_like(told, np.nan)))
+    assert headline(nowhere)[0][0] == "residual, RMS"
+
+
 def test_scene_and_map_hold_every_landmark_inside(solution: Solution) -> None:
     terrain = shown_terrain(solution)
     usable = np.isfinite(landmark_residuals(solution))
