@@ -184,8 +184,8 @@ PDS3 = InputFormat(
 def _left_out(unusable: Mapping[str, InputError]) -> list[str]:
     """Warnings of files that cannot be used: the first five with their reasons, and names of others."""
     said = left_out(unusable)
-    others = list(unusable)[len(said) - 1 :]
-    return [*said[:-1], f"{said[-1]}: {named_files(others)}"] if len(unusable) > len(said) else said
+    others = list(unusable)[sum(warning.startswith("image ") for warning in said) :]
+    return [*said[:-1], f"{said[-1]}: {named_files(others)}"] if others else said
 
 
 def _remarks(images: Sequence[LabelledImage]) -> list[str]:
