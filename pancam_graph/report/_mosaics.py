@@ -17,6 +17,7 @@ _STYLE = """
 .controls button[aria-pressed=true] { background: var(--after); color: #ffffff; border-style: inset; }
 .controls input[type=range] { width: 220px; vertical-align: middle; }
 .blink figcaption { margin-top: 6px; font-weight: 600; min-height: 1.5em; overflow-wrap: anywhere; }
+@media print { #mosaics .controls { display: none; } }
 .seams li { overflow-wrap: anywhere; max-width: 130ch; }
 """
 _SCRIPT = r"""

@@ -98,7 +98,7 @@ code { font-size: 14px; }
   .panels { grid-template-columns: repeat(2, minmax(0, 1fr)); }
   tr, .plot, .figures div { break-inside: avoid; }
   h2, .controls { break-after: avoid; }
-  .modebar, .controls span:not([id]), #mosaics .controls { display: none !important; }
+  .modebar, .controls span:not([id]) { display: none !important; }
   /* What WebGL draws does not reach paper: a picture of it does. */
   .plot:has(+ .still) { display: none; }
   .still { display: block; max-width: 100%; break-inside: avoid; }
