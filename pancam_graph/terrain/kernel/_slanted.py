@@ -10,6 +10,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from pancam_graph.base.compiled import part
+from pancam_graph.base.geometry import FloatArray
 from pancam_graph.terrain.kernel._compiling import entry
 
 __all__ = ["FINER", "refine_rows"]
@@ -30,6 +32,47 @@ _LEAST_WEIGHT = 0.25
 """Share of a window's weight that must lie in both images, on the surface of its middle."""
 _FLAT = 1.0
 """Weight of a prior of slopes about those of the start, a share of what the window says of its middle."""
+
+
+@part
+def _plane(
+    taps: int,
+    u: FloatArray,
+    v: FloatArray,
+    off: FloatArray,
+    first_weight: FloatArray,
+    weight: FloatArray,
+) -> tuple[float, float, float, float]:
+    """The plane of the starts around a pixel, those of other surfaces left out.
+
+    Returns the sum of the weights, which are written, the plane at the middle, and its slopes along x and y.
+    """
+    a, b, middle, s0 = 0.0, 0.0, 0.0, 0.0
+    for _ in range(2):
+        s0 = sx = sy = sxx = sxy = syy = sd = sxd = syd = 0.0
+        for k in range(taps):
+            out = (off[k] - a * u[k] - b * v[k]) / _SAME_SURFACE_PX
+            ww = first_weight[k] / ((1 + out * out) * (1 + out * out))
+            weight[k] = ww
+            wu, wv, wo = ww * u[k], ww * v[k], ww * off[k]
+            s0 += ww
+            sx += wu
+            sy += wv
+            sxx += wu * u[k]
+            sxy += wu * v[k]
+            syy += wv * v[k]
+            sd += wo
+            sxd += wu * off[k]
+            syd += wv * off[k]
+        if s0 < 2:
+            return s0, 0.0, a, b
+        mx, my = sx / s0, sy / s0
+        cxx, cxy, cyy = sxx - sx * mx + 0.02 * s0, sxy - sx * my, syy - sy * my + 0.02 * s0
+        bx, by = sxd - mx * sd, syd - my * sd
+        det = cxx * cyy - cxy * cxy
+        a, b = (cyy * bx - cxy * by) / det, (cxx * by - cxy * bx) / det
+        middle = sd / s0 - a * mx - b * my
+    return s0, middle, a, b
 
 
 @entry
@@ -81,33 +124,8 @@ def refine_rows(
                     value[taps] = left[yy, xx]
                     own_gradient[taps] = 0.5 * (left[yy, min(xx + 1, w - 1)] - left[yy, max(xx - 1, 0)])
                     taps += 1
-            # The plane of the starts around, those of other surfaces left out.
-            a, b, s0 = 0.0, 0.0, 0.0
-            for again in range(2):
-                s0 = sx = sy = sxx = sxy = syy = sd = sxd = syd = 0.0
-                for k in range(taps):
-                    out = (off[k] - a * u[k] - b * v[k]) / _SAME_SURFACE_PX
-                    ww = first_weight[k] / ((1 + out * out) * (1 + out * out))
-                    weight[k] = ww
-                    wu, wv, wo = ww * u[k], ww * v[k], ww * off[k]
-                    s0 += ww
-                    sx += wu
-                    sy += wv
-                    sxx += wu * u[k]
-                    sxy += wu * v[k]
-                    syy += wv * v[k]
-                    sd += wo
-                    sxd += wu * off[k]
-                    syd += wv * off[k]
-                if s0 < 2:
-                    break
-                mx, my = sx / s0, sy / s0
-                cxx, cxy, cyy = sxx - sx * mx + 0.02 * s0, sxy - sx * my, syy - sy * my + 0.02 * s0
-                bx, by = sxd - mx * sd, syd - my * sd
-                det = cxx * cyy - cxy * cxy
-                a, b = (cyy * bx - cxy * by) / det, (cxx * by - cxy * bx) / det
-                if again == 1:
-                    d += sd / s0 - a * mx - b * my
+            s0, off_middle, a, b = _plane(taps, u, v, off, first_weight, weight)
+            d += off_middle
             if s0 < _LEAST_WEIGHT * 2 * math.pi * _WEIGHT_PX**2:
                 continue
             mean = own_square = 0.0
