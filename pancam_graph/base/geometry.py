@@ -20,6 +20,7 @@ __all__ = [
     "BoolArray",
     "FloatArray",
     "IntArray",
+    "axes_across",
     "compose",
     "corrected_poses",
     "correction_twists",
@@ -69,6 +70,14 @@ def rz(angle_rad: float) -> FloatArray:
     """Rotation about z; pan."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def axes_across(directions: FloatArray) -> FloatArray:
+    """Two unit vectors (n, 2, 3) across unit directions (n, 3) and across each other, right-handed."""
+    least = np.eye(3)[np.argmin(np.abs(directions), axis=1)]
+    first = np.cross(directions, least)
+    first = first / np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(directions, first)], axis=1)
 
 
 def skew(v: FloatArray) -> FloatArray:

@@ -26,9 +26,11 @@ from pancam_graph.cameras._lens import LensField as LensField
 from pancam_graph.cameras._lens_table import LENS_SOURCES as LENS_SOURCES
 from pancam_graph.cameras._lens_table import LensTable as LensTable
 from pancam_graph.cameras._lens_table import distort as distort
+from pancam_graph.cameras._lenses import CAHVORE_TYPES as CAHVORE_TYPES
 from pancam_graph.cameras._lenses import LENSES as LENSES
 from pancam_graph.cameras._lenses import as_cahv as as_cahv
 from pancam_graph.cameras._lenses import cahv_of_vectors as cahv_of_vectors
+from pancam_graph.cameras._lenses import cahvore_linearity as cahvore_linearity
 from pancam_graph.cameras._lenses import lens_of as lens_of
 from pancam_graph.cameras._matrix import CALIBRATION_ENTRIES as CALIBRATION_ENTRIES
 from pancam_graph.cameras._matrix import decompose_projection as decompose_projection

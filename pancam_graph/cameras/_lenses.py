@@ -12,7 +12,7 @@ from pancam_graph.cameras._cahvore import CAHVORE, CAHVORE_LENS
 from pancam_graph.cameras._camera import PINHOLE_LENS, Camera
 from pancam_graph.cameras._lens import Lens
 
-__all__ = ["LENSES", "as_cahv", "cahv_of_vectors", "lens_of"]
+__all__ = ["CAHVORE_TYPES", "LENSES", "as_cahv", "cahv_of_vectors", "cahvore_linearity", "lens_of"]
 
 LENSES: tuple[Lens[Any], ...] = (PINHOLE_LENS, BROWN_LENS, CAHV_LENS, CAHVOR_LENS, CAHVORE_LENS)
 """All camera models, in the order in which error messages name them."""
@@ -43,6 +43,15 @@ def as_cahv(camera: Camera) -> CAHV:
     vectors = dict(lens_of(camera).cahv_vectors(camera))
     linearity = vectors.pop("linearity", 1.0)
     return cahv_of_vectors(camera.width_px, camera.height_px, vectors, linearity)
+
+
+CAHVORE_TYPES = (1, 2, 3)
+"""Types of a CAHVORE: perspective, fish-eye, and general."""
+
+
+def cahvore_linearity(kind: int, parameter: float) -> float:
+    """Linearity of a CAHVORE by its type, one of `CAHVORE_TYPES`; `parameter` is that of a general one."""
+    return {1: 1.0, 2: 0.0, 3: parameter}[kind]
 
 
 def cahv_of_vectors(

@@ -1,5 +1,6 @@
 """Drawing for people: pictures with axes and words."""
 
+from pancam_graph.charts._encoded import encoded as encoded
 from pancam_graph.charts._framed import INK as INK
 from pancam_graph.charts._framed import STEPS as STEPS
 from pancam_graph.charts._framed import Axis as Axis

@@ -267,6 +267,7 @@ class Traverse:
         """Raise InputError for a constraint on what there is not, and for exact ones that contradict."""
         stops = [s.id for s in self.stops]
         held = {s.id for s in self.stops if not s.sigmas.any()}
+        alike: dict[tuple[object, ...], list[int]] = {}
         for i, one in enumerate(self.constraints):
             where = f"constraints[{i}] ({one.kind})"
             for stop in one.stops:
@@ -278,12 +279,14 @@ class Traverse:
                 raise InputError(
                     f"{where}: expected a stop that can move, found {' and '.join(one.stops)} held by sigma 0"
                 )
-            for j, other in enumerate(self.constraints[:i]):
-                if one.contradicts(other):
+            before = alike.setdefault((one.kind, one.landmarks, frozenset(one.stops)), [])
+            for j in before:
+                if one.contradicts(self.constraints[j]):
                     raise InputError(
                         f"{where}: expected what constraints[{j}] says, which is exact (sigma 0) as this is; "
                         "found another value"
                     )
+            before.append(i)
 
     def track_of(self, landmark: Landmark, where: str = "landmark") -> int | None:
         """Number of the track of a landmark, by name or number; None where it has none yet.

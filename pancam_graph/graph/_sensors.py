@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, rz
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, axes_across, rz
 from pancam_graph.cameras import Fields, LensTable, Sensor
 from pancam_graph.data import (
     Constraint,
@@ -114,12 +114,7 @@ def _row(traverse: Traverse, stop: str) -> int:
 def _rotation(along: FloatArray) -> FloatArray:
     """A rotation (3, 3) whose first columns are these one or two (3, k) orthonormal ones."""
     first = along[:, 0]
-    if along.shape[1] == 1:
-        least = np.eye(3)[int(np.argmin(np.abs(first)))]
-        second = np.cross(first, least)
-        second /= np.linalg.norm(second)
-    else:
-        second = along[:, 1]
+    second = along[:, 1] if along.shape[1] > 1 else axes_across(first[None])[0, 0]
     return np.column_stack([first, second, np.cross(first, second)])
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from pancam_graph.base.errors import CameraError, GeometryError, InputError
 from pancam_graph.base.geometry import FloatArray, pose_from_wxyz
-from pancam_graph.cameras import CAHV, cahv_of_vectors
+from pancam_graph.cameras import CAHV, CAHVORE_TYPES, cahv_of_vectors, cahvore_linearity
 from pancam_graph.io._clock import plain_clock
 from pancam_graph.io._json import any_json, read_bytes, short
 from pancam_graph.io._labelled_image import LabelledImage
@@ -38,8 +38,6 @@ _NAMES = ("filename", "link", "url", "fullres", "image", "jsonlink", "imageid")
 _ABOUT = PointingSigma(pan_rad=float(np.deg2rad(1.0)), tilt_rad=float(np.deg2rad(1.0)))
 """Accuracy of mast_az and mast_el, which are about where the head looks: 1 degree."""
 _UNKNOWN = {"", "UNK", "NONE", "NULL", "N/A", "NA"}
-
-
 _CLOCK = re.compile(r"_\d{4}_(\d{10})_(\d{3})")
 """The clock at the start of the exposure in the names of Perseverance's pictures."""
 _MARS2020_NAME = re.compile(r"[A-Z0-9]{2,3}_?_\d{4}_\d{10}_\d{3}")
@@ -70,9 +68,13 @@ class FeedRecord:
             f"{self.where}{'.' if self.place else ': '}{entry}: expected {expected}, found {found}"
         )
 
+    def _value(self, entry: str) -> Any:
+        """What the record has of an entry; None where it is missing."""
+        return self.entries.get(_plain(entry))
+
     def text(self, entry: str) -> str:
         """An entry as text; "" where it is missing or says that it is unknown."""
-        value = self.entries.get(entry.replace("_", "").lower())
+        value = self._value(entry)
         text = "" if value is None or isinstance(value, dict | list) else str(value).strip()
         return "" if text.upper() in _UNKNOWN else text
 
@@ -81,9 +83,7 @@ class FeedRecord:
         text = self.text(entry)
         if not text:
             return None
-        number = (
-            None if isinstance(self.entries.get(entry.replace("_", "").lower()), bool) else told_number(text)
-        )
+        number = None if isinstance(self._value(entry), bool) else told_number(text)
         if number is None:
             self.refuse(entry, "a number", short(text))
         return number
@@ -93,7 +93,7 @@ class FeedRecord:
 
         Raises InputError for another text, and for another count.
         """
-        value = self.entries.get(entry.replace("_", "").lower())
+        value = self._value(entry)
         if isinstance(value, str):
             if value.strip().upper() in _UNKNOWN:
                 return None
@@ -102,8 +102,13 @@ class FeedRecord:
             return None
         numbers = [_number(v) for v in value] if isinstance(value, list) else []
         if len(numbers) != count or None in numbers:
-            self.refuse(entry, f"{count} numbers", short(self.entries[entry.replace("_", "").lower()]))
+            self.refuse(entry, f"{count} numbers", short(self._value(entry)))
         return [float(v) for v in numbers if v is not None]
+
+
+def _plain(name: object) -> str:
+    """A name in small letters without underscores."""
+    return str(name).replace("_", "").lower()
 
 
 def _number(value: object) -> float | None:
@@ -137,15 +142,11 @@ def _records(file: Path, value: object, place: str) -> Iterator[FeedRecord]:
 
 def _opened(value: Mapping[str, Any]) -> dict[str, Any]:
     """Entries by their plain names; those of nested objects, but for ones that are there already."""
-    out = {
-        str(key).replace("_", "").lower(): entry
-        for key, entry in value.items()
-        if not isinstance(entry, dict)
-    }
+    out = {_plain(key): entry for key, entry in value.items() if not isinstance(entry, dict)}
     for entry in value.values():
         if isinstance(entry, dict):
             for key, inner in entry.items():
-                out.setdefault(str(key).replace("_", "").lower(), inner)
+                out.setdefault(_plain(key), inner)
     return out
 
 
@@ -268,11 +269,12 @@ def _camera_model(record: FeedRecord, width_px: int, height_px: int) -> CAHV:
     linearity = 1.0
     if kind == "CAHVORE":
         told = [told_number(part.strip("()")) for part in parts[7:9]]
-        if len(told) < 2 or None in told or told[0] not in {1.0, 2.0, 3.0}:
+        number, parameter = (*told, None, None)[:2]
+        if number is None or number not in CAHVORE_TYPES or parameter is None:
             record.refuse(
                 entry, "behind C;A;H;V;O;R;E a type of 1, 2 or 3 and a linearity", short(parts[7:9])
             )
-        linearity = {1.0: 1.0, 2.0: 0.0}.get(told[0] or 0.0, told[1] or 0.0)
+        linearity = cahvore_linearity(int(number), parameter)
     return cahv_of_vectors(width_px, height_px, {letter: known[letter] for letter in kind}, linearity)
 
 

@@ -12,7 +12,7 @@ import gtsam
 from pancam_graph.base.errors import CameraError, GeometryError, InputError
 from pancam_graph.base.geometry import FloatArray, pose_from_wxyz
 from pancam_graph.base.text import visible
-from pancam_graph.cameras import CAHV, cahv_of_vectors
+from pancam_graph.cameras import CAHV, CAHVORE_TYPES, cahv_of_vectors, cahvore_linearity
 from pancam_graph.io._clock import plain_clock
 from pancam_graph.io._labelled_image import LabelledImage
 from pancam_graph.io._pds4_samples import described_picture, pds4_host
@@ -151,9 +151,9 @@ def _camera_model(camera: XmlElement, width_px: int, height_px: int) -> tuple[CA
     linearity = 1.0
     if kind == "CAHVORE":
         told = terms.whole("cahvore_model_type")
-        if told not in {1, 2, 3}:
+        if told not in CAHVORE_TYPES:
             terms.refuse("a cahvore_model_type of 1, 2 or 3", told)
-        linearity = {1: 1.0, 2: 0.0}.get(told, terms.required("cahvore_model_parameter").number())
+        linearity = cahvore_linearity(told, terms.required("cahvore_model_parameter").number())
     frame = _frame(camera.required("Coordinate_Space_Reference"))
     if frame not in ROVER_FRAMES | {_SITE}:
         camera.refuse(

@@ -7,7 +7,7 @@ import gtsam
 from pancam_graph.base.errors import CameraError, GeometryError, InputError
 from pancam_graph.base.geometry import FloatArray, pose_from_wxyz
 from pancam_graph.base.text import visible
-from pancam_graph.cameras import CAHV, cahv_of_vectors
+from pancam_graph.cameras import CAHV, CAHVORE_TYPES, cahv_of_vectors, cahvore_linearity
 from pancam_graph.io._clock import plain_clock
 from pancam_graph.io._labelled_image import LabelledImage
 from pancam_graph.io._pds_label import LabelGroup, PdsLabel, read_label
@@ -129,11 +129,11 @@ def _camera_model(group: LabelGroup, width_px: int, height_px: int) -> CAHV:
 
 
 def _linearity(group: LabelGroup, order: list[str], vectors: dict[str, FloatArray]) -> float:
-    """Linearity of a CAHVORE by its type T: 1 perspective, 2 fish-eye, 3 general with the linearity in P."""
-    linearity = {1: 1.0, 2: 0.0, 3: float(vectors["P"][0])}.get(int(vectors["T"][0]))
-    if linearity is None:
+    """Linearity of a CAHVORE by its type T and its parameter P."""
+    kind = int(vectors["T"][0])
+    if kind not in CAHVORE_TYPES:
         raise InputError(
             f"{group.where}: MODEL_COMPONENT_{order.index('T') + 1}: expected a CAHVORE type of 1, 2 or 3, "
             f"found {vectors['T'][0]:g}"
         )
-    return linearity
+    return cahvore_linearity(kind, float(vectors["P"][0]))

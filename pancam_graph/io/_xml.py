@@ -77,20 +77,20 @@ class XmlElement:
         """Its number, in a unit or without one. Raises InputError for another unit, and for none."""
         if self.unit and self.unit.lower() != unit:
             self.refuse(f"the unit {unit}" if unit else "no unit", repr(self.unit[:_MAX_QUOTED]))
-        number = told_number(self.text)
-        if number is None:
-            self.refuse("a number", repr(self.text[:_MAX_QUOTED]))
-        return number
+        return self._number()
 
     def angle_rad(self) -> float:
         """Its angle, told in radians or degrees. Raises InputError for another unit, and for no number."""
         scale = _ANGLES.get(self.unit.lower())
         if scale is None:
             self.refuse("radians or degrees", repr(self.unit[:_MAX_QUOTED]))
+        return self._number() * scale
+
+    def _number(self) -> float:
         number = told_number(self.text)
         if number is None:
             self.refuse("a number", repr(self.text[:_MAX_QUOTED]))
-        return number * scale
+        return number
 
     def whole(self, name: str, default: int | None = None, *, least: int = 0) -> int:
         """The first element of a name as an integer, `least` or above, written with a point or without."""

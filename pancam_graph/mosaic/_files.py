@@ -7,11 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pancam_graph.base.errors import InputError
+from pancam_graph.charts import encoded
 from pancam_graph.data import Solution
 from pancam_graph.io import MOSAIC_FORMAT, VERSION, same_pictures
 from pancam_graph.mosaic._draw import close_ups, comparison, with_axes
@@ -193,14 +193,7 @@ def _seam_error(made: StopMosaics) -> Json:
 
 
 def _save(path: Path, picture: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
-    path.write_bytes(_encoded(picture, path.suffix, _QUALITY))
-
-
-def _encoded(picture: NDArray[np.uint8] | NDArray[np.uint16], suffix: str, quality: int) -> bytes:
-    setting = [cv2.IMWRITE_JPEG_QUALITY, quality] if suffix == ".jpg" else []
-    done, data = cv2.imencode(suffix, picture, setting)
-    assert done
-    return data.tobytes()
+    path.write_bytes(encoded(picture, path.suffix, _QUALITY))
 
 
 def _blinks(made: StopMosaics, group: str) -> list[Blink]:
@@ -228,5 +221,5 @@ def _blink(
     group: str, title: str, captions: dict[Pointing, str], pictures: dict[Pointing, NDArray[np.uint8]]
 ) -> Blink:
     height, width = pictures["refined"].shape[:2]
-    jpeg = {p: _encoded(pictures[p], ".jpg", _BLINK_QUALITY) for p in POINTINGS}
+    jpeg = {p: encoded(pictures[p], ".jpg", _BLINK_QUALITY) for p in POINTINGS}
     return Blink(group=group, title=title, captions=captions, jpeg=jpeg, width_px=width, height_px=height)

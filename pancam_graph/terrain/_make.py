@@ -15,7 +15,7 @@ from pancam_graph.terrain import kernel
 from pancam_graph.terrain._agreement import Agreement, agreement_of
 from pancam_graph.terrain._drive import Drive, Pair, stereo_pairs
 from pancam_graph.terrain._grid import Grid, Layer, grid_around
-from pancam_graph.terrain._surface import Points, Surface, ground_spacing_m, surface_of
+from pancam_graph.terrain._surface import Points, ground_spacing_m, surface_of
 from pancam_graph.terrain._terrain_options import TerrainOptions
 
 __all__ = ["Cloud", "Fused", "Terrain", "make_terrain"]
@@ -74,7 +74,7 @@ class _Seen:
     """What one frame gave: its layer with each pointing, and its points."""
 
     pair: Pair
-    refined: Layer | None
+    refined: Layer
     telemetry: Layer | None
     points: Points
 
@@ -110,7 +110,7 @@ def make_terrain(
         1, int(np.ceil(sum(m.reasons.size for m in masks if m is not None) / 2 / options.most_cloud_points))
     )
 
-    def seen(pair: Pair) -> _Seen | str:
+    def seen(pair: Pair) -> _Seen | str | None:
         left, right = _usable(masks[pair.left]), _usable(masks[pair.right])
         if left is None or right is None:
             return f"terrain: frame {traverse.frames[pair.frame].id} is left out: a picture cannot be used"
@@ -118,32 +118,40 @@ def make_terrain(
             surface = surface_of(drive, pair, (left, right), options.reach_m)
         except ImageError as error:
             return f"terrain: frame {traverse.frames[pair.frame].id} is left out: {error}"
-        return _Seen(
-            pair=pair,
-            refined=surface.layer(grid, options.reach_m),
-            telemetry=surface.layer(grid, options.reach_m, _to_telemetry(drive, telemetry, pair)),
-            points=_near(surface, every, options.reach_m),
+        layer = surface.layer(grid, options.reach_m)
+        return (
+            None
+            if layer is None
+            else _Seen(
+                pair=pair,
+                refined=layer,
+                telemetry=surface.layer(grid, options.reach_m, _to_telemetry(drive, telemetry, pair)),
+                points=surface.points(options.reach_m, every),
+            )
         )
 
-    def tell(number: int, _: _Seen | str) -> None:
+    def tell(number: int, _: _Seen | str | None) -> None:
         if progress is not None:
             progress("terrain", number + 1, len(pairs))
 
     found = in_order(seen, pairs, tell)
     warnings += [each for each in found if isinstance(each, str)]
-    frames = [each for each in found if isinstance(each, _Seen) and each.refined is not None]
+    frames = [each for each in found if isinstance(each, _Seen)]
     if not frames:
         raise InputError(
             "terrain: expected ground that two eyes see, found none: see the masks of the images"
         )
     frames = _evened(frames)
-    layers = [each.refined for each in frames if each.refined is not None]
-    stop_of = traverse.frame_stop
-    names = [traverse.stops[s].id for s in sorted({int(stop_of[each.pair.frame]) for each in frames})]
-    of_stop = {n: [e for e in frames if traverse.stops[stop_of[e.pair.frame]].id == n] for n in names}
+    layers = [each.refined for each in frames]
+    stop_of = [traverse.frames[each.pair.frame].stop for each in frames]
+    of_stop = {
+        stop.id: [each for each, own in zip(frames, stop_of, strict=True) if own == stop.id]
+        for stop in traverse.stops
+        if stop.id in stop_of
+    }
     return Terrain(
         drive=fuse(grid, layers),
-        stops={n: fuse(grid, [e.refined for e in of if e.refined is not None]) for n, of in of_stop.items()},
+        stops={n: fuse(grid, [e.refined for e in of]) for n, of in of_stop.items()},
         clouds={n: _cloud(of) for n, of in of_stop.items()},
         agreement=agreement_of(
             layers, [e.telemetry for e in frames if e.telemetry is not None], traverse.frame_stop
@@ -155,10 +163,10 @@ def make_terrain(
 
 def _evened(frames: Sequence[_Seen]) -> list[_Seen]:
     """Frames of equal brightness: a gain of each, from what they show of the same cells."""
-    layers = [(k, each.refined) for k, each in enumerate(frames) if each.refined is not None]
-    brightest = max(float(np.nanmax(layer.grey)) for _, layer in layers)
+    layers = [each.refined for each in frames]
+    brightest = max(float(np.nanmax(layer.grey)) for layer in layers)
     scale, small = np.float32(_BRIGHTEST / max(brightest, 1e-6)), []
-    for k, layer in layers:
+    for k, layer in enumerate(layers):
         # Every n-th cell of the grid, the same ones of all layers.
         top, left = -layer.first_row % _SHRINK, -layer.first_column % _SHRINK
         grey = layer.grey[top::_SHRINK, left::_SHRINK] * scale
@@ -175,7 +183,6 @@ def _evened(frames: Sequence[_Seen]) -> list[_Seen]:
     gain, evened = even_out(small).gain, []
     for k, each in enumerate(frames):
         own, points = each.refined, each.points
-        assert own is not None  # the caller has left out frames without
         factor = np.float32(gain[k])
         evened.append(
             replace(
@@ -222,18 +229,6 @@ def _to_telemetry(
     i = pair.left
     turn = telemetry[0][i] @ drive.world_R_camera[i].T
     return turn, telemetry[1][i] - turn @ drive.world_t_camera[i]
-
-
-def _near(surface: Surface, every: int, reach_m: float) -> Points:
-    points = surface.points(every)
-    _, origin = surface.world_T_point
-    near = np.hypot(*(points.xyz_m - origin)[:, :2].T) <= reach_m
-    return Points(
-        xyz_m=points.xyz_m[near],
-        sigma_m=points.sigma_m[near],
-        covariance_m2=points.covariance_m2[near],
-        grey=points.grey[near],
-    )
 
 
 def _cloud(frames: Sequence[_Seen]) -> Cloud:

@@ -3,11 +3,13 @@
 import json
 import struct
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pancam_graph.charts import encoded
 from pancam_graph.terrain._make import Fused
 
 __all__ = ["mesh_glb", "write_mesh"]
@@ -51,10 +53,9 @@ def mesh_glb(fused: Fused, grey: NDArray[np.uint8], most_cells: int) -> tuple[by
     texture = np.stack([u, v], axis=1).astype("<f4")
     smaller = min(1.0, _TEXTURE_PX / max(grey.shape))
     size = max(1, round(grey.shape[1] * smaller)), max(1, round(grey.shape[0] * smaller))
-    _, jpeg = cv2.imencode(
-        ".jpg", cv2.resize(grey, size, interpolation=cv2.INTER_AREA), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
-    )
-    parts = [position.tobytes(), texture.tobytes(), index.tobytes(), jpeg.tobytes()]
+    smaller_grey: NDArray[Any] = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    jpeg = encoded(smaller_grey, ".jpg", _QUALITY)
+    parts = [position.tobytes(), texture.tobytes(), index.tobytes(), jpeg]
     views, begin = [], 0
     for part, target in zip(parts, (_ARRAY, _ARRAY, _ELEMENTS, None), strict=True):
         view: dict[str, int] = {"buffer": 0, "byteOffset": begin, "byteLength": len(part)}

@@ -78,6 +78,12 @@ class Surface:
         rays, origin = self.world_T_point
         return origin + rays * self.depth_m[..., None]
 
+    @cached_property
+    def away_m(self) -> FloatArray:
+        """Distances (h, w) of the points from the camera along the ground; NaN where nothing was found."""
+        _, origin = self.world_T_point
+        return np.asarray(np.hypot(self.points_m[..., 0] - origin[0], self.points_m[..., 1] - origin[1]))
+
     def layer(
         self, grid: Grid, reach_m: float, move: tuple[FloatArray, FloatArray] | None = None
     ) -> Layer | None:
@@ -87,9 +93,8 @@ class Surface:
         from the camera along the ground are left out.
         """
         _, origin = self.world_T_point
-        far = np.hypot(self.points_m[..., 0] - origin[0], self.points_m[..., 1] - origin[1])
         with np.errstate(invalid="ignore"):
-            points = np.where((far <= reach_m)[..., None], self.points_m, np.nan)
+            points = np.where((self.away_m <= reach_m)[..., None], self.points_m, np.nan)
         if move is not None:
             points = points @ move[0].T + move[1]
         if not np.isfinite(points[..., 2]).any():
@@ -137,9 +142,10 @@ class Surface:
         aside = _ACROSS_PX * self.depth_m / self.focal_px
         return np.asarray((across * self.sigma_m) ** 2 + aside**2, dtype=np.float32)
 
-    def points(self, every: int = 1) -> Points:
-        """Every n-th of the points, with covariances and samples."""
+    def points(self, reach_m: float, every: int = 1) -> Points:
+        """Every n-th of the points, those within reach along the ground, with covariances and samples."""
         found = np.flatnonzero(np.isfinite(self.depth_m))[::every]
+        found = found[self.away_m.ravel()[found] <= reach_m]
         rays, origin = self.world_T_point
         ray = rays.reshape(-1, 3)[found]
         depth, sigma = self.depth_m.ravel()[found].astype(float), self.sigma_m.ravel()[found].astype(float)

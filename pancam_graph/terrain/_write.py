@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pancam_graph.charts import Picture
+from pancam_graph.charts import Picture, encoded
 from pancam_graph.data import Traverse
 from pancam_graph.io import TERRAIN_FORMAT, VERSION
 from pancam_graph.terrain._cloud import write_cloud
@@ -138,10 +138,7 @@ def _stretched(grey: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def _save(path: Path, picture: Picture) -> None:
-    import cv2  # noqa: PLC0415  as the writers of other products, late
-
-    _, data = cv2.imencode(".png", picture)
-    path.write_bytes(data.tobytes())
+    path.write_bytes(encoded(picture, path.suffix))
 
 
 def _both(terrain: Terrain, *, same_stop: bool | None) -> Json:

@@ -32,6 +32,7 @@ from support.fuzzing import (
     dumped,
     mutated_arrays,
     mutated_bytes,
+    mutated_label,
     mutated_text,
     mutated_tree,
     outcome,
@@ -259,9 +260,7 @@ def labels(folder: Path, text: str) -> Case:
     """Labels alone in their folder, so that what is wrong is said, and images read through them."""
 
     def case(rng: np.random.Generator) -> str:
-        label = mutated_text(rng, text).encode("utf-8", "replace")
-        if rng.random() < 0.3:
-            label = mutated_bytes(rng, label)
+        label = mutated_label(rng, text)
         file = folder / "NRB_0.IMG"
         file.write_bytes(label.ljust(8192) + bytes(48))
         said = outcome(lambda: read_pds(folder), folder)
@@ -280,8 +279,7 @@ def labels_of_pds4(folder: Path) -> Case:
     (folder / "a.dat").write_bytes(bytes(range(24)))
 
     def case(rng: np.random.Generator) -> str:
-        label = mutated_text(rng, text).encode("utf-8", "replace")
-        (folder / "a.xml").write_bytes(mutated_bytes(rng, label) if rng.random() < 0.3 else label)
+        (folder / "a.xml").write_bytes(mutated_label(rng, text))
         said = outcome(lambda: read_pds(folder), folder)
         return said or outcome(lambda: read_image(folder / "a.dat"), folder)
 
@@ -300,10 +298,10 @@ def labels_of_vicar(folder: Path) -> Case:
     file = folder / "a.VIC"
 
     def case(rng: np.random.Generator) -> str:
-        label = mutated_text(rng, text).encode("utf-8", "replace")
-        label = mutated_bytes(rng, label) if rng.random() < 0.3 else label
         file.write_bytes(
-            label.ljust(512, b"\0") + bytes(range(24)) + b"LBLSIZE=40  PROPERTY='X' A=1".ljust(40)
+            mutated_label(rng, text).ljust(512, b"\0")
+            + bytes(range(24))
+            + b"LBLSIZE=40  PROPERTY='X' A=1".ljust(40)
         )
         return outcome(lambda: read_image(file), folder)
 
@@ -322,8 +320,7 @@ def files_of_sites(folder: Path) -> Case:
     file = folder / "a.svf"
 
     def case(rng: np.random.Generator) -> str:
-        label = mutated_text(rng, text).encode("utf-8", "replace")
-        file.write_bytes(mutated_bytes(rng, label) if rng.random() < 0.3 else label)
+        file.write_bytes(mutated_label(rng, text))
         return outcome(lambda: site_poses([file]), folder)
 
     return case

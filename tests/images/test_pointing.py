@@ -9,6 +9,7 @@ import pytest
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import (
     FloatArray,
+    axes_across,
     pan_tilt_rotation,
     so3_exp,
     so3_log,
@@ -22,7 +23,6 @@ from pancam_graph.images.pointing._head_fit import (
     HeadState,
     Points,
     Priors,
-    axes_across,
     fit_head,
     residuals,
 )

@@ -139,8 +139,7 @@ def _require_gauge(traverse: Traverse) -> None:
         if len(traverse.stops) > 1 and not any(told):
             raise InputError(
                 f"stop {stop.id}: expected the pan of one of its pictures at least, as its pictures alone "
-                f"do not "
-                "tell how it is turned to other stops; found none"
+                "do not tell how it is turned to other stops; found none"
             )
 
 
@@ -294,9 +293,7 @@ def _agreed(pairs: Sequence[PairTurn]) -> float:
     """The focal length, over the told one, of most pairs: the median, weighted by what each knows."""
     log_scale = np.log([pair.scale for pair in pairs])
     weight = np.array([1 / np.hypot(pair.sigma_scale, 0.01) for pair in pairs])
-    order = np.argsort(log_scale)
-    half = np.searchsorted(np.cumsum(weight[order]), weight.sum() / 2)
-    return float(np.exp(log_scale[order[half]]))
+    return float(np.exp(_median(log_scale, weight)))
 
 
 def _grouped(traverse: Traverse, stop: int, rows: Sequence[int], pairs: list[PairTurn]) -> _Group:
@@ -315,9 +312,8 @@ def _grouped(traverse: Traverse, stop: int, rows: Sequence[int], pairs: list[Pai
         if off > _UNLIKE_A_HEAD_RAD:
             raise InputError(
                 f"stop {name}: expected pictures of a head that pans and tilts, which keeps its tilt axis "
-                f"level; "
-                f"found it {np.rad2deg(off):.0f} degrees off: are the cameras rolled otherwise than the rig "
-                f"says?"
+                f"level; found it {np.rad2deg(off):.0f} degrees off: are the cameras rolled otherwise than "
+                "the rig says?"
             )
         points = Points.of(inside, number[frame], eye)
         uncertainty = traverse.rig.uncertainty
@@ -350,20 +346,16 @@ def _with_groups(traverse: Traverse, groups: Sequence[_Group], warnings: list[st
     frames: dict[int, Frame] = {}
     sources: list[str] = []
     for row, (stop, group) in enumerate(zip(traverse.stops, groups, strict=True)):
-        told = [traverse.frames[row] for row in group.frames]
+        told = [traverse.frames[k] for k in group.frames]
         pointed, more = _pointed(told, group)
         warnings += [f"stop {stop.id}: {sentence}" for sentence in more]
         frames |= dict(zip(group.frames.tolist(), pointed, strict=True))
-        told_well = np.flatnonzero(traverse.frame_stop == row)
-        frames |= {
-            int(k): traverse.frames[k]
-            for k in told_well
-            if k not in frames and not traverse.frames[k].is_vague
-        }
+        of_stop = np.flatnonzero(traverse.frame_stop == row).tolist()
+        told_well = [k for k in of_stop if k not in frames and not traverse.frames[k].is_vague]
+        frames |= {k: traverse.frames[k] for k in told_well}
         sources.append(
             f"pointing of stop {stop.id}: {len(pointed)} frames, from {len(group.pairs)} pairs of pictures "
-            f"that "
-            f"overlap{_gauge(told)}"
+            f"that overlap{_gauge(told)}"
         )
     images = [row for row in range(len(traverse.images)) if int(traverse.image_frame[row]) in frames]
     lost = [str(image.file) for row, image in enumerate(traverse.images) if row not in images]
@@ -431,10 +423,14 @@ def _circular_median(angles: FloatArray, weight: FloatArray) -> float:
     """The angle with the least weighted sum of differences to the others."""
     apart = np.abs(wrap_angle(angles[:, None] - angles))
     nearest = float(angles[np.argmin(apart @ weight)])
-    around = wrap_angle(angles - nearest)
-    order = np.argsort(around)
+    return nearest + _median(wrap_angle(angles - nearest), weight)
+
+
+def _median(values: FloatArray, weight: FloatArray) -> float:
+    """The weighted median of values (n,)."""
+    order = np.argsort(values)
     below = np.cumsum(weight[order])
-    return nearest + float(around[order][np.searchsorted(below, below[-1] / 2)])
+    return float(values[order][np.searchsorted(below, below[-1] / 2)])
 
 
 def _with_rig(rig: Rig, groups: Sequence[_Group]) -> tuple[Rig, list[str]]:
@@ -456,7 +452,7 @@ def _with_rig(rig: Rig, groups: Sequence[_Group]) -> tuple[Rig, list[str]]:
             eyes[row] = replace(eyes[row], camera=eyes[row].camera.with_calibration(K))
             sentences.append(
                 f"camera {eyes[row].name}: focal length {K[0, 0]:.1f} px +- {100 * sigma:.1f} %, from the "
-                f"pictures"
+                "pictures"
             )
     if _arms_untold(rig):
         uncertainty = replace(uncertainty, mount_m=_ARM_LEFT_M, tilt_axis_m=_ARM_LEFT_M / 2)
@@ -467,10 +463,8 @@ def _with_rig(rig: Rig, groups: Sequence[_Group]) -> tuple[Rig, list[str]]:
             forward_m, left_m, up_m = place_m
             sentences.append(
                 f"camera {eyes[row].name}: {forward_m:.3f} m before, {left_m:.3f} m left of and {up_m:.3f} "
-                f"m above "
-                f"the axes, +- {_ARM_LEFT_M:g} m, from the pictures, which tell the directions of arms and "
-                f"not "
-                f"their lengths: these are taken, and all distances go with them"
+                f"m above the axes, +- {_ARM_LEFT_M:g} m, from the pictures, which tell the directions of "
+                "arms and not their lengths: these are taken, and all distances go with them"
             )
     return replace(rig, eyes=tuple(eyes), uncertainty=uncertainty), sentences
 

@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, pan_tilt_rotation
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, axes_across, pan_tilt_rotation, rx
 from pancam_graph.images.pointing._pair_turns import PairTurn
 from pancam_graph.images.pointing._two_points import d_directions, directions
 from pancam_graph.rigs import Rig
 
-__all__ = ["HeadFit", "HeadState", "Points", "Priors", "agreeing", "axes_across", "fit_head", "residuals"]
+__all__ = ["HeadFit", "HeadState", "Points", "Priors", "agreeing", "fit_head", "residuals"]
 
 _MOST_POINTS = 80
 """Points of a pair that are used."""
@@ -140,8 +140,7 @@ class _Looks:
         pan = pan_tilt_rotation(state.pan_rad[frame], 0.0)
         stage = pan @ axis
         head = stage @ pan_tilt_rotation(0.0, state.tilt_rad[frame])
-        cos, sin = np.cos(state.roll_rad), np.sin(state.roll_rad)
-        rolled = np.array([[[1.0, 0, 0], [0, c, -s], [0, s, c]] for c, s in zip(cos, sin, strict=True)])
+        rolled = np.array([rx(roll) for roll in state.roll_rad])
         mounts = rolled @ np.array([e.head_T_camera.rotation().matrix() for e in rig.eyes])
         arms = np.array([e.head_T_camera.translation() for e in rig.eyes]) + state.shift_m
         mast_R_camera = head @ mounts[eye]
@@ -203,14 +202,6 @@ def residuals(
         for k in range(3):
             J[rows, :, 2 * frames + 2 * eyes + 3 * eye + k] += shifted[:, :, k]
     return off, J, (across @ apart[:, :, None])[:, :, 0]
-
-
-def axes_across(looks: FloatArray) -> FloatArray:
-    """Two unit vectors (n, 2, 3) across unit directions (n, 3) and across each other."""
-    least = np.eye(3)[np.argmin(np.abs(looks), axis=1)]
-    first = np.cross(looks, least)
-    first = first / np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, np.cross(looks, first)], axis=1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
