@@ -54,6 +54,7 @@ from pancam_graph.data._traverse import Frame as Frame
 from pancam_graph.data._traverse import Image as Image
 from pancam_graph.data._traverse import Observations as Observations
 from pancam_graph.data._traverse import Stop as Stop
+from pancam_graph.data._traverse import Tile as Tile
 from pancam_graph.data._traverse import Traverse as Traverse
 from pancam_graph.data._verdict import Verdict as Verdict
 from pancam_graph.data._verdict import VerdictTest as VerdictTest

@@ -26,7 +26,17 @@ from pancam_graph.data._points import NamedPoints
 from pancam_graph.data._sharing import Sharing
 from pancam_graph.rigs import Rig
 
-__all__ = ["UNKNOWN_RAD", "VAGUE_RAD", "DrivePart", "Frame", "Image", "Observations", "Stop", "Traverse"]
+__all__ = [
+    "UNKNOWN_RAD",
+    "VAGUE_RAD",
+    "DrivePart",
+    "Frame",
+    "Image",
+    "Observations",
+    "Stop",
+    "Tile",
+    "Traverse",
+]
 
 UNKNOWN_RAD = float(np.pi)
 """Standard deviation from which on a pan or tilt is not known at all."""
@@ -87,6 +97,18 @@ class Frame:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Tile:
+    """A file with a part of an image: a window of the camera's picture."""
+
+    file: str
+    """Path of the image file relative to the traverse folder."""
+    left_px: int
+    """Column of the image in which the file's first one is."""
+    top_px: int
+    """Row of the image in which the file's first one is."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Image:
     """One eye's picture of a frame."""
 
@@ -99,6 +121,31 @@ class Image:
     """Path of the image file relative to the traverse folder, if there is one."""
     mask: str | None = None
     """Path of a mask relative to the traverse folder: white where the image may be used, black where not."""
+    tiles: tuple[Tile, ...] = ()
+    """Files that have a part of the image each, where no file has all of it; `file` is the first of them."""
+
+    def __post_init__(self) -> None:
+        """Name the first tile's file. Raises InputError for another one beside tiles, or a negative place."""
+        if not self.tiles:
+            return
+        if self.file not in {None, self.tiles[0].file}:
+            raise InputError(
+                f"images: {self.id}: expected a file or tiles, found the file {self.file!r} beside tiles"
+            )
+        for i, tile in enumerate(self.tiles):
+            if min(tile.left_px, tile.top_px) < 0:
+                raise InputError(
+                    f"images: {self.id}: tiles[{i}]: expected left_px and top_px of 0 or more, "
+                    f"found {tile.left_px} and {tile.top_px}"
+                )
+        object.__setattr__(self, "file", self.tiles[0].file)
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """All files that the image is in."""
+        if self.tiles:
+            return tuple(tile.file for tile in self.tiles)
+        return () if self.file is None else (self.file,)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -7,6 +7,7 @@ from pathlib import Path
 import gtsam
 
 from pancam_graph.cameras import CAHV
+from pancam_graph.data import Tile
 from pancam_graph.rigs import MastKinematics, PointingSigma, RigUncertainty
 
 __all__ = ["LabelledImage"]
@@ -53,6 +54,8 @@ class LabelledImage:
     """What a user should know of how the label was read; the same for all images that it is true of."""
     levelled: bool = True
     """Whether the label has the rover's attitude; else `world_T_rover` has none."""
+    tiles: tuple[Tile, ...] = ()
+    """Files that have a part of the picture each; empty: `file` has all of it."""
     placed: bool = True
     """Whether the label has the rover's place; else `world_T_rover` has none."""
     site_before_T_site: gtsam.Pose3 | None = None

@@ -6,8 +6,8 @@ What becomes what (docs/conventions.md for the frames):
   held; later ones have the sigma of rover localisation, `LOCALISATION_SIGMA`;
 - a frame: images of one stop with the same mast counter (PMA, RSM) whose measured angles agree to
   `SAME_POINTING_RAD`, each eye once;
-- an eye: images of one INSTRUMENT_ID with the same size, model type and intrinsics. An image of another
-  size, subframe or zoom is another eye, since its camera model is another: `navcam-left-2`;
+- an eye: images of one INSTRUMENT_ID with the same model type and intrinsics. Subframes and tiles are
+  windows of its picture (`on_detectors`); at another zoom or averaging it is another eye: `navcam-left-2`;
 - the rig: the mast's axes of `pancam_graph.rigs`, with mounts averaged over the labels' cameras;
 - pan and tilt: of the chain's head frame, so that the chain reproduces the label's camera. They are the
   measured angles where those do (MER: through the label's mast quaternion; Curiosity: through the joints'
@@ -29,6 +29,7 @@ from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray, IntArray, wrap_angle
 from pancam_graph.base.text import visible
 from pancam_graph.data import Frame, Image, Stop, Traverse
+from pancam_graph.io._detectors import SAME_PRINCIPAL_POINT_PX, on_detectors, same_focal_lengths
 from pancam_graph.io._input_format import InputFormat
 from pancam_graph.io._labelled_files import LABEL_SUFFIXES, labelled_files
 from pancam_graph.io._labelled_image import LabelledImage
@@ -57,8 +58,6 @@ _AS_LABELLED = RigFitOptions(
     reference_sigma=ReferenceSigma(mast_rad=5e-3, mast_m=5e-3, axis_rad=5e-3, axis_m=5e-3),
 )
 """A flight unit's axes may differ from the design, and its angles from the measured ones, by so much."""
-_SAME_FOCAL = 2e-4
-_SAME_PRINCIPAL_POINT_PX = 1.0
 _SAME_POSE = 1e-3
 """Metres and radians by which rover poses within a stop may differ without a warning."""
 
@@ -107,7 +106,7 @@ def read_pds(folder: Path | str) -> Traverse:
         raise next(iter(unusable.values()))
     group = one_group(products, found.site_poses)
     exposures = one_of_each_exposure(group.images)
-    images = exposures.images
+    images = on_detectors(exposures.images)
     kinematics = images[0].mast
     warnings = [
         *_left_out(unusable),
@@ -166,6 +165,7 @@ def read_pds(folder: Path | str) -> Traverse:
                 frame=frame_ids[frame_of[i]],
                 camera=eye_names[eye_of[i]],
                 file=image.file.name,
+                tiles=image.tiles,
             )
             for i, image in enumerate(images)
         ),
@@ -224,13 +224,10 @@ def _sort_eyes(images: Sequence[LabelledImage]) -> tuple[IntArray, list[str]]:
 
 def _same_eye(first: LabelledImage, image: LabelledImage) -> bool:
     a, b = first.model, image.model
-    if first.instrument != image.instrument or type(a) is not type(b):
-        return False
     if (a.width_px, a.height_px) != (b.width_px, b.height_px):
         return False
-    focal = max(abs(a.fx_px / b.fx_px - 1), abs(a.fy_px / b.fy_px - 1))
     centre = max(abs(a.cx_px - b.cx_px), abs(a.cy_px - b.cy_px))
-    return focal < _SAME_FOCAL and centre < _SAME_PRINCIPAL_POINT_PX
+    return same_focal_lengths(first, image) and centre < SAME_PRINCIPAL_POINT_PX
 
 
 def _stop_id(stop: tuple[int, int]) -> str:

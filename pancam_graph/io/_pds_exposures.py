@@ -14,7 +14,7 @@ import numpy as np
 from pancam_graph.cameras import CAHV
 from pancam_graph.io._labelled_image import LabelledImage
 
-__all__ = ["Exposures", "one_of_each_exposure"]
+__all__ = ["Exposures", "exposure_key", "one_of_each_exposure"]
 
 _NAMED = 5
 _FAR_M = 100.0
@@ -42,7 +42,7 @@ def one_of_each_exposure(images: Sequence[LabelledImage]) -> Exposures:
     """
     products: dict[tuple[object, ...], list[LabelledImage]] = {}
     for image in images:
-        products.setdefault(_exposure(image), []).append(image)
+        products.setdefault(exposure_key(image), []).append(image)
     kept: list[LabelledImage] = []
     warnings: list[str] = []
     for same in products.values():
@@ -67,7 +67,8 @@ def one_of_each_exposure(images: Sequence[LabelledImage]) -> Exposures:
     return Exposures(images=tuple(i for i in images if id(i) in chosen), warnings=tuple(warnings))
 
 
-def _exposure(image: LabelledImage) -> tuple[object, ...]:
+def exposure_key(image: LabelledImage) -> tuple[object, ...]:
+    """What images of one exposure have in common: spacecraft, camera and clock; without a clock, the file."""
     if image.clock_start is None:
         return (image.file,)
     return image.host, _camera(image), image.clock_start

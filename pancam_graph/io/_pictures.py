@@ -1,10 +1,12 @@
 """Pictures of a traverse: from the row of an image to its samples, and which pictures are the same."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from pancam_graph.base.errors import ImageError, InputError
-from pancam_graph.data import Traverse
+from pancam_graph.data import Tile, Traverse
 from pancam_graph.io._file_memory import FileMemory
 from pancam_graph.io._image_files import GreyImage, ImageContent, read_content
 from pancam_graph.io._looks import Look, look_of, same_looks
@@ -24,7 +26,7 @@ _LOOKS = FileMemory[Look]()
 
 
 def picture_file(traverse: Traverse, row: int) -> Path | None:
-    """Where the file of an image is; None if it has none."""
+    """Where the file of an image is, of tiles the first; None if it has none."""
     file = traverse.images[row].file
     return None if file is None else (traverse.folder or Path()) / file
 
@@ -32,18 +34,48 @@ def picture_file(traverse: Traverse, row: int) -> Path | None:
 def read_picture(traverse: Traverse, row: int) -> ImageContent:
     """Decode the file of an image; see `read_image`.
 
-    Raises ImageError as `read_image` does, for an image without a file, and for one of another size than its
-    camera's: a rig (most often a template) for another product, subframe or zoom.
+    Tiles are put in their places; the image is 0, which means missing, where there is none.
+
+    Raises ImageError as `read_image` does, for an image without a file, for one of another size than its
+    camera's: a rig (most often a template) for another product, subframe or zoom; and for a tile that
+    reaches beyond its camera's picture.
     """
     path, eye = picture_file(traverse, row), traverse.rig.eyes[int(traverse.image_eye[row])]
+    image = traverse.images[row]
     if path is None:
-        raise ImageError(f"image {traverse.images[row].id}: expected an image file, found none")
+        raise ImageError(f"image {image.id}: expected an image file, found none")
     width_px, height_px = eye.camera.width_px, eye.camera.height_px
     words = f"{width_px} x {height_px} pixels as of camera {eye.name} of the rig {traverse.rig.name}"
-    content = read_content(path, WantedSize(width_px=width_px, height_px=height_px, words=words))
+    size = WantedSize(width_px=width_px, height_px=height_px, words=words)
+    folder = traverse.folder or Path()
+    content = _tiled(folder, image.tiles, size) if image.tiles else read_content(path, size)
     if _LOOKS.recall(path) is None:
-        _LOOKS.keep(path, look_of(content.samples))
+        _LOOKS.keep(path, look_of(content.samples), [folder / name for name in image.files])
     return content
+
+
+def _tiled(folder: Path, tiles: Sequence[Tile], size: WantedSize) -> ImageContent:
+    """The image that tiles make, 16 bits where one of them has 16; a later tile lies on those before."""
+    read: list[ImageContent] = []
+    for tile in tiles:
+        path = folder / tile.file
+        content = read_content(path)
+        height_px, width_px = content.samples.shape
+        if tile.left_px + width_px > size.width_px or tile.top_px + height_px > size.height_px:
+            raise ImageError(
+                f"{path}: expected a tile of {size.words}, found {width_px} x {height_px} from column "
+                f"{tile.left_px} and row {tile.top_px} on"
+            )
+        read.append(content)
+    samples: GreyImage = np.zeros(
+        (size.height_px, size.width_px), dtype=np.result_type(*(content.samples.dtype for content in read))
+    )
+    for tile, content in zip(tiles, read, strict=True):
+        height_px, width_px = content.samples.shape
+        samples[tile.top_px : tile.top_px + height_px, tile.left_px : tile.left_px + width_px] = (
+            content.samples
+        )
+    return ImageContent(samples=samples, colour=any(content.colour for content in read), host=read[0].host)
 
 
 def readable_picture(traverse: Traverse, row: int) -> GreyImage | None:

@@ -5,11 +5,11 @@ from dataclasses import replace
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import Discriminator, Tag
+from pydantic import Discriminator, Field, Tag
 
 from pancam_graph.base.choices import expected_one_of
 from pancam_graph.base.errors import InputError
-from pancam_graph.data import QUANTITIES, Freedom, Sharing
+from pancam_graph.data import QUANTITIES, Freedom, Image, Sharing, Tile
 from pancam_graph.io._camera_entry import AnyCamera, camera_entry
 from pancam_graph.io._constraint_entries import AnyConstraint
 from pancam_graph.io._entries import Entry, Label, PoseEntry, SparseEntry, Text
@@ -184,14 +184,49 @@ class FrameEntry(Entry):
     sigma_tilt_rad: float
 
 
-class ImageEntry(Entry):
+class TileEntry(Entry):
+    """A file with a part of an image."""
+
+    file: Label
+    left_px: int
+    top_px: int
+
+
+class ImageEntry(SparseEntry):
     """One eye's picture of a frame."""
+
+    _OPTIONAL: ClassVar = frozenset({"mask", "tiles"})
 
     id: Label
     frame: Label
     camera: Label
     file: Label | None = None
     mask: Label | None = None
+    tiles: Annotated[list[TileEntry], Field(min_length=1)] | None = None
+
+    def image(self) -> Image:
+        """The image. Raises InputError as `Image` does."""
+        told = self.model_dump(exclude={"tiles"})
+        return Image(**told, tiles=tuple(Tile(**tile.model_dump()) for tile in self.tiles or ()))
+
+    @staticmethod
+    def of(image: Image) -> "ImageEntry":
+        """The entry of an image."""
+        return ImageEntry(
+            id=image.id,
+            frame=image.frame,
+            camera=image.camera,
+            file=None if image.tiles else image.file,
+            mask=image.mask,
+            tiles=[TileEntry(**vars(tile)) for tile in image.tiles] or None,
+        )
+
+    @property
+    def named_files(self) -> dict[str, str]:
+        """Image files by the entries that name them."""
+        if self.tiles is None:
+            return {} if self.file is None else {"file": self.file}
+        return {f"tiles[{i}].file": tile.file for i, tile in enumerate(self.tiles)}
 
 
 class FreedomEntry(Entry):

@@ -38,14 +38,14 @@ def require_other_pictures(traverse: Traverse, rig: Rig) -> None:
 
 
 def _of_file(traverse: Traverse, row: int) -> str:
-    name = traverse.images[row].file
-    if name is None or traverse.folder is None:
+    names = traverse.images[row].files
+    if not names or traverse.folder is None:
         return ""
-    path = traverse.folder / name
-    if instead_of_file(path) is not None:
+    paths = [traverse.folder / name for name in names]
+    if any(instead_of_file(path) is not None for path in paths):
         return ""
     try:
-        return f"file:{hashlib.sha256(read_bytes(path)).hexdigest()}"
+        return f"file:{hashlib.sha256(b''.join(map(read_bytes, paths))).hexdigest()}"
     except InputError:  # a file that cannot be read is left out by who needs it
         return ""
 

@@ -10,7 +10,7 @@ from pancam_graph.base.errors import ImageError, InputError, PancamGraphError
 from pancam_graph.base.regular_files import instead_of_file, is_missing
 from pancam_graph.base.text import visible
 from pancam_graph.base.whole_files import whole_file
-from pancam_graph.data import Frame, Image, NamedPoints, Observations, Stop, Traverse
+from pancam_graph.data import Frame, NamedPoints, Observations, Stop, Traverse
 from pancam_graph.io._constraint_entries import constraint_entry, points_csv, read_points
 from pancam_graph.io._entries import TRAVERSE_FORMAT, VERSION, PoseEntry
 from pancam_graph.io._input_format import InputFormat
@@ -57,7 +57,7 @@ def read_traverse(folder: Path | str) -> Traverse:
     entries = validated(TraverseFile, read_json(path, TRAVERSE_FORMAT, VERSION), path)
     with prefixed(path):
         files = [
-            None if i.file is None else _inside(folder, i.file, f"images[{row}].file")
+            [_inside(folder, name, f"images[{row}].{entry}") for entry, name in i.named_files.items()]
             for row, i in enumerate(entries.images)
         ]
         if entries.observations is None and not any(files):
@@ -117,9 +117,6 @@ def write_traverse(traverse: Traverse, folder: Path | str, *, overwrite: bool = 
     with refused_by_schema(path):
         entries = traverse_entries(traverse)
     content = entries.model_dump(exclude={"sharing", "constraints", "points"})
-    for image in content["images"]:
-        if image["mask"] is None:
-            del image["mask"]
     if entries.sharing is not None:
         content["sharing"] = entries.sharing.model_dump(exclude_defaults=True)
     if entries.constraints:
@@ -166,7 +163,7 @@ def traverse_of(
         rig=entries.rig.rig(),
         stops=stops,
         frames=tuple(Frame(**f.model_dump()) for f in entries.frames),
-        images=tuple(Image(**i.model_dump()) for i in entries.images),
+        images=tuple(i.image() for i in entries.images),
         observations=None if observations is None else observations.with_points(points),
         sharing=None if entries.sharing is None else entries.sharing.sharing(),
         folder=folder,
@@ -202,10 +199,7 @@ def traverse_entries(traverse: Traverse) -> TraverseFile:
         rig=rig_entry(traverse.rig),
         stops=stops,
         frames=frames,
-        images=[
-            ImageEntry(id=i.id, frame=i.frame, camera=i.camera, file=i.file, mask=i.mask)
-            for i in traverse.images
-        ],
+        images=[ImageEntry.of(i) for i in traverse.images],
         observations=None if traverse.observations is None else _OBSERVATIONS,
         sharing=None if traverse.sharing is None else SharingEntry.of(traverse.sharing),
         constraints=[constraint_entry(one) for one in traverse.constraints],  # type: ignore[misc]  # of its union
@@ -234,7 +228,7 @@ def _inside(folder: Path, name: str, entry: str) -> Path:
     return folder / name
 
 
-def _unusable_images(files: list[Path | None], traverse: Traverse) -> dict[str, ImageError]:
+def _unusable_images(files: list[list[Path]], traverse: Traverse) -> dict[str, ImageError]:
     """The image files that cannot be used, by id.
 
     Raises ImageError for a mask that cannot be used and if no image file can, InputError for images of two
@@ -243,9 +237,10 @@ def _unusable_images(files: list[Path | None], traverse: Traverse) -> dict[str, 
     hosts: dict[str, Path] = {}
     masks: set[tuple[Path, int, int]] = set()
     unusable: dict[int, ImageError] = {}
-    for row, file in enumerate(files):
-        if file is None:
+    for row, of_image in enumerate(files):
+        if not of_image:
             continue
+        file = of_image[0]
         camera = traverse.rig.eyes[int(traverse.image_eye[row])].camera
         mask = mask_file(traverse, row)
         try:
@@ -268,8 +263,8 @@ def _unusable_images(files: list[Path | None], traverse: Traverse) -> dict[str, 
                     f"{file}: INSTRUMENT_HOST_ID: expected {first} as in {hosts[first].name}, "
                     f"found {content.host}: images of two rovers"
                 )
-    named = [file for file in files if file is not None]
-    lost = traverse.observations is not None and all(is_missing(file) for file in named)
+    named = [of_image for of_image in files if of_image]
+    lost = traverse.observations is not None and all(is_missing(file) for of in named for file in of)
     if len(unusable) == len(named) > 0 and not lost:
         row, first_error = next(iter(unusable.items()))
         raise _at(traverse, row, first_error) from first_error
@@ -289,7 +284,7 @@ def _copies(traverse: Traverse, folder: Path) -> list[tuple[Path, Path]]:
     named = [
         (f"images[{row}].{kind}", name)
         for row, i in enumerate(traverse.images)
-        for kind, name in (("file", i.file), ("mask", i.mask))
+        for kind, name in (*((f"file {file}", file) for file in i.files), ("mask", i.mask))
         if name is not None
     ]
     files = {folder / name: _inside(traverse.folder, name, entry) for entry, name in named}
