@@ -1,6 +1,6 @@
 """Measure the solver against its peers on simulated drives, and against the committed baseline.
 
-Every engine solves each case in a new process. Prints a table for the README; writes all figures as
+Every engine solves each case in a new process. Prints a table for docs/performance.md; writes all figures as
 JSON. Absolute times change between machines and hours. Only ratios within one run are compared; the file
 scripts/benchmark_baseline.json keeps them.
 
