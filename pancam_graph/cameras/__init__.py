@@ -37,6 +37,7 @@ from pancam_graph.cameras._matrix import decompose_projection as decompose_proje
 from pancam_graph.cameras._matrix import projection_matrix as projection_matrix
 from pancam_graph.cameras._matrix import projection_tangents as projection_tangents
 from pancam_graph.cameras._matrix import split_projections as split_projections
+from pancam_graph.cameras._sensors import SURFACE_HEAD as SURFACE_HEAD
 from pancam_graph.cameras._sensors import Sensor as Sensor
 from pancam_graph.cameras._straighten import straight_pixels as straight_pixels
 from pancam_graph.cameras._straighten import straightened as straightened

@@ -12,7 +12,7 @@ from pancam_graph.cameras._camera import Camera
 from pancam_graph.cameras._field_camera import without_field
 from pancam_graph.cameras._lens import Distorted
 from pancam_graph.cameras._lenses import LENSES, lens_of
-from pancam_graph.cameras._sensors import SENSORS
+from pancam_graph.cameras._sensors import SENSORS, SURFACE_HEAD
 
 __all__ = ["LENS_SOURCES", "LensTable", "distort"]
 
@@ -20,8 +20,8 @@ LENS_SOURCES = Path(__file__).parent
 """Folder whose sources compiled loops depend on where they call `distort`."""
 
 _KINDS = [lens.name for lens in LENSES]
-_WIDTH = max(lens.distortion.length for lens in LENSES if lens.distortion is not None)
-"""Columns of every table: as many as the lens with most parameters has."""
+_WIDTH = max(SURFACE_HEAD, *(lens.distortion.length for lens in LENSES if lens.distortion is not None))
+"""Least columns of a table: as many as the lens with most parameters has."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -64,10 +64,22 @@ class LensTable:
         )
 
     @staticmethod
-    def of_sensors(kind: IntArray) -> "LensTable":
-        """The table of sensors of some kinds (n,), each its place in `SENSORS`."""
+    def of_sensors(kind: IntArray, table: IntArray, tables: Sequence[FloatArray]) -> "LensTable":
+        """The table of sensors of some kinds (n,), each its place in `SENSORS`.
+
+        `table` (n,) is the place in `tables` of the numbers (rows, columns) that a sensor reads, which
+        several may share; -1: it has none.
+        """
         n = len(kind)
-        return LensTable(row=np.arange(n), kind=len(LENSES) + kind, parameters=np.zeros((n, _WIDTH)))
+        plain = LensTable(row=np.arange(n), kind=len(LENSES) + kind, parameters=np.zeros((n, _WIDTH)))
+        if not tables:
+            return plain
+        parameters = _stacked([plain.parameters, *tables])
+        begin = np.cumsum([n, *(len(one) for one in tables)])
+        row = np.where(table < 0, plain.row, begin[table])
+        kinds = np.full(len(parameters), -1, dtype=np.int64)  # rows that no sensor begins with are of no kind
+        kinds[row] = plain.kind
+        return LensTable(row=row, kind=kinds, parameters=parameters)
 
     @staticmethod
     def joined(tables: "Sequence[LensTable]") -> "LensTable":
@@ -77,8 +89,20 @@ class LensTable:
         return LensTable(
             row=np.concatenate(rows),
             kind=np.concatenate([t.kind for t in tables]),
-            parameters=np.concatenate([t.parameters for t in tables]),
+            parameters=_stacked([t.parameters for t in tables]),
         )
+
+
+def _stacked(tables: Sequence[FloatArray]) -> FloatArray:
+    """Tables (rows, columns) one below the other, 0 where one has fewer columns."""
+    if len({one.shape[1] for one in tables}) == 1:
+        return np.concatenate(tables)
+    out = np.zeros((sum(map(len, tables)), max(one.shape[1] for one in tables)))
+    begin = 0
+    for one in tables:
+        out[begin : begin + len(one), : one.shape[1]] = one
+        begin += len(one)
+    return out
 
 
 _Distort = Callable[[int, FloatArray, int, float, float, float, float], Distorted]

@@ -1,16 +1,20 @@
 """The data model: what is known of a traverse, and what an adjustment found."""
 
 from pancam_graph.data._constraints import CONSTRAINTS as CONSTRAINTS
+from pancam_graph.data._constraints import EXACT as EXACT
 from pancam_graph.data._constraints import Constraint as Constraint
 from pancam_graph.data._constraints import Landmark as Landmark
 from pancam_graph.data._constraints import LandmarkAzimuth as LandmarkAzimuth
+from pancam_graph.data._constraints import LandmarkDistance as LandmarkDistance
 from pancam_graph.data._constraints import LandmarkElevation as LandmarkElevation
 from pancam_graph.data._constraints import LandmarkHeight as LandmarkHeight
 from pancam_graph.data._constraints import LandmarkInfinity as LandmarkInfinity
 from pancam_graph.data._constraints import LandmarkPlane as LandmarkPlane
 from pancam_graph.data._constraints import LandmarkPosition as LandmarkPosition
+from pancam_graph.data._constraints import LandmarkSurface as LandmarkSurface
 from pancam_graph.data._constraints import StopDistance as StopDistance
 from pancam_graph.data._constraints import StopHeading as StopHeading
+from pancam_graph.data._constraints import StopPlacement as StopPlacement
 from pancam_graph.data._constraints import StopPose as StopPose
 from pancam_graph.data._constraints import StopPosition as StopPosition
 from pancam_graph.data._cross_validation import CrossValidation as CrossValidation
@@ -47,6 +51,7 @@ from pancam_graph.data._solution import Seconds as Seconds
 from pancam_graph.data._solution import Solution as Solution
 from pancam_graph.data._solution import State as State
 from pancam_graph.data._solution import rms_px as rms_px
+from pancam_graph.data._surface import Surface as Surface
 from pancam_graph.data._traverse import UNKNOWN_RAD as UNKNOWN_RAD
 from pancam_graph.data._traverse import VAGUE_RAD as VAGUE_RAD
 from pancam_graph.data._traverse import DrivePart as DrivePart

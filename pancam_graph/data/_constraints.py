@@ -14,6 +14,7 @@ import numpy as np
 from pancam_graph.base.arrays import float_array
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray, IntArray
+from pancam_graph.data._surface import Surface
 
 __all__ = [
     "CONSTRAINTS",
@@ -21,13 +22,16 @@ __all__ = [
     "Constraint",
     "Landmark",
     "LandmarkAzimuth",
+    "LandmarkDistance",
     "LandmarkElevation",
     "LandmarkHeight",
     "LandmarkInfinity",
     "LandmarkPlane",
     "LandmarkPosition",
+    "LandmarkSurface",
     "StopDistance",
     "StopHeading",
+    "StopPlacement",
     "StopPose",
     "StopPosition",
 ]
@@ -37,6 +41,7 @@ Landmark = str | int
 
 EXACT = 1e-5
 """Sigma, metres or radians, that stands for 0: far below what pictures tell, and above rounding."""
+_STOPS = "stops: expected the ids of two different stops"
 _ASYMMETRY = 1e-9
 """Largest difference of mixed entries of a covariance, as a share of its largest variance."""
 _FLATTEST = 1e-12
@@ -169,7 +174,7 @@ class _Measured(Constraint):
         if type(other) is not type(self):
             return False
         assert isinstance(other, _Measured)
-        if (self.landmarks, set(self.stops)) != (other.landmarks, set(other.stops)):
+        if {*self.landmarks} != {*other.landmarks} or {*self.stops} != {*other.stops}:
             return False
         exact = getattr(self, self._sigma) == 0 and getattr(other, self._sigma) == 0
         apart = abs(self.value - other.value)
@@ -269,11 +274,72 @@ class LandmarkInfinity(Constraint):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class LandmarkSurface(Constraint):
+    """A terrain point on a known surface: its height above it, at its own place, is 0."""
+
+    kind = "landmark-surface"
+    landmark: Landmark
+    surface: Surface
+    sigma_m: float
+    """Of heights; 0: exact."""
+
+    def __post_init__(self) -> None:
+        """Check numbers."""
+        if _number("sigma_m", self.sigma_m) < 0:
+            raise InputError(f"sigma_m: expected 0 (exact) or a positive number, found {self.sigma_m}")
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of heights; `EXACT` for exact ones."""
+        return max(float(self.sigma_m), EXACT)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LandmarkDistance(_Measured):
+    """The distance between two terrain points, as a scale bar or a tape has it."""
+
+    kind, _value, _sigma = "landmark-distance", "distance_m", "sigma_m"
+    between: Sequence[Landmark]
+    """The two points; `landmarks` in files."""
+    distance_m: float
+    sigma_m: float
+
+    def __post_init__(self) -> None:
+        """Check numbers."""
+        super().__post_init__()
+        _two(self.between, "landmarks: expected two different terrain points")
+        if self.distance_m <= 0:
+            raise InputError(f"distance_m: expected a number above 0, found {self.distance_m}")
+
+    @property
+    def landmarks(self) -> tuple[Landmark, ...]:
+        """Both points."""
+        return tuple(self.between)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class StopPosition(_Placed):
     """A stop's mast at a known position, beside the stop's own prior."""
 
     kind = "stop-position"
     stop: str
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StopPlacement(Constraint):
+    """A stop's mast at a known position and attitude, whose errors hang together; beside the stop's prior."""
+
+    kind = "stop-position"
+    stop: str
+    world_T_mast: gtsam.Pose3
+    covariance: FloatArray
+    """(6, 6) in the tangent of world_T_mast: rotation first, in the mast frame, radians and metres."""
+
+    def __post_init__(self) -> None:
+        """Check shapes and numbers."""
+        if not np.all(np.isfinite(self.world_T_mast.matrix())):
+            raise InputError("world_T_mast: expected finite numbers, found NaN or infinity")
+        object.__setattr__(self, "covariance", _covariance("covariance", self.covariance, 6))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -289,7 +355,7 @@ class StopPose(Constraint):
 
     def __post_init__(self) -> None:
         """Check shapes and numbers."""
-        _two(self.between)
+        _two(self.between, _STOPS)
         if not np.all(np.isfinite(self.a_T_b.matrix())):
             raise InputError("a_T_b: expected finite numbers, found NaN or infinity")
         object.__setattr__(self, "covariance", _covariance("covariance", self.covariance, 6))
@@ -313,7 +379,7 @@ class StopDistance(_Measured):
     def __post_init__(self) -> None:
         """Check numbers."""
         super().__post_init__()
-        _two(self.between)
+        _two(self.between, _STOPS)
         if self.distance_m <= 0:
             raise InputError(f"distance_m: expected a number above 0, found {self.distance_m}")
 
@@ -341,7 +407,10 @@ CONSTRAINTS: tuple[type[Constraint], ...] = (
     LandmarkAzimuth,
     LandmarkElevation,
     LandmarkInfinity,
+    LandmarkSurface,
+    LandmarkDistance,
     StopPosition,
+    StopPlacement,
     StopPose,
     StopDistance,
     StopHeading,
@@ -367,9 +436,9 @@ def _three(name: str, values: Sequence[float | None]) -> FloatArray:
     return out
 
 
-def _two(stops: Sequence[str]) -> None:
-    if isinstance(stops, str) or len(stops) != 2 or stops[0] == stops[1]:
-        raise InputError(f"stops: expected the ids of two different stops, found {stops}")
+def _two(names: Sequence[Landmark], expected: str) -> None:
+    if isinstance(names, str) or len(names) != 2 or names[0] == names[1]:
+        raise InputError(f"{expected}, found {names}")
 
 
 def _covariance(name: str, values: object, n: int) -> FloatArray:

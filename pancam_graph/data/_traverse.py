@@ -326,7 +326,7 @@ class Traverse:
                 raise InputError(
                     f"{where}: expected a stop that can move, found {' and '.join(one.stops)} held by sigma 0"
                 )
-            before = alike.setdefault((one.kind, one.landmarks, frozenset(one.stops)), [])
+            before = alike.setdefault((one.kind, frozenset(one.landmarks), frozenset(one.stops)), [])
             for j in before:
                 if one.contradicts(self.constraints[j]):
                     raise InputError(

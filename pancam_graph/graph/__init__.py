@@ -1,5 +1,6 @@
 """The rig as variables and factors of a GTSAM graph; keys and factors of callers; landmarks as variables."""
 
+from pancam_graph.graph._constraint_factors import landmark_constraints as landmark_constraints
 from pancam_graph.graph._constraint_factors import stop_constraints as stop_constraints
 from pancam_graph.graph._factors import FactorList as FactorList
 from pancam_graph.graph._factors import Factors as Factors

@@ -1,23 +1,46 @@
-"""Constraints on stops as factors on the keys of masts; those on terrain points are in `_sensors`."""
+"""Constraints on stops, and those that join points, as factors; those on one point are in `_sensors`."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import gtsam
 import numpy as np
 
-from pancam_graph.data import Constraint, StopDistance, StopHeading, StopPose, StopPosition, Traverse
+from pancam_graph.data import (
+    Constraint,
+    LandmarkDistance,
+    StopDistance,
+    StopHeading,
+    StopPlacement,
+    StopPose,
+    StopPosition,
+    Traverse,
+)
 from pancam_graph.factors import Key, stop_distance_factor, stop_heading_factor, stop_position_factor
 from pancam_graph.graph._given import GivenFactor
 from pancam_graph.graph._graph_keys import GraphKeys
 
-__all__ = ["stop_constraints"]
+__all__ = ["landmark_constraints", "stop_constraints"]
 
 
 def stop_constraints(traverse: Traverse, keys: GraphKeys) -> Iterator[GivenFactor]:
     """The constraints of a traverse that are about stops alone."""
     for i, one in enumerate(traverse.constraints):
+        if one.landmarks:
+            continue
         factor = _factor(one, [keys.mast(stop) for stop in one.stops])
         if factor is not None:
+            yield GivenFactor(factor=factor, name=f"constraints[{i}] ({one.about})", constraint=i)
+
+
+def landmark_constraints(traverse: Traverse, key_of_track: Mapping[int | None, int]) -> Iterator[GivenFactor]:
+    """The constraints that join terrain points which are variables (Point3), by the tracks of these."""
+    for i, one in enumerate(traverse.constraints):
+        if not isinstance(one, LandmarkDistance):
+            continue
+        a, b = (traverse.track_of(landmark) for landmark in one.landmarks)
+        if a in key_of_track and b in key_of_track:
+            sigma = gtsam.noiseModel.Isotropic.Sigma(1, one.sigma)
+            factor = gtsam.RangeFactor3(key_of_track[a], key_of_track[b], one.distance_m, sigma)
             yield GivenFactor(factor=factor, name=f"constraints[{i}] ({one.about})", constraint=i)
 
 
@@ -30,6 +53,8 @@ def _factor(one: Constraint, masts: list[int]) -> gtsam.NonlinearFactor | None:
             position_m=one.target_m,
             axes=one.axes,
         )
+    if isinstance(one, StopPlacement):
+        return gtsam.PriorFactorPose3(masts[0], one.world_T_mast, noise.Gaussian.Covariance(one.covariance))
     if isinstance(one, StopPose):
         return gtsam.BetweenFactorPose3(
             masts[0], masts[1], one.a_T_b, noise.Gaussian.Covariance(one.covariance)

@@ -21,7 +21,7 @@ class Factors:
     telemetry: tuple[gtsam.NonlinearFactor, ...]
     """Priors of masts and angles, and motions from stop to stop."""
     ties: tuple[gtsam.NonlinearFactor, ...] = ()
-    """Factors that tie camera poses, or projection matrices, to the mast."""
+    """Factors that tie camera poses, or projection matrices, to the mast; loose priors of terrain points."""
     rig: tuple[gtsam.NonlinearFactor, ...] = ()
     """Priors of free entries of the rig."""
     given: tuple[GivenFactor, ...] = ()

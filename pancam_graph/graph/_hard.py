@@ -78,6 +78,8 @@ class HardTemplate(FactorTemplate):
         """The same variables, with these sensors behind the images."""
         other = copy(self)
         other.sensors = sensors
+        # A point that follows its variable over a long step leaves it by more than they may be apart.
+        other.refines_landmarks = sensors is not None and len(sensors.track) > 0
         other.__dict__.pop("linkage", None)
         return other
 
@@ -224,7 +226,9 @@ class HardTemplate(FactorTemplate):
             unit_t=masts[1][stop],
             chain=chain[seg.present],
         )
-        return posture if self.sensors is None else self.sensors.postured(posture, masts, self._mast_keys)
+        if self.sensors is None:
+            return posture
+        return self.sensors.postured(posture, values, masts, self._mast_keys)
 
     def _angle_twists(self, angles: FloatArray, axes: tuple[FloatArray, FloatArray] | None) -> FloatArray:
         """Twists of the mast frame (frames, 6, 2), rotation first, that move the head as its pan and tilt do.
@@ -298,6 +302,10 @@ class HardTemplate(FactorTemplate):
             return found
         found = found or RigCorrection.to_calibrations(self.traverse, self.traverse.calibration)
         return replace(found, field_px=self._field_changes(values))
+
+    def ties(self, *, apart: bool = False) -> FactorList:
+        """Loose priors of terrain points that are variables."""
+        return [] if self.sensors is None else self.sensors.priors()
 
     def flex_factors(self, stop: int) -> FactorList:
         """The prior of how a stop's heads stand off the rigid mast, if they may."""

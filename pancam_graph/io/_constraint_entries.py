@@ -2,8 +2,9 @@
 
 import csv
 import io
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import gtsam
 import numpy as np
@@ -12,12 +13,20 @@ from pydantic import Field
 from pancam_graph.base.choices import expected_one_of
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray
-from pancam_graph.data import CONSTRAINTS, Constraint, NamedPoints
+from pancam_graph.data import (
+    CONSTRAINTS,
+    Constraint,
+    LandmarkSurface,
+    NamedPoints,
+    StopPlacement,
+    StopPosition,
+    Surface,
+)
 from pancam_graph.io._csv_table import read_csv_table
 from pancam_graph.io._entries import Label, PoseEntry, SparseEntry
 from pancam_graph.io._json import prefixed, short
 
-__all__ = ["AnyConstraint", "constraint_entry", "points_csv", "read_points"]
+__all__ = ["AnyConstraint", "constraint_entry", "points_csv", "read_points", "surface_files"]
 
 _Landmark = Label | int
 _Axes = Annotated[list[float | None], Field(min_length=3, max_length=3)]
@@ -30,22 +39,31 @@ _COLUMNS = ("name", "image", "u_px", "v_px", "sigma_px")
 class _ConstraintEntry(SparseEntry):
     """Base of all kinds."""
 
-    _OPTIONAL: ClassVar = frozenset({"robust", "sigma_m", "covariance_m2"})
+    _OPTIONAL: ClassVar = frozenset(
+        {"robust", "sigma_m", "covariance_m2", "position_m", "world_T_mast", "covariance"}
+    )
 
     kind: str
     robust: bool | None = None
 
-    def constraint(self) -> Constraint:
-        """The constraint. Raises InputError naming the entry."""
+    def constraint(self, surfaces: Mapping[str, Surface]) -> Constraint:
+        """The constraint; `surfaces` are those of `surface_files`. Raises InputError naming the entry."""
         known = {name: getattr(self, name) for name in type(self).model_fields if name != "kind"}
-        if isinstance(known.get("a_T_b"), PoseEntry):
-            known["a_T_b"] = known["a_T_b"].pose("a_T_b")
+        for name in ("a_T_b", "world_T_mast"):
+            if isinstance(known.get(name), PoseEntry):
+                known[name] = known[name].pose(name)
+        if "file" in known:
+            known["surface"] = surfaces[known.pop("file")]
         for name in ("covariance", "covariance_m2"):
             if known.get(name) is not None:
                 known[name] = _matrix(name, known[name])
-        if "stops" in known:
-            known["between"] = tuple(known.pop("stops"))
+        for name in ("stops", "landmarks"):
+            if name in known:
+                known["between"] = tuple(known.pop(name))
         known["robust"] = bool(known["robust"])
+        return self._made(known)
+
+    def _made(self, known: dict[str, Any]) -> Constraint:
         return _CLASS[self.kind](**known)
 
 
@@ -93,12 +111,40 @@ class _LandmarkInfinity(_ConstraintEntry):
     landmark: _Landmark
 
 
+class _LandmarkSurface(_ConstraintEntry):
+    kind: Literal["landmark-surface"]
+    landmark: _Landmark
+    file: Label
+    sigma_m: float
+
+
+class _LandmarkDistance(_ConstraintEntry):
+    kind: Literal["landmark-distance"]
+    landmarks: Annotated[list[_Landmark], Field(min_length=2, max_length=2)]
+    distance_m: float
+    sigma_m: float
+
+
 class _StopPosition(_ConstraintEntry):
     kind: Literal["stop-position"]
     stop: Label
-    position_m: _Axes
+    position_m: _Axes | None = None
     sigma_m: _Axes | None = None
     covariance_m2: list[list[float]] | None = None
+    world_T_mast: PoseEntry | None = None
+    covariance: list[list[float]] | None = None
+
+    def _made(self, known: dict[str, Any]) -> Constraint:
+        place, pose = ("position_m", "sigma_m", "covariance_m2"), ("world_T_mast", "covariance")
+        told = [name for name in (*place, *pose) if known[name] is not None]
+        if set(told) == set(pose):
+            return StopPlacement(**{name: value for name, value in known.items() if name not in place})
+        if "position_m" not in told or set(told) & set(pose):
+            raise InputError(
+                "expected position_m with sigma_m or covariance_m2, or world_T_mast with covariance; found "
+                f"{' and '.join(told) or 'none'}"
+            )
+        return StopPosition(**{name: value for name, value in known.items() if name not in pose})
 
 
 class _StopPose(_ConstraintEntry):
@@ -129,6 +175,8 @@ AnyConstraint = Annotated[
     | _LandmarkAzimuth
     | _LandmarkElevation
     | _LandmarkInfinity
+    | _LandmarkSurface
+    | _LandmarkDistance
     | _StopPosition
     | _StopPose
     | _StopDistance
@@ -143,12 +191,35 @@ _ENTRY = {
 }
 
 
-def constraint_entry(constraint: Constraint) -> "_ConstraintEntry":
-    """The entry of a constraint."""
+def surface_files(constraints: Sequence[Constraint], folder: Path | None) -> dict[Surface, str]:
+    """Surfaces of constraints, each with the name of its file in a folder that they are written to.
+
+    A file in `folder`, where the traverse was read, keeps its path there.
+    """
+    out: dict[Surface, str] = {}
+    for one in constraints:
+        if not isinstance(one, LandmarkSurface) or one.surface in out:
+            continue
+        file = one.surface.file
+        name = Path("surface.tif" if file is None else file.name)
+        if file is not None and folder is not None and file.is_relative_to(folder):
+            name = file.relative_to(folder)
+        numbered = [name, *(name.with_name(f"{name.stem}_{n}{name.suffix}") for n in range(2, len(out) + 3))]
+        out[one.surface] = next(str(one) for one in numbered if str(one) not in out.values())
+    return out
+
+
+def constraint_entry(constraint: Constraint, surfaces: Mapping[Surface, str]) -> "_ConstraintEntry":
+    """The entry of a constraint; `surfaces` are those of `surface_files`."""
     entry = _ENTRY[constraint.kind]
     known: dict[str, object] = {"kind": constraint.kind}
+    if isinstance(constraint, LandmarkSurface):
+        known["file"] = surfaces[constraint.surface]
     for name in entry.model_fields:
-        value = getattr(constraint, "between" if name == "stops" else name, None)
+        value = vars(constraint).get("between" if name in {"stops", "landmarks"} else name)
+        if name == "landmarks":
+            known[name] = list(value or ())
+            continue
         if name == "kind" or value is None or (name == "robust" and not value):
             continue
         if isinstance(value, gtsam.Pose3):

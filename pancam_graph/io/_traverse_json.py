@@ -10,8 +10,8 @@ from pancam_graph.base.errors import ImageError, InputError, PancamGraphError
 from pancam_graph.base.regular_files import instead_of_file, is_missing
 from pancam_graph.base.text import visible
 from pancam_graph.base.whole_files import whole_file
-from pancam_graph.data import Frame, NamedPoints, Observations, Stop, Traverse
-from pancam_graph.io._constraint_entries import constraint_entry, points_csv, read_points
+from pancam_graph.data import Frame, NamedPoints, Observations, Stop, Surface, Traverse
+from pancam_graph.io._constraint_entries import constraint_entry, points_csv, read_points, surface_files
 from pancam_graph.io._entries import TRAVERSE_FORMAT, VERSION, PoseEntry
 from pancam_graph.io._input_format import InputFormat
 from pancam_graph.io._json import prefixed, read_json, refused_by_schema, short, validated
@@ -27,6 +27,7 @@ from pancam_graph.io._schema import (
     rig_entry,
 )
 from pancam_graph.io._seen_pictures import require_other_pictures
+from pancam_graph.io._surfaces import read_surface, write_surface
 
 __all__ = ["TRAVERSE_FOLDER", "read_traverse", "traverse_entries", "traverse_of", "write_traverse"]
 
@@ -129,6 +130,8 @@ def write_traverse(traverse: Traverse, folder: Path | str, *, overwrite: bool = 
         for source, target in copies:
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source, target)
+        for surface, name in surface_files(traverse.constraints, traverse.folder).items():
+            _write_surface(surface, folder / name)
         if observations is not None:
             whole_file(folder / _OBSERVATIONS, observations_npz(observations.without_points()))
         if traverse.points is not None:
@@ -138,6 +141,15 @@ def write_traverse(traverse: Traverse, folder: Path | str, *, overwrite: bool = 
         raise InputError(f"{folder}: expected a folder to write to, found: {error}") from error
 
 
+def _write_surface(surface: Surface, target: Path) -> None:
+    """Copy a surface's own file, or write one."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if surface.file is None:
+        write_surface(surface, target)
+    elif surface.file.resolve() != target.resolve():
+        shutil.copyfile(surface.file, target)
+
+
 def traverse_of(
     entries: TraverseFile,
     folder: Path,
@@ -145,10 +157,6 @@ def traverse_of(
     points: NamedPoints | None = None,
 ) -> Traverse:
     """The traverse that a file's entries say. Raises InputError as `Traverse` does."""
-    constraints = []
-    for i, entry in enumerate(entries.constraints):
-        with prefixed(f"constraints[{i}] ({entry.kind})"):
-            constraints.append(entry.constraint())
     stops = tuple(
         Stop(
             id=s.id,
@@ -158,6 +166,14 @@ def traverse_of(
         )
         for i, s in enumerate(entries.stops)
     )
+    constraints = []
+    surfaces: dict[str, Surface] = {}
+    for i, entry in enumerate(entries.constraints):
+        with prefixed(f"constraints[{i}] ({entry.kind})"):
+            if isinstance(file := getattr(entry, "file", None), str) and file not in surfaces:
+                places = np.array([s.world_T_mast.translation()[:2] for s in stops])
+                surfaces[file] = read_surface(_inside(folder, file, "file"), places)
+            constraints.append(entry.constraint(surfaces))
     return Traverse(
         name=entries.name if entries.name is not None else visible(folder.resolve().name),
         rig=entries.rig.rig(),
@@ -194,6 +210,7 @@ def traverse_entries(traverse: Traverse) -> TraverseFile:
         )
         for f in traverse.frames
     ]
+    surfaces = surface_files(traverse.constraints, traverse.folder)
     return TraverseFile(
         name=traverse.name,
         rig=rig_entry(traverse.rig),
@@ -202,7 +219,7 @@ def traverse_entries(traverse: Traverse) -> TraverseFile:
         images=[ImageEntry.of(i) for i in traverse.images],
         observations=None if traverse.observations is None else _OBSERVATIONS,
         sharing=None if traverse.sharing is None else SharingEntry.of(traverse.sharing),
-        constraints=[constraint_entry(one) for one in traverse.constraints],  # type: ignore[misc]  # of its union
+        constraints=[constraint_entry(one, surfaces) for one in traverse.constraints],  # type: ignore[misc]  # of its union
         points=None if traverse.points is None else _POINTS,
     )
 

@@ -91,6 +91,9 @@ def _of_stops(problem: Problem, covariance: Covariance) -> Iterator[ConstraintTe
     for one in problem.factors.given:
         if one.constraint is None:
             continue
+        if not _is_seen(problem, one.constraint):
+            yield _test(problem, one.constraint, np.full(1, np.nan), np.full(1, np.nan), None)
+            continue
         (factor,) = template.seated([one], values)
         linear = factor.linearize(values)
         jacobian, minus_residual = linear.jacobian()
@@ -103,6 +106,18 @@ def _of_stops(problem: Problem, covariance: Covariance) -> Iterator[ConstraintTe
         noise = one.factor.noiseModel()  # type: ignore[attr-defined]  # every one has a model
         raw = noise.unwhiten(-minus_residual)
         yield _test(problem, one.constraint, -minus_residual, raw, spread)
+
+
+def _is_seen(problem: Problem, constraint: int) -> bool:
+    """Whether all terrain points that a factor joins take part."""
+    traverse = problem.template.traverse
+    tracks = {traverse.track_of(landmark) for landmark in traverse.constraints[constraint].landmarks}
+    if problem.ties is None or not tracks:
+        return True
+    sensors = problem.template.sensors
+    assert sensors is not None
+    seen = sensors.track[sensors.point[problem.tied & ~problem.ties.of_constraint]]
+    return tracks.issubset(seen.tolist())
 
 
 def _of_landmarks(
@@ -120,7 +135,7 @@ def _of_landmarks(
     by_place = _by_place(landmarks, alone, views)
     spreads = RowSpread(reduced.system, covariance)
     number = np.searchsorted(reduced.rows, ties.landmark[which])
-    for constraint in dict.fromkeys(ties.constraint.tolist()):
+    for constraint in dict.fromkeys(ties.constraint[ties.of_constraint].tolist()):
         rows = np.flatnonzero(ties.constraint[which] == constraint)
         if not len(rows):
             yield _test(problem, constraint, np.full(1, np.nan), np.full(1, np.nan), None)

@@ -3,15 +3,24 @@
 Outliers are screened without them: a constraint that is wrong must not decide which observations are.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 
 from pancam_graph.base.errors import InputError
-from pancam_graph.base.geometry import IntArray
+from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.cameras import Sensor
 from pancam_graph.data import Traverse
-from pancam_graph.graph import HardTemplate, Sensors, check_given, stop_constraints
+from pancam_graph.graph import (
+    HardTemplate,
+    Sensors,
+    Sight,
+    check_given,
+    landmark_constraints,
+    stop_constraints,
+)
 from pancam_graph.landmarks import Landmarks
 from pancam_graph.solve._options import SolveOptions
 from pancam_graph.solve._problem import Problem
@@ -21,6 +30,8 @@ __all__ = ["constrained", "require_constraints"]
 
 _IN_FRONT = 1e-3
 """Inverse distance, 1/m, at which a landmark of known coordinates starts that is at infinity or beyond."""
+_LARGEST = 2048
+"""Nodes of a surface, along an axis, between the points that are tied to it."""
 
 
 def require_constraints(traverse: Traverse, options: SolveOptions, problem: Problem) -> None:
@@ -40,6 +51,9 @@ def require_constraints(traverse: Traverse, options: SolveOptions, problem: Prob
                 raise InputError(f"{where}: expected a point that two or more images see, found it in fewer")
     given = list(stop_constraints(traverse, template.keys))
     check_given(given, template.seats(given), problem.values)
+    made = ties_of(traverse, seen)
+    if made is not None:
+        _require_surfaces(problem, made[0], problem.points_m()[made[1].landmark])
 
 
 def constrained(problem: Problem) -> Problem:
@@ -50,18 +64,42 @@ def constrained(problem: Problem) -> Problem:
         return problem
     given = [one for one in problem.factors.given if one.constraint is None]
     given += stop_constraints(traverse, template.keys)
-    problem = replace(problem, factors=template.factors(given, present=problem.values))
     made = ties_of(traverse, _tracks(problem))
     if made is None:
-        return problem
+        return replace(problem, factors=template.factors(given, present=problem.values))
     sights, ties = made
     assert isinstance(template, HardTemplate)  # `require_constraints` has looked
-    return replace(
-        problem,
-        template=template.sensing(Sensors.of(sights)),
-        ties=ties,
-        landmarks=_in_front(problem.landmarks, ties.landmark[[s.kind is Sensor.COORDINATES for s in sights]]),
-    )
+    near = [s.kind in {Sensor.COORDINATES, Sensor.SURFACE} for s in sights]
+    problem = replace(problem, ties=ties, landmarks=_in_front(problem.landmarks, ties.landmark[near]))
+    place_m = problem.points_m()[ties.landmark]
+    _require_surfaces(problem, sights, place_m)
+    sensors = Sensors.of(sights, place_m)
+    template, values = template.sensing(sensors), gtsam.Values(problem.values)
+    sensors.insert(values)
+    given += landmark_constraints(traverse, sensors.point_keys)
+    return replace(problem, template=template, values=values, factors=template.factors(given, present=values))
+
+
+def _require_surfaces(problem: Problem, sights: Sequence[Sight], place_m: FloatArray) -> None:
+    """Raise InputError for a surface that does not cover its point, or has too many nodes between several."""
+    constraints = problem.template.traverse.constraints
+    for sight, place in zip(sights, place_m, strict=True):
+        if sight.surface is None:
+            continue
+        where = f"constraints[{sight.constraint}] ({constraints[sight.constraint].about})"
+        if not sight.surface.covers(place[None, :2])[0]:
+            x, y = place[:2]
+            raise InputError(
+                f"{where}: expected a surface with heights two nodes around the point, which is at "
+                f"x {x:.2f} m, y {y:.2f} m; found none there"
+            )
+        of_surface = [p for s, p in zip(sights, place_m, strict=True) if s.surface is sight.surface]
+        span = np.ptp(np.array(of_surface)[:, :2], axis=0) / np.abs(sight.surface.step_m)
+        if span.max() > _LARGEST:
+            raise InputError(
+                f"{where}: expected points on one surface within {_LARGEST} nodes of each other, found them "
+                f"{span.max():.0f} apart"
+            )
 
 
 def _tracks(problem: Problem) -> IntArray:

@@ -62,7 +62,7 @@ class Problem:
         """(ties,) whether each takes part: its landmark does, and it was not let go."""
         if self.ties is None:
             return np.zeros(0, dtype=bool)
-        gone = self.template.let_go.constraints[self.ties.constraint]
+        gone = self.ties.of_constraint & self.template.let_go.constraints[self.ties.constraint]
         return np.asarray(self.present[self.ties.landmark] & ~gone)
 
     @cached_property
@@ -83,7 +83,7 @@ class Problem:
         if sensors is None:
             return self.views
         masts = np.array([pose.translation() for pose in self.template.masts(self.values)])
-        return sensors.behind(self.views, masts)
+        return sensors.behind(self.views, self.values, masts)
 
     def points_m(self) -> FloatArray:
         """World points (landmarks, 3), metres, none farther than the limit where noise hides parallax."""
@@ -134,6 +134,8 @@ class Problem:
         if isinstance(template, HardTemplate):
             template = template.sensing(self.template.sensors)
         values = template.values(self.template.state(self.values, np.zeros((0, 3))))
+        if template.sensors is not None:
+            template.sensors.insert(values, self.values)
         factors = template.factors(self.factors.given, present=self.values)
         return replace(self, template=template, factors=factors, values=values)
 

@@ -22,7 +22,7 @@ class Ties:
     """Measurements by sensors: m rows, one a sensor."""
 
     constraint: IntArray
-    """(m,) row of the traverse's constraint that each is of"""
+    """(m,) row of the traverse's constraint that each is of; -1: it holds a point to its variable"""
     landmark: IntArray
     """(m,) landmark row"""
     uv: FloatArray
@@ -31,6 +31,11 @@ class Ties:
     """(m, 2, 2)"""
     first_image: int
     """Number of images, behind which the sensors are."""
+
+    @property
+    def of_constraint(self) -> BoolArray:
+        """(m,) whether each is of a constraint."""
+        return np.asarray(self.constraint >= 0)
 
     def rows(self, which: BoolArray, landmark: IntArray) -> Measurements:
         """Some of them alone, whose landmarks have these numbers (landmarks,); in their own order.

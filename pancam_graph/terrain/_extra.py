@@ -1,9 +1,8 @@
 """Packages of the extra `terrain`, which are imported when a product needs them."""
 
-from importlib import import_module
 from typing import Any
 
-from pancam_graph.base.errors import InputError
+from pancam_graph.base.extras import needed as needed_of
 
 __all__ = ["needed", "require_extra"]
 
@@ -12,12 +11,7 @@ _PACKAGES = ("rasterio", "laspy", "lazrs")
 
 def needed(package: str) -> Any:
     """A package of the extra. Raises InputError that names the extra where it is not installed."""
-    try:
-        return import_module(package)
-    except ImportError as error:
-        raise InputError(
-            f"terrain: expected the Python package {package}, found none: pip install 'pancam-graph[terrain]'"
-        ) from error
+    return needed_of(package, "terrain")
 
 
 def require_extra() -> None:

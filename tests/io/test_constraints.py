@@ -15,22 +15,31 @@ from pancam_graph.base.errors import InputError
 from pancam_graph.data import (
     CONSTRAINTS,
     LandmarkAzimuth,
+    LandmarkDistance,
     LandmarkElevation,
     LandmarkHeight,
     LandmarkInfinity,
     LandmarkPlane,
     LandmarkPosition,
+    LandmarkSurface,
     NamedPoints,
     StopDistance,
     StopHeading,
+    StopPlacement,
     StopPose,
     StopPosition,
+    Surface,
 )
 from support.fuzzing import dumped, mutated_bytes, mutated_tree, outcome
 from support.small_drives import simulated
 
 S0, S1 = "stop0000", "stop0001"
 POSE = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, -0.2, 0.3), np.array([4.0, 0.1, -0.2]))
+GROUND = Surface(
+    first_m=np.array([-3.0, 4.0]),
+    step_m=np.array([0.5, -0.25]),
+    height_m=np.where(np.eye(9, 7, dtype=bool), np.nan, np.arange(63.0).reshape(9, 7) / 7.0),
+)
 EVERY = (
     LandmarkPosition(landmark="rock7", position_m=(1.0, None, 3.0), sigma_m=(0.01, None, 0.0), robust=True),
     LandmarkPosition(landmark=0, position_m=(1.0, 2.0, 3.0), covariance_m2=np.diag([1e-4, 2e-4, 3e-4])),
@@ -43,6 +52,9 @@ EVERY = (
     StopPose(between=(S0, S1), a_T_b=POSE, covariance=1e-4 * np.eye(6)),
     StopDistance(between=(S0, S1), distance_m=4.0, sigma_m=0.01),
     StopHeading(stop=S1, heading_rad=-0.3, sigma_rad=0.01),
+    LandmarkSurface(landmark="rock7", surface=GROUND, sigma_m=0.1, robust=True),
+    LandmarkDistance(between=("rock7", 0), distance_m=2.5, sigma_m=0.01),
+    StopPlacement(stop=S1, world_T_mast=POSE, covariance=1e-4 * np.eye(6)),
 )
 
 
@@ -79,6 +91,9 @@ def test_every_kind_is_written_and_read_back(tmp_path: Path) -> None:
                 assert found.matrix() == pytest.approx(value.matrix(), abs=1e-15)
             elif isinstance(value, np.ndarray):
                 assert np.array_equal(found, value)
+            elif isinstance(value, Surface):
+                for part in ("first_m", "step_m", "height_m"):
+                    assert np.array_equal(getattr(found, part), getattr(value, part), equal_nan=True)
             else:
                 assert found == value or list(found) == list(value), name
     assert traverse.observations is not None
@@ -86,7 +101,7 @@ def test_every_kind_is_written_and_read_back(tmp_path: Path) -> None:
     assert np.array_equal(again.observations.uv_px, traverse.observations.uv_px)
     assert again.observations.point_track == traverse.observations.point_track
     write_traverse(again, tmp_path / "b")
-    for file in ("points.csv", "observations.npz"):
+    for file in ("points.csv", "observations.npz", "surface.tif"):
         assert (tmp_path / "b" / file).read_bytes() == (tmp_path / "a" / file).read_bytes()
 
 
@@ -116,6 +131,10 @@ def appended(**constraint: Any) -> Change:
 
 
 EXACT = [{"kind": "landmark-height", "landmark": "peak", "height_m": h, "sigma_m": 0.0} for h in (1.0, 2.0)]
+DISTANCES = [
+    {"kind": "landmark-distance", "landmarks": pair, "distance_m": d, "sigma_m": 0.0}
+    for pair, d in ((["rock7", "peak"], 1.0), (["peak", "rock7"], 2.0))
+]
 WRONG: dict[str, tuple[Change, str]] = {
     "unknown kind": (
         entry(9, kind="stop-distanc"),
@@ -165,8 +184,27 @@ WRONG: dict[str, tuple[Change, str]] = {
     "no normal": (entry(3, normal=[0.0, 0.0, 0.0]), "not all 0"),
     "contradictory exact heights": (
         lambda c: c["constraints"].extend(EXACT),
-        r"constraints\[12\] \(landmark-height\): expected what constraints\[11\] says, which is exact",
+        r"constraints\[15\] \(landmark-height\): expected what constraints\[14\] says, which is exact",
     ),
+    "a surface that is not there": (entry(11, file="hills.tif"), "hills.tif: expected a GeoTIFF, found"),
+    "a surface outside": (entry(11, file="../dem.tif"), "file: expected a path inside the traverse folder"),
+    "a surface that is none": (entry(11, file="points.csv"), "points.csv: expected a GeoTIFF, found"),
+    "negative sigma of a surface": (entry(11, sigma_m=-1.0), "sigma_m: expected 0"),
+    "one point twice": (entry(12, landmarks=[0, 0]), "expected two different terrain points, found"),
+    "distance of an unknown point": (
+        entry(12, landmarks=["rock7", "rock8"]),
+        "landmark: expected one of rock7, peak; found 'rock8'",
+    ),
+    "no distance": (entry(12, distance_m=0.0), "distance_m: expected a number above 0, found 0.0"),
+    "contradictory exact distances": (
+        lambda c: c["constraints"].extend(DISTANCES),
+        r"constraints\[15\] \(landmark-distance\): expected what constraints\[14\] says, which is exact",
+    ),
+    "a place told in two ways": (
+        entry(13, position_m=[0.0, 0.0, 0.0]),
+        "expected position_m with sigma_m or covariance_m2, or world_T_mast with covariance; found pos",
+    ),
+    "a pose without covariance": (entry(13, covariance=None), "found world_T_mast"),
     "points that are not there": (
         lambda c: c.update(points="marks.csv"),
         "marks.csv: expected a file, found",

@@ -11,16 +11,20 @@ from pancam_graph.base.errors import InputError
 from pancam_graph.data import (
     Constraint,
     LandmarkAzimuth,
+    LandmarkDistance,
     LandmarkHeight,
     LandmarkInfinity,
     LandmarkPlane,
     LandmarkPosition,
+    LandmarkSurface,
     StopDistance,
     StopHeading,
+    StopPlacement,
     StopPose,
     StopPosition,
 )
 from pancam_graph.factors import Key, stop_heading_factor
+from pancam_graph.simulate import Simulation
 from pancam_graph.smoother import solve_incrementally
 from pancam_graph.solve import Problem, constrained, prepare
 from pancam_graph.solve._reduced import panels_of
@@ -163,6 +167,65 @@ def test_the_gradient_of_tied_landmarks_is_that_of_the_cost(state: str) -> None:
             assert gradient[k] == pytest.approx(numeric, rel=1e-3, abs=1e-4 * np.abs(gradient).max())
 
 
+def distance_of(simulation: Simulation, sigma: float) -> LandmarkDistance:
+    a, b = seen_often(simulation, 2)
+    true = simulation.truth.landmarks_m
+    return LandmarkDistance(
+        between=(a, b), distance_m=float(np.linalg.norm(true[a] - true[b])), sigma_m=sigma
+    )
+
+
+def test_points_that_are_variables_change_nothing_and_an_exact_distance_of_them_is_kept() -> None:
+    simulation = simulated(2, 3)
+    options = replace(HARD, landmark_covariances=True)
+    loose = distance_of(simulation, 10.0)
+    plain = solve(simulation.traverse, options)
+    tied = solve(replace(simulation.traverse, constraints=(loose,)), options)
+    for stop in (1, 2):
+        apart = plain.final.world_T_mast[stop].localCoordinates(tied.final.world_T_mast[stop])
+        assert np.abs(apart / np.sqrt(np.diag(plain.stop_covariance[stop]))).max() < 1e-3
+        assert tied.stop_covariance[stop] == pytest.approx(plain.stop_covariance[stop], rel=1e-3, abs=1e-12)
+    rows = [int(np.flatnonzero(plain.landmark_track == track)[0]) for track in loose.between]
+    assert tied.landmark_covariance_m2 is not None
+    assert plain.landmark_covariance_m2 is not None
+    for row in rows:
+        ratio = np.diag(tied.landmark_covariance_m2[row]) / np.diag(plain.landmark_covariance_m2[row])
+        assert ratio == pytest.approx(1.0, abs=2e-3)
+    found = float(np.linalg.norm(np.subtract(*plain.final.landmarks_m[rows])))
+    exact = replace(loose, distance_m=found + 0.002, sigma_m=0.0)
+    after = solve(replace(simulation.traverse, constraints=(exact,)), options)
+    assert after.converged
+    between = np.linalg.norm(np.subtract(*after.final.landmarks_m[rows]))
+    assert between == pytest.approx(found + 0.002, abs=5e-5)
+
+
+def test_a_stops_pose_with_its_covariance_is_as_theory_says() -> None:
+    plain = near_part(simulated(2, 2))
+    before = solve(plain, HARD)
+    pose, P = before.final.world_T_mast[1], before.stop_covariance[1]
+    told = pose.retract(np.array([2e-4, -1e-4, 3e-4, 0.001, 0.002, -0.001]))
+    root = np.diag([1e-3] * 3 + [2e-3] * 3) @ (np.eye(6) + 0.3 * np.tri(6))
+    tie = StopPlacement(stop=plain.stops[1].id, world_T_mast=told, covariance=root @ root.T)
+    after = solve(replace(plain, constraints=(tie,)), HARD)
+    gain = P @ np.linalg.inv(P + root @ root.T)
+    size, step = np.sqrt(np.diag(P)), gain @ pose.localCoordinates(told)
+    moved = pose.localCoordinates(after.final.world_T_mast[1])
+    assert np.abs((moved - step) / size).max() < 0.05 * np.abs(step / size).max()
+    assert np.abs((after.stop_covariance[1] - (P - gain @ P)) / np.outer(size, size)).max() < 0.05
+
+
+def test_a_surface_that_does_not_cover_its_point_is_refused_in_one_sentence() -> None:
+    simulation = simulated(2, 3)
+    tie = next(one for one in landmark_ties(simulation) if isinstance(one, LandmarkSurface))
+    holed = np.where(np.eye(81, dtype=bool), np.nan, tie.surface.height_m)
+    for changed in ({"first_m": tie.surface.first_m + 100.0}, {"height_m": holed}):
+        tied = replace(tie, surface=replace(tie.surface, **changed))
+        with pytest.raises(
+            InputError, match=r"constraints\[0\] .*: expected a surface with heights .* at x "
+        ):
+            solve(replace(simulation.traverse, constraints=(tied,)), HARD)
+
+
 def loosened(stop: Stop) -> Stop:
     return replace(stop, sigma_translation_m=1e3, sigma_rotation_rad=10.0)
 
@@ -218,13 +281,19 @@ def with_gross(ties: tuple[Constraint, ...], which: int, *, robust: bool) -> tup
         wrong = replace(tie, height_m=tie.height_m + 0.3)
     elif isinstance(tie, LandmarkPlane):
         wrong = replace(tie, offset_m=tie.offset_m + 0.3)
+    elif isinstance(tie, LandmarkSurface):
+        wrong = replace(tie, surface=replace(tie.surface, height_m=tie.surface.height_m + 0.3))
+    elif isinstance(tie, LandmarkDistance):
+        wrong = replace(tie, distance_m=tie.distance_m + 0.3)
     else:
         assert isinstance(tie, LandmarkAzimuth)
         wrong = replace(tie, azimuth_rad=tie.azimuth_rad + 0.1)
     return tuple(replace(wrong if i == which else one, robust=robust) for i, one in enumerate(ties))
 
 
-@pytest.mark.parametrize("which", [0, *(pytest.param(i, marks=pytest.mark.slow) for i in range(1, 6))])
+@pytest.mark.parametrize(
+    "which", [0, *(pytest.param(i, marks=pytest.mark.slow) for i in (1, 2, 3, 4, 5, 7, 8))]
+)
 def test_a_gross_tie_is_found_named_and_let_go(which: int) -> None:
     simulation = simulated(2, 3)
     ties = landmark_ties(simulation)

@@ -8,15 +8,18 @@ from pancam_graph.base.geometry import FloatArray
 from pancam_graph.data import (
     Constraint,
     LandmarkAzimuth,
+    LandmarkDistance,
     LandmarkElevation,
     LandmarkHeight,
     LandmarkPlane,
     LandmarkPosition,
+    LandmarkSurface,
+    Surface,
     Traverse,
 )
 from pancam_graph.simulate import Simulation
 
-__all__ = ["landmark_ties", "noise_free", "seen_often"]
+__all__ = ["ground_through", "landmark_ties", "noise_free", "seen_often"]
 
 _COVARIANCE_M2 = 1e-6 * np.array([[4.0, 1.0, 0.0], [1.0, 3.0, 1.0], [0.0, 1.0, 2.0]])
 
@@ -31,10 +34,20 @@ def seen_often(simulation: Simulation, n: int, least: int = 4) -> list[int]:
     return [int(i) for i in np.argsort(distance) if counts[i] >= least][:n]
 
 
+def ground_through(point_m: FloatArray, step_m: float = 0.25, nodes: int = 81) -> Surface:
+    """Curved ground (a quadratic, which cubic convolution has exactly) through a point near its middle."""
+    half = step_m * (nodes // 2)
+    first = np.array([point_m[0] - half + 0.3 * step_m, point_m[1] + half - 0.4 * step_m])
+    x = first[0] + step_m * np.arange(nodes) - point_m[0]
+    y = first[1] - step_m * np.arange(nodes)[:, None] - point_m[1]
+    height = point_m[2] + 0.2 * x - 0.1 * y + 0.02 * x * x - 0.03 * x * y + 0.01 * y * y
+    return Surface(first_m=first, step_m=np.array([step_m, -step_m]), height_m=height)
+
+
 def landmark_ties(simulation: Simulation, sigma: float = 1e-3) -> tuple[Constraint, ...]:
     """One of each kind that has a number, metres or radians of this sigma."""
     true, stops = simulation.truth, simulation.traverse.stops
-    a, b, c, d, e, f, g = seen_often(simulation, 7)
+    a, b, c, d, e, f, g, h, i, j = seen_often(simulation, 10)
     point = true.landmarks_m
 
     def arm(landmark: int, stop: int) -> FloatArray:
@@ -68,6 +81,10 @@ def landmark_ties(simulation: Simulation, sigma: float = 1e-3) -> tuple[Constrai
             stop=stops[-1].id,
             elevation_rad=float(np.arctan2(up[2], np.hypot(up[0], up[1]))),
             sigma_rad=0.1 * sigma,
+        ),
+        LandmarkSurface(landmark=h, surface=ground_through(point[h]), sigma_m=sigma),
+        LandmarkDistance(
+            between=(i, j), distance_m=float(np.linalg.norm(point[i] - point[j])), sigma_m=sigma
         ),
     )
 
