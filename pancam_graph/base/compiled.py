@@ -95,8 +95,8 @@ class Entry:
         )
         self._linked = dict[tuple[Any, ...], NativeFunction]()
         """Code by what it is compiled for."""
-        self._last = dict[tuple[Any, ...], NativeFunction]()
-        """The code that was called last for arguments of some classes."""
+        self._plans = dict[tuple[type, ...], _Plan]()
+        """How arguments of some classes were handed on last."""
         self._dispatcher: Any = None
         """Numba's, where its code cannot be called without it."""
         self.n_found = 0
@@ -109,18 +109,19 @@ class Entry:
         """
         if self._dispatcher is not None:
             return self._dispatcher(*arguments)
-        classes, words, numbers = list[Any](), list[int](), list[float]()
-        _spread(arguments, classes, words, numbers)
-        guess = tuple(classes)
-        native = self._last.get(guess)
-        if native is not None:
+        outer = tuple(map(type, arguments))
+        plan = self._plans.get(outer)
+        values = None if plan is None else plan.leaves(arguments)
+        if plan is not None and values is not None:
             with suppress(OtherArraysError):
-                return native(words, numbers)
+                return plan.native(*plan.handed(values))
         native = self._ready(arguments)
         if native is None:
             return self(*arguments)
-        self._last[guess] = native
-        return native(words, numbers, checked=True)
+        plan = self._plans[outer] = _Plan.of(arguments, native)
+        values = plan.leaves(arguments)
+        assert values is not None  # it is their own plan
+        return native(*plan.handed(values), checked=True)
 
     @property
     def signatures(self) -> list[tuple[Any, ...]]:
@@ -187,28 +188,65 @@ def _word(kind: Any) -> str:
     return kind.__qualname__ if isinstance(kind, type) else str(kind)
 
 
-def _spread(values: Sequence[Any], classes: list[Any], words: list[int], numbers: list[float]) -> None:
-    """Append the classes of values, and the values themselves: of arrays the addresses of their objects."""
-    for value in values:
-        own = type(value)
-        classes.append(own)
-        if own is np.ndarray:
-            words.append(id(value))
-        elif own is int:
-            words.append(value)
-        elif own is float:
-            numbers.append(value)
-        elif isinstance(value, tuple):
-            classes.append(len(value))
-            _spread(value, classes, words, numbers)
-        elif isinstance(value, np.ndarray):
-            words.append(id(value))
-        elif isinstance(value, (bool, np.bool_, int, np.integer)):
-            words.append(int(value))
-        elif isinstance(value, (float, np.floating)):
-            numbers.append(float(value))
-        else:
-            raise TypeError(f"compiled functions take arrays, numbers and tuples of these, not {own}")
+@dataclass(frozen=True, kw_only=True)
+class _Plan:
+    """How arguments of some classes are handed on: learnt once, since calls are short and many."""
+
+    native: NativeFunction
+    tuples: tuple[tuple[int, type, int], ...]
+    """Tuples in the order in which they are opened: place, class and length of each."""
+    classes: tuple[type, ...]
+    """Classes of what is left when all are open."""
+    whole: tuple[int, ...]
+    """Places of whole numbers among these."""
+    real: tuple[int, ...]
+    """Places of other numbers."""
+
+    @staticmethod
+    def of(arguments: Sequence[Any], native: NativeFunction) -> "_Plan":
+        """The plan for arguments that code takes. Raises TypeError where they are no arrays or numbers."""
+        values, tuples = list[Any](arguments), list[tuple[int, type, int]]()
+        whole, real, at = list[int](), list[int](), 0
+        while at < len(values):
+            value = values[at]
+            if isinstance(value, tuple):
+                tuples.append((at, type(value), len(value)))
+                values[at : at + 1] = value
+                continue
+            if isinstance(value, (bool, np.bool_, int, np.integer)):
+                whole.append(at)
+            elif isinstance(value, (float, np.floating)):
+                real.append(at)
+            elif not isinstance(value, np.ndarray):
+                raise TypeError(
+                    f"compiled functions take arrays, numbers and tuples of these, not {type(value)}"
+                )
+            at += 1
+        return _Plan(
+            native=native,
+            tuples=tuple(tuples),
+            classes=tuple(map(type, values)),
+            whole=tuple(whole),
+            real=tuple(real),
+        )
+
+    def leaves(self, arguments: Sequence[Any]) -> list[Any] | None:
+        """Arrays and numbers of some arguments, in order; None where they are not of the plan's classes."""
+        values = list[Any](arguments)
+        for at, own, length in self.tuples:
+            if type(values[at]) is not own or len(values[at]) != length:
+                return None
+            values[at : at + 1] = values[at]
+        return values if tuple(map(type, values)) == self.classes else None
+
+    def handed(self, values: list[Any]) -> tuple[list[int], list[float]]:
+        """Words and other numbers for the code, of `leaves`: of arrays the addresses of their objects."""
+        words = list(map(id, values))
+        for at in self.whole:
+            words[at] = int(values[at])
+        for at in reversed(self.real):
+            del words[at]
+        return words, [float(values[at]) for at in self.real]
 
 
 def _kinds(values: Sequence[Any]) -> Iterator[Any]:
@@ -296,8 +334,9 @@ def chosen(choose: Callable[[_F], Callable[..., Any]]) -> Callable[[_F], _F]:
 
 
 def is_on_disk(function: Callable[..., Any]) -> bool:
-    """Whether an entry point was compiled before, from the present sources: its first call then is quick.
+    """Whether an entry point was compiled before, from the present sources: its next call then is quick.
 
-    True where compilation is switched off (NUMBA_DISABLE_JIT).
+    True where compilation is switched off (NUMBA_DISABLE_JIT), and where its code is in memory: the disk is
+    then not looked at.
     """
-    return not isinstance(function, Entry) or function.is_on_disk
+    return not isinstance(function, Entry) or bool(function.signatures) or function.is_on_disk

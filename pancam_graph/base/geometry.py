@@ -229,9 +229,9 @@ def compose(
 
 def pan_tilt_rotation(pan_rad: ArrayLike, tilt_rad: ArrayLike) -> FloatArray:
     """Rotation of the head, `Rz(pan) Ry(-tilt)`, for scalars or arrays: (...,) to (..., 3, 3)."""
-    pan, tilt = np.broadcast_arrays(np.asarray(pan_rad, dtype=float), np.asarray(tilt_rad, dtype=float))
+    pan, tilt = np.asarray(pan_rad, dtype=float), np.asarray(tilt_rad, dtype=float)
     cp, sp, ct, st = np.cos(pan), np.sin(pan), np.cos(tilt), np.sin(tilt)
-    out = np.empty((*pan.shape, 3, 3))
+    out = np.empty((*np.broadcast(pan, tilt).shape, 3, 3))
     out[..., 0, 0], out[..., 0, 1], out[..., 0, 2] = cp * ct, -sp, -cp * st
     out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = sp * ct, cp, -sp * st
     out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = st, 0.0, ct

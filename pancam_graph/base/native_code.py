@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
+from struct import pack
 from typing import Any
 
 import numpy as np
@@ -100,7 +101,7 @@ class NativeFunction:
 
     def __init__(self, address: int, returns: str, dtypes: Sequence[np.dtype[Any]]) -> None:
         self._function = _CALL(address)
-        self._returns = returns
+        self._result = _RESULTS[returns]
         self._dtypes = tuple(dtypes)  # keeps their addresses
         self._expected = (_WORD * len(dtypes))(*map(id, dtypes))
 
@@ -112,10 +113,10 @@ class NativeFunction:
         Raises OtherArraysError, unless the arrays were `checked`, and RuntimeError where the code ends with
         Numba's sign of an exception: it found no memory.
         """
-        result = _RESULTS[self._returns]()
+        result = self._result()
         status = self._function(
-            (_WORD * len(words))(*words),
-            (_NUMBER * len(numbers))(*numbers),
+            pack(f"={len(words)}q", *words),
+            pack(f"={len(numbers)}d", *numbers),
             result,
             None if checked else self._expected,
         )

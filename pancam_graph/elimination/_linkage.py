@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -93,11 +94,17 @@ class Linkage:
         """Index of the variable of each key."""
         return {key: i for i, key in enumerate(self.key)}
 
+    @cached_property
+    def place(self) -> dict[int, tuple[int, slice]]:
+        """By key, the group of a variable and its columns among those of the group."""
+        entries = zip(
+            self.key, self.group.tolist(), self.variable_column.tolist(), self.dim.tolist(), strict=True
+        )
+        return {key: (group, slice(begin, begin + dim)) for key, group, begin, dim in entries}
+
     def columns_of(self, key: int) -> slice:
         """Columns of a variable among those of its group."""
-        i = self.row[key]
-        begin = int(self.variable_column[i])
-        return slice(begin, begin + int(self.dim[i]))
+        return self.place[key][1]
 
     def by_group(self, components: Iterable[tuple[int, IntArray]]) -> dict[int, IntArray]:
         """By group, the columns of components (n,) of variables, by key; only groups with any."""
@@ -119,13 +126,17 @@ class Linkage:
     @cached_property
     def unit_groups(self) -> tuple[tuple[int, ...], ...]:
         """Groups of the variables of each unit."""
-        group = self.group[self.segment_variable]
-        begin = self.segment_begin
+        of_segment, begin = self.group[self.segment_variable].tolist(), self.segment_begin.tolist()
         of_field = set() if self.fields is None else {self.fields.group}
-        return tuple(
-            tuple(sorted(of_field.union(group[begin[u] : begin[u + 1]].tolist())))
-            for u in range(len(begin) - 1)
-        )
+        # Many units have the same groups: only what differs is sorted.
+        known = dict[tuple[int, ...], tuple[int, ...]]()
+        out = list[tuple[int, ...]]()
+        for first, last in pairwise(begin):
+            of_unit = tuple(of_segment[first:last])
+            if of_unit not in known:
+                known[of_unit] = tuple(sorted(of_field.union(of_unit)))
+            out.append(known[of_unit])
+        return tuple(out)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import scipy
@@ -200,7 +201,7 @@ class Panels:
         st = self.structure
         rows: list[FloatArray] = [np.zeros((0, 0))] * len(st.dim)
         # Pivots are compared with the diagonal before elimination: one tiny beside it is rounding.
-        summed = [np.diag(panel).copy() for panel in self.panel]
+        summed = [panel.diagonal().copy() for panel in self.panel]
         least = 1.0
         for g in st.order:
             rows[g], pivot = _root_of_panel(self.panel[g], summed[g])
@@ -229,21 +230,27 @@ def _root_of_panel(panel: FloatArray, summed: FloatArray) -> tuple[FloatArray, f
     """
     n, unit = len(summed), np.sqrt(np.maximum(summed, 0.0))
     scale = np.where(unit > 0, 1 / np.maximum(unit, 1e-150), 0.0)
-    if not np.all(np.isfinite(panel)):
+    if not np.isfinite(panel).all():
         raise SolveError("the linearised system is not finite: a camera or a landmark has left the domain")
     scaled = panel[:, :n] * scale[:, None] * scale
     upper, pivot, rank, _ = scipy.linalg.lapack.dpstrf(scaled, tol=_RANK_TOLERANCE)
     pivot -= 1  # LAPACK counts from 1, and never rejects the first pivot
-    if np.max(np.diag(scaled), initial=0.0) <= _RANK_TOLERANCE:
+    if scaled.diagonal().max(initial=0.0) <= _RANK_TOLERANCE:
         rank = 0
     rows = np.zeros((rank, panel.shape[1]))
     if rank > 0:
-        upper = np.triu(upper)[:rank]
+        upper = np.where(_upper_triangle(n), upper, 0.0)[:rank]
         rows[:, pivot] = upper * unit[pivot]
         right = panel[pivot[:rank], n:] * scale[pivot[:rank], None]
         # U'^-1 right, transposed: BLAS gets columns in its own order, and no large copy is made.
         rows[:, n:] = scipy.linalg.blas.dtrsm(1.0, upper[:, :rank], right.T, side=1, overwrite_b=1).T
-    return rows, float(np.min(np.diag(upper)[:rank], initial=1.0)) ** 2
+    return rows, float(upper.diagonal()[:rank].min(initial=1.0)) ** 2
+
+
+@lru_cache(maxsize=16)
+def _upper_triangle(n: int) -> BoolArray:
+    """(n, n) whether an entry is on the diagonal or above it: NumPy takes longer than a small system."""
+    return np.triu(np.ones((n, n), dtype=bool))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -80,7 +80,8 @@ class HardTemplate(FactorTemplate):
         other.sensors = sensors
         # A point that follows its variable over a long step leaves it by more than they may be apart.
         other.refines_landmarks = sensors is not None and len(sensors.track) > 0
-        other.__dict__.pop("linkage", None)
+        for of_linkage in ("linkage", "held_by_group"):
+            other.__dict__.pop(of_linkage, None)
         return other
 
     @cached_property

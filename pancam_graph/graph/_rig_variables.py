@@ -83,6 +83,7 @@ class RigVariables:
         t = self.traverse = traverse
         self.sharing = sharing
         self._K = t.calibration
+        self._focals_px = [float(p.calibration_matrix[0, 0]) for p in t.rig.pinholes]
         mounts_R, mounts_t = pose_arrays([e.head_T_camera for e in t.rig.eyes])
         self._mounts = mounts_R[t.image_eye], mounts_t[t.image_eye]
         self._place: dict[Quantity, IntArray] = {}
@@ -115,7 +116,7 @@ class RigVariables:
         nominal = self._nominal(quantity, entries, n_sites)
         out = []
         for i, (number, first) in enumerate(zip(numbers, firsts, strict=True)):
-            of_owner = place == i
+            is_same = (nominal[place == i] == nominal[first]).all(axis=0)
             eye_of_all = None if no_eye or scope == "all" else int(t.image_eye[first])
             focal = 1.0 if no_eye else self._focal_px(eye_of_all)
             key = key_of(_KIND[quantity], int(number))
@@ -134,8 +135,8 @@ class RigVariables:
                     image=int(first) if scope == "image" else None,
                     first=int(first),
                     nominal=tuple(
-                        float(one) if np.all(of_entry == one) else None
-                        for of_entry, one in zip(nominal[of_owner].T, nominal[first], strict=True)
+                        one if same else None
+                        for same, one in zip(is_same.tolist(), nominal[first].tolist(), strict=True)
                     ),
                 )
             )
@@ -146,8 +147,7 @@ class RigVariables:
 
         It does not depend on which images a traverse has, so that a drive has the same priors at every stop.
         """
-        of_eyes = [p.calibration_matrix[0, 0] for p in self.traverse.rig.pinholes]
-        return float(np.mean(of_eyes) if eye is None else of_eyes[eye])
+        return float(np.mean(self._focals_px)) if eye is None else self._focals_px[eye]
 
     def _basis_of(self, quantity: Quantity, free: tuple[str, ...], n_sites: int) -> FloatArray:
         """(sites, entries, columns) takes free entries to all entries of the correction."""

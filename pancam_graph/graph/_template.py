@@ -164,6 +164,11 @@ class FactorTemplate(ABC):
     def held_columns(self) -> dict[int, IntArray]:
         """By key, tangent components that telemetry holds while others of the same variable are free."""
 
+    @cached_property
+    def held_by_group(self) -> dict[int, IntArray]:
+        """By group, the columns that telemetry holds."""
+        return self.linkage.by_group(self.held_columns().items())
+
     @abstractmethod
     def angle_rows(self, frame: int, state: State) -> tuple[IntArray, FloatArray]:
         """Jacobian of a frame's pan and tilt by its stop: columns (k,) of the group, rows (2, k).

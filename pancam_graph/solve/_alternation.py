@@ -23,7 +23,7 @@ from pancam_graph.solve._eliminated import EliminatedSolver
 from pancam_graph.solve._joint import all_columns, retracted
 from pancam_graph.solve._optimise import Iteration, Outcome, is_short
 from pancam_graph.solve._problem import Problem, system_of
-from pancam_graph.solve._reduced import add_factors, held_columns
+from pancam_graph.solve._reduced import add_factors
 from pancam_graph.solve._stopping import LEFT_SIGMAS, StopRule
 
 __all__ = ["AlternatingSolver"]
@@ -72,7 +72,7 @@ class _Point:
         self.template, self.factors, self.values = problem.template, problem.factors, problem.values
         self.system, self.rows = system_of(problem, loss)
         self.n_observations = int(problem.kept.sum())
-        self.held = held_columns(self.template)
+        self.held = self.template.held_by_group
         self.held_columns = all_columns(self.template.linkage, self.held)
         """The held columns among all columns"""
         self.cost = self.system.cost_at(self.posture(self.values)) + self.factors.error(self.values)

@@ -12,7 +12,7 @@ from pancam_graph.elimination import Covariance, FreeDirectionError, JointCovari
 from pancam_graph.graph import FactorTemplate, Kind, index_of, kind_of
 from pancam_graph.landmarks import Landmarks
 from pancam_graph.solve._problem import Problem
-from pancam_graph.solve._reduced import ReducedSystem, held_columns, loosened_root
+from pancam_graph.solve._reduced import ReducedSystem, loosened_root
 
 __all__ = ["Uncertainty", "covariance_of", "uncertainty"]
 
@@ -122,7 +122,7 @@ def _inverse(template: FactorTemplate, root: Root) -> Covariance:
         covariance = root.covariance()
     except FreeDirectionError as error:
         raise SolveError(f"nothing holds {_name(template, error)}") from error
-    covariance.release(held_columns(template))
+    covariance.release(template.held_by_group)
     return covariance
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from pancam_graph.base.geometry import IntArray
 from pancam_graph.elimination import LandmarkSystem, Root
 from pancam_graph.graph import HardTemplate
-from pancam_graph.landmarks import SQUARED, Loss
+from pancam_graph.landmarks import SQUARED, CameraViews, Loss
 from pancam_graph.solve._joint import JointSystem, OnLastGroup
 from pancam_graph.solve._optimise import Iteration, Outcome, optimise
 from pancam_graph.solve._problem import Problem, Solver, system_of
@@ -42,7 +42,7 @@ class EliminatedSolver(Solver):
             return problem, outcome
         _, in_front = problem.residuals
         problem, again = self._fit(
-            replace(problem, accepted=problem.accepted & in_front), rule, SQUARED, "solve", LEFT_SIGMAS
+            problem.having(accepted=problem.accepted & in_front), rule, SQUARED, "solve", LEFT_SIGMAS
         )
         return problem, replace(again, costs=outcome.costs + again.costs[1:])
 
@@ -94,7 +94,7 @@ class EliminatedSolver(Solver):
             gain_ahead=lambda _values: _gain_ahead(system, joint.root),
             left_sigmas=left_sigmas,
         )
-        return self._ended(problem, outcome, system, rows, joint.known_root), outcome
+        return self._ended(problem, outcome, system, rows, joint.known_root, joint.views), outcome
 
     def _ended(
         self,
@@ -103,11 +103,12 @@ class EliminatedSolver(Solver):
         system: LandmarkSystem,
         rows: IntArray,
         joint: Root | None = None,
+        views: CameraViews | None = None,
     ) -> Problem:
-        """The problem at the end of a fit, which is kept as `last`."""
+        """The problem at the end of a fit, which is kept as `last`; `views` are its cameras, if known."""
         vector = problem.landmarks.vector.copy()
         vector[rows] = system.landmarks().vector
-        fitted = problem.at(outcome.values, replace(problem.landmarks, vector=vector))
+        fitted = problem.at(outcome.values, replace(problem.landmarks, vector=vector), views)
         self._last = Ended(problem=fitted, system=system, rows=rows, joint=joint)
         return fitted
 

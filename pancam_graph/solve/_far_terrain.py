@@ -21,7 +21,7 @@ from pancam_graph.landmarks import InverseRanges, Landmarks, at_inverse_ranges, 
 from pancam_graph.solve._joint import all_columns, retracted
 from pancam_graph.solve._problem import Problem, reach_m
 from pancam_graph.solve._range_prior import RangePrior
-from pancam_graph.solve._reduced import held_columns, panels_of
+from pancam_graph.solve._reduced import panels_of
 
 __all__ = ["FarTerrain", "far_terrain"]
 
@@ -110,7 +110,7 @@ def _solved(
     `system` is that at the ranges that are expected first.
     """
     link = problem.template.linkage
-    held = all_columns(link, held_columns(problem.template))
+    held = all_columns(link, problem.template.held_by_group)
     root, short = system.copy().root(), _ShortSteps()
     learnt = 0
     for number in range(_ROUNDS):

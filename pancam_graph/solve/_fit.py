@@ -67,7 +67,7 @@ def fit(screened: Screened) -> Fitted:
                 break
             factor = noise_factor(problem)
             noise = noise.scaled(factor)
-            problem = replace(problem, measurements=problem.measurements.scaled(factor))
+            problem = problem.having(measurements=problem.measurements.scaled(factor))
             if not (abs(factor - 1) > 1e-3 and outcome.converged):
                 break
     return _without_range_bias(

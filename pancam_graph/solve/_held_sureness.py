@@ -22,7 +22,7 @@ from pancam_graph.graph import HardTemplate, RigVariable, RigVariables
 from pancam_graph.solve._covariance import Uncertainty, covariance_of
 from pancam_graph.solve._problem import Problem
 from pancam_graph.solve._reduced import ReducedSystem
-from pancam_graph.solve._rig_told import RigTold, reduced_to_rig, stated_sharing
+from pancam_graph.solve._rig_told import RigTold, reduced_to_rig
 
 __all__ = ["HeldRig", "held_rig"]
 
@@ -55,14 +55,13 @@ def held_rig(problem: Problem, held: Uncertainty, told: RigTold | None) -> HeldR
     `told` is `rig_told` of the problem. None for models but the rigid mast, for a rig that is exact or of
     which anything is free, and where the system is not determined.
     """
-    sharing = stated_sharing(problem)
-    if told is None or not sharing.any_free:
+    if told is None or not told.stated.any_free:
         return None
     try:
-        odds = _log_odds_of_part(told, RigVariables(told.rig.traverse, sharing))
+        odds = _log_odds_of_part(told, RigVariables(told.rig.traverse, told.stated))
         if odds > _CONFIRMED:
             return HeldRig(log_odds=odds, growth=1.0, what="")
-        wide = problem.on(HardTemplate(problem.template.traverse, sharing))
+        wide = problem.on(HardTemplate(problem.template.traverse, told.stated))
         reduced = reduced_to_rig(wide)
         growth, what = _growth(problem, held, wide, reduced)
         return HeldRig(log_odds=_log_odds_of_whole(wide, reduced), growth=growth, what=what)

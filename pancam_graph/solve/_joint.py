@@ -8,7 +8,7 @@ substitution. The result is the step of the whole system with the same damping o
 step the problem moves there, and GTSAM's vector begins at 0 again.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gtsam
@@ -16,9 +16,10 @@ import numpy as np
 
 from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.elimination import LandmarkSystem, Linkage, Panels, Posture, Root
+from pancam_graph.landmarks import CameraViews
 from pancam_graph.solve._optimise import MOST_DAMPING, InOrder, parameters_of
 from pancam_graph.solve._problem import Problem
-from pancam_graph.solve._reduced import held_columns, joint_panels
+from pancam_graph.solve._reduced import joint_panels
 from pancam_graph.solve._stopping import StopRule
 
 __all__ = ["JointSystem", "OnLastGroup", "all_columns", "retracted"]
@@ -52,6 +53,10 @@ def all_columns(linkage: Linkage, columns: dict[int, IntArray]) -> IntArray:
 class _Trial:
     """A step of all variables from the values of a joint system, and what it leads to."""
 
+    last_step: FloatArray
+    """(columns,) of the last group: what was asked for."""
+    damping: float
+    """Damping of the other groups."""
     step: FloatArray
     """(columns,)"""
     values: gtsam.Values
@@ -72,7 +77,7 @@ class JointSystem:
         link = self.template.linkage
         self.last = next(g for g in reversed(system.structure.order) if link.group_dim[g])
         """Index of the group that is not eliminated"""
-        self._held = all_columns(link, held_columns(self.template))
+        self._held = all_columns(link, self.template.held_by_group)
         self._posture = self.template.posture(self.values)
         self.cost = system.cost_at(self._posture) + self.factors.error(self.values)
         """Cost at these values"""
@@ -83,6 +88,11 @@ class JointSystem:
         self._root: Root | None = None
         self._damped: tuple[float, Root] | None = None
         self._tried: _Trial | None = None
+
+    @property
+    def views(self) -> CameraViews | None:
+        """Cameras at these values; None where sensors are among them."""
+        return self._posture.views if self.template.sensors is None else None
 
     def panels(self) -> Panels:
         """The system (S, s) at these values, landmarks eliminated, all other factors included."""
@@ -119,13 +129,25 @@ class JointSystem:
 
     def cost_after(self, last_step: FloatArray, damping: float) -> float:
         """True cost after a step of the last group (columns,); other groups and landmarks follow it."""
+        tried = self._tried
+        if tried is not None and tried.damping == damping and np.array_equal(tried.last_step, last_step):
+            return tried.cost
         step = self.damped_root(damping).step(known={self.last: last_step})
         step[self._held] = 0.0  # held values stay exactly the same
-        if self._tried is None or not np.array_equal(self._tried.step, step):
+        if tried is not None and np.array_equal(tried.step, step):
+            self._tried = replace(tried, last_step=last_step.copy(), damping=damping)
+        else:
             values = retracted(self.template.linkage, self.values, step)
             posture = self.template.posture(values)
             cost = float(self.system.try_step(posture, step).sum()) + self.factors.error(values)
-            self._tried = _Trial(step=step, values=values, posture=posture, cost=cost)
+            self._tried = _Trial(
+                last_step=last_step.copy(),
+                damping=damping,
+                step=step,
+                values=values,
+                posture=posture,
+                cost=cost,
+            )
         return self._tried.cost
 
     def move(self, last_step: FloatArray, damping: float) -> None:

@@ -1,6 +1,6 @@
 """Stage 4, judge: how sure an optimum is, what speaks against it, and the verdict."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -153,7 +153,7 @@ def _first(fitted: Fitted) -> Problem:
         first = first.letting_go(problem.template.let_go)
     if m is first.measurements and problem.accepted.all():
         return first
-    return triangulated(replace(first, measurements=m, accepted=problem.accepted)).placed()
+    return triangulated(first.having(measurements=m, accepted=problem.accepted)).placed()
 
 
 def _unknown(fitted: Fitted) -> Uncertainty:
@@ -201,8 +201,8 @@ def _diverging(problem: Problem, reduced: ReducedSystem | None, variables: Covar
     if beyond.any():
         m, rows = problem.measurements, np.flatnonzero(beyond)
         weight = problem.accepted.astype(float)
-        bound = replace(
-            problem, landmarks=refine(problem.landmarks, m, problem.views, weight, only=rows)
+        bound = problem.having(
+            landmarks=refine(problem.landmarks, m, problem.views, weight, only=rows)
         ).residuals[0]
         excess = weight * np.sum(bound**2 - problem.residuals[0] ** 2, axis=1)
         square = np.bincount(m.landmark, excess, minlength=m.n_landmarks)

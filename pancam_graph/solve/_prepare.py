@@ -34,6 +34,7 @@ from pancam_graph.graph import (
 )
 from pancam_graph.initialise import FreeCameras, Start, in_turns_of_telemetry, start_from_telemetry
 from pancam_graph.landmarks import (
+    CameraViews,
     Landmarks,
     Measurements,
     lines_of_sight,
@@ -142,7 +143,8 @@ def prepare(
     solver_for(options).require(template)
     values = template.values(_first_state(traverse, start, cameras))
     few = _FEW if options.firm_tie == "soft" else 0.0
-    measurements, track, reason = _measure(traverse.observations, template, values, from_one_place=few)
+    views = template.views(values)
+    measurements, track, reason = _measure(traverse.observations, views, from_one_place=few)
     n = measurements.n_landmarks
     problem = Problem(
         template=template,
@@ -151,7 +153,7 @@ def prepare(
         accepted=np.ones(len(measurements.row), dtype=bool),
         values=values,
         landmarks=Landmarks(vector=np.zeros((n, 4)), origin_m=np.zeros((n, 3))),
-    )
+    ).seen_by(views)
     require_constraints(traverse, options, problem)
     return Prepared(
         traverse=traverse,
@@ -186,13 +188,13 @@ def triangulated(problem: Problem) -> Problem:
     landmarks = triangulate(centre, direction, m.landmark, weight)
     _, in_front = residuals(landmarks, m, views)
     behind = np.bincount(m.landmark, ~in_front & (weight > 0), minlength=m.n_landmarks) > 0
-    problem = replace(problem, landmarks=landmarks)
+    problem = problem.having(landmarks=landmarks)
     if not behind.any():
         return problem
     mean = np.add.reduceat(weight[:, None] * direction, m.starts)
     ahead = landmarks.moved_to(landmarks.origin_m + reach_m(problem)[:, None] * mean)
     vector = np.where(behind[:, None], ahead.vector, landmarks.vector)
-    return replace(problem, landmarks=replace(landmarks, vector=vector))
+    return problem.having(landmarks=replace(landmarks, vector=vector))
 
 
 def free_numbers(traverse: Traverse, options: SolveOptions) -> Sharing:
@@ -280,22 +282,23 @@ def _factors(template: FactorTemplate, values: gtsam.Values, factors: UserFactor
 
 
 def _measure(
-    observations: Observations, template: FactorTemplate, values: gtsam.Values, *, from_one_place: float
+    observations: Observations, views: CameraViews, *, from_one_place: float
 ) -> tuple[Measurements, IntArray, Reasons]:
     """Observations of tracks seen twice or more, the track of each landmark, and reasons.
 
     Tracks seen from one place alone are left out where their share is below `from_one_place`. Raises
     SolveError where no track is seen twice.
     """
-    views = template.views(values)
     *_, valid = lines_of_sight(observations.image, observations.uv_px, views)
     _, track = np.unique(observations.track, return_inverse=True)
     seen = np.bincount(track, valid)
-    centre_m = views.world_t_camera[observations.image[valid]]
-    at_one_place = (seen >= 2) & (_extent_m(centre_m, track[valid], len(seen)) < _ONE_PLACE_M)
-    if np.count_nonzero(at_one_place) >= from_one_place * np.count_nonzero(seen >= 2):
-        at_one_place[:] = False
-    single = valid & ((seen < 2) | at_one_place)[track]
+    too_few = seen < 2
+    if from_one_place > 0:
+        centre_m = views.world_t_camera[observations.image[valid]]
+        at_one_place = (seen >= 2) & (_extent_m(centre_m, track[valid], len(seen)) < _ONE_PLACE_M)
+        if np.count_nonzero(at_one_place) < from_one_place * np.count_nonzero(seen >= 2):
+            too_few |= at_one_place
+    single = valid & too_few[track]
     reason = np.full(len(observations), "", dtype=object)
     reason[~valid], reason[single] = "outside", "single"
     rows = np.flatnonzero(valid & ~single)
@@ -308,7 +311,7 @@ def _measure(
         row=rows,
         image=observations.image[rows],
         landmark=np.cumsum(is_new),
-        uv_px=observations.uv_px[rows],
+        uv_px=observations.uv_px.take(rows, axis=0),
         whitening=observations.noise.select(rows).whitening,
     )
     return measurements, tracks[measurements.starts], reason

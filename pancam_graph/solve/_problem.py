@@ -126,14 +126,14 @@ class Problem:
             weights[place] = weight
             m, weight = joined, weights
         best = refine(self.landmarks, m, self.views_of_all, weight, loss, beyond_infinity=True)
-        return replace(self, landmarks=best)
+        return self.having(landmarks=best)
 
     def on(self, template: FactorTemplate) -> "Problem":
         """The same problem on another template, with the nearest cameras that its variables allow."""
         template = template.letting_go(self.template.let_go)
         if isinstance(template, HardTemplate):
             template = template.sensing(self.template.sensors)
-        values = template.values(self.template.state(self.values, np.zeros((0, 3))))
+        values = template.values(self.template.state(self.values, np.zeros((0, 3)), self.views))
         if template.sensors is not None:
             template.sensors.insert(values, self.values)
         factors = template.factors(self.factors.given, present=self.values)
@@ -156,9 +156,36 @@ class Problem:
         )
         return replace(self, template=template, factors=factors)
 
-    def at(self, values: gtsam.Values, landmarks: Landmarks) -> "Problem":
-        """The same problem at other values and landmarks."""
-        return replace(self, values=values, landmarks=landmarks)
+    def at(self, values: gtsam.Values, landmarks: Landmarks, views: CameraViews | None = None) -> "Problem":
+        """The same problem at other values and landmarks; `views` are the cameras at the values, if known."""
+        if values is self.values:
+            return self.having(landmarks=landmarks)
+        other = replace(self, values=values, landmarks=landmarks)
+        return other if views is None else other.seen_by(views)
+
+    def seen_by(self, views: CameraViews) -> "Problem":
+        """The same problem, of which the cameras at its values are known already."""
+        other = replace(self)
+        other.__dict__["views"] = views
+        return other
+
+    def having(
+        self,
+        *,
+        landmarks: Landmarks | None = None,
+        measurements: Measurements | None = None,
+        accepted: BoolArray | None = None,
+    ) -> "Problem":
+        """The same problem with other landmarks or observations: its cameras are not computed again."""
+        other = replace(
+            self,
+            landmarks=self.landmarks if landmarks is None else landmarks,
+            measurements=self.measurements if measurements is None else measurements,
+            accepted=self.accepted if accepted is None else accepted,
+        )
+        of_cameras = ("views", "views_of_all")
+        other.__dict__.update({name: self.__dict__[name] for name in of_cameras if name in self.__dict__})
+        return other
 
 
 def reach_m(problem: Problem, of: BoolArray | None = None) -> FloatArray:
@@ -171,7 +198,8 @@ def reach_m(problem: Problem, of: BoolArray | None = None) -> FloatArray:
     landmark = m.landmark[rows]
     if len(landmark) == 0:
         return np.zeros(0)
-    arm = views.world_t_camera[m.image[rows]] - problem.landmarks.origin_m[landmark]
+    arm = views.world_t_camera.take(m.image[rows], axis=0)  # several times as fast as an index
+    arm -= problem.landmarks.origin_m.take(landmark, axis=0)
     starts = m.starts if of is None else np.flatnonzero(np.diff(landmark, prepend=-1))
     longest = np.sqrt(np.maximum.reduceat(np.einsum("ij,ij->i", arm, arm), starts))
     baseline = (2 * longest).clip(_LEAST_BASELINE_M)

@@ -14,7 +14,6 @@ from pancam_graph.solve._problem import Problem, system_of
 __all__ = [
     "ReducedSystem",
     "add_factors",
-    "held_columns",
     "joint_panels",
     "landmark_panels",
     "loosened_root",
@@ -86,7 +85,7 @@ def landmark_panels(
 def joint_panels(template: FactorTemplate, factors: Factors, values: gtsam.Values, panels: Panels) -> Panels:
     """Add all factors except landmarks' to the panels of the eliminated landmarks, and hold columns."""
     add_factors(panels, template.linkage, factors.linearize(values))
-    panels.hold(held_columns(template))
+    panels.hold(template.held_by_group)
     return panels
 
 
@@ -103,7 +102,7 @@ def loosened_root(problem: Problem, system: LandmarkSystem, factor: float) -> Ro
 
     add((*factors.ties, *factors.seated), 1.0)
     add(factors.priors, factor**-2)
-    panels.hold(held_columns(template))
+    panels.hold(template.held_by_group)
     return _firm_root(problem, system, panels.root(), factor)
 
 
@@ -131,7 +130,7 @@ def _root_by_qr(problem: Problem, system: LandmarkSystem, motion: FloatArray | N
         problem.factors,
         problem.values,
     )
-    held = held_columns(template)
+    held = template.held_by_group
     panels = system.linearise(template.posture(values))
     panels.hold(held)
     more = _rows(link, graph_of((*factors.ties, *factors.seated)).linearize(values), held, 1.0)
@@ -160,7 +159,7 @@ def _common_motion(problem: Problem) -> FloatArray | None:
         out[first : first + 3, :3] = inverse
         out[first + 3 : first + 6, :3] = inverse @ np.cross(np.eye(3), arm).T
         out[first + 3 : first + 6, 3:] = inverse
-    held = [link.group_column[g] + columns for g, columns in held_columns(template).items()]
+    held = [link.group_column[g] + columns for g, columns in template.held_by_group.items()]
     return None if any(np.any(out[columns]) for columns in held) else out
 
 
@@ -187,9 +186,8 @@ def _rows(
         factor = linear.at(i)
         if factor is None:
             continue
-        keys = factor.keys()
-        groups = [int(linkage.group[linkage.row[key]]) for key in keys]
-        columns = [linkage.columns_of(key) for key in keys]
+        places = [linkage.place[key] for key in factor.keys()]  # noqa: SIM118  no dictionary
+        groups, columns = [group for group, _ in places], [columns for _, columns in places]
         rows = weight * factor.augmentedJacobian()
         rows[:, -1] *= -1  # GTSAM has the right-hand side there, minus the residual
         is_held = [
@@ -200,11 +198,6 @@ def _rows(
     return out
 
 
-def held_columns(template: FactorTemplate) -> dict[int, IntArray]:
-    """By group, the columns that telemetry holds."""
-    return template.linkage.by_group(template.held_columns().items())
-
-
 def add_factors(
     panels: Panels, linkage: Linkage, linear: gtsam.GaussianFactorGraph, weight: float = 1.0
 ) -> None:
@@ -213,14 +206,14 @@ def add_factors(
         factor = linear.at(i)
         if factor is None:
             continue
-        keys = factor.keys()
         # The last column is the right-hand side, minus the residual.
         normal = weight * factor.augmentedInformation()
-        group = [int(linkage.group[linkage.row[key]]) for key in keys]
-        columns = [linkage.columns_of(key) for key in keys]
-        end = np.cumsum([c.stop - c.start for c in columns])
-        place = [slice(e - (c.stop - c.start), e) for c, e in zip(columns, end, strict=True)]
-        for a in range(len(keys)):
-            panels.add_right(group[a], columns[a], -normal[place[a], -1])
-            for b in range(a, len(keys)):
-                panels.add_block(group[a], columns[a], group[b], columns[b], normal[place[a], place[b]])
+        places, begin = [linkage.place[key] for key in factor.keys()], 0  # noqa: SIM118  no dictionary
+        rows = list[slice]()
+        for _, columns in places:
+            rows.append(slice(begin, begin + columns.stop - columns.start))
+            begin = rows[-1].stop
+        for a, (group, columns) in enumerate(places):
+            panels.add_right(group, columns, -normal[rows[a], -1])
+            for (other, others), to in zip(places[a:], rows[a:], strict=True):
+                panels.add_block(group, columns, other, others, normal[rows[a], to])

@@ -16,7 +16,7 @@ from pancam_graph.rigs import FOCAL
 from pancam_graph.solve._problem import Problem, system_of
 from pancam_graph.solve._reduced import ReducedSystem
 
-__all__ = ["RigTold", "part_of", "reduced_to_rig", "rig_told", "stated_sharing"]
+__all__ = ["RigTold", "part_of", "reduced_to_rig", "rig_told"]
 
 _TESTED: dict[Quantity, Freedom] = {
     "calibration": Freedom(scope="eye", free=(FOCAL, "cx_px", "cy_px")),
@@ -39,6 +39,8 @@ class RigTold:
     """Of the part: numbers of the problem's rig that are free or were held, all about their values."""
     freed: Sharing
     """Numbers that the problem holds and the score test frees."""
+    stated: Sharing
+    """Numbers of a rig that is held and states an uncertainty, free with it; none where any is free."""
     information: FloatArray
     """(n, n) of the columns of the rig with default priors of what was held, all else marginalised."""
     gradient: FloatArray
@@ -57,7 +59,7 @@ class RigTold:
         return np.asarray(self.information[np.ix_(columns, columns)] - np.diag(usual[columns] ** -2.0))
 
 
-def stated_sharing(problem: Problem) -> Sharing:
+def _stated_sharing(problem: Problem) -> Sharing:
     """Numbers of a rig that is held and states an uncertainty, free with it; none where any is free.
 
     None of models but the rigid mast either. A head's flex is one with its pan and tilt, and no number.
@@ -77,7 +79,7 @@ def rig_told(problem: Problem) -> RigTold | None:
     template = problem.template
     if not isinstance(template, HardTemplate):
         return None
-    own, stated = template.rig_variables.sharing, stated_sharing(problem)
+    own, stated = template.rig_variables.sharing, _stated_sharing(problem)
     freed: dict[str, Any] = {q: f for q, f in _TESTED.items() if getattr(own, q) == FIXED}
     wide: dict[str, Any] = {}
     for quantity in _QUANTITIES:
@@ -100,6 +102,7 @@ def rig_told(problem: Problem) -> RigTold | None:
     return RigTold(
         rig=rig,
         freed=Sharing(**freed),
+        stated=stated,
         information=information,
         gradient=gradient,
         column=column,

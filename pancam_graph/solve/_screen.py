@@ -165,7 +165,7 @@ class ScreeningRounds:
     def share_changed(self) -> float:
         """Share of the observations that one test of all of them, with the cameras held, judges otherwise."""
         before = self.problem.accepted
-        self.problem = replace(self.problem, accepted=~self._banned)
+        self.problem = self.problem.having(accepted=~self._banned)
         self._scale = self._snoop(self._prepared.options.outlier_sigma)
         return float(np.mean(self.problem.accepted != before))
 
@@ -194,7 +194,7 @@ class ScreeningRounds:
 
     def _second_pass(self, scale: float, cutoff: float) -> float:
         """From all observations but the grossest outliers until the same ones stay; the noise scale."""
-        self.problem = replace(self.problem, accepted=~self._banned)
+        self.problem = self.problem.having(accepted=~self._banned)
         self._snoop(_GROSS * cutoff)
         for _ in range(_ROUNDS):
             before = scale
@@ -237,7 +237,7 @@ class ScreeningRounds:
 
     def _adopt(self, snooping: Snooping) -> None:
         accepted = snooping.accepted & ~self._banned
-        self.problem = replace(self.problem, landmarks=snooping.landmarks, accepted=accepted)
+        self.problem = self.problem.having(landmarks=snooping.landmarks, accepted=accepted)
         self.set_aside[self.problem.measurements.row[~accepted]] = True
 
 

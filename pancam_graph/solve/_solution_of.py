@@ -87,6 +87,7 @@ def _raw_residuals(problem: Problem, present: BoolArray, n: int, noise: PixelNoi
     m = problem.measurements
     whitened, in_front = problem.residuals
     residual_px = np.full((n, 2), np.nan)
-    known = present[m.landmark] & in_front
-    residual_px[m.row[known]] = noise.select(m.row[known]).to_pixels(whitened[known])
+    known = np.flatnonzero(present[m.landmark] & in_front)
+    rows = m.row[known]
+    residual_px[rows] = noise.select(rows).to_pixels(whitened.take(known, axis=0))
     return residual_px

@@ -200,7 +200,7 @@ class Suspected:
 def telemetry_of(problem: Problem, covariance: Covariance) -> list[StopTelemetry]:
     """Corrections of all stops at a problem's values; `covariance` is that of its variables."""
     template, link = problem.template, problem.template.linkage
-    held = link.by_group(template.held_columns().items())
+    held = template.held_by_group
     parts: dict[int, list[_Prior]] = {}
     for factor in problem.factors.telemetry:
         keys = list(factor.keys())

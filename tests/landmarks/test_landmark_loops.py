@@ -23,7 +23,7 @@ from pancam_graph.landmarks import (
     triangulate,
 )
 from pancam_graph.landmarks._landmarks import evaluate, free_derivatives, residual_cofactor
-from pancam_graph.landmarks.kernel._symmetric import diagonalise
+from pancam_graph.landmarks.kernel._symmetric import diagonalise, least_direction
 from pancam_graph.solve import snoop
 from pancam_graph.solve._rejection import Snooping
 from support import landmark_reference as reference
@@ -74,6 +74,42 @@ def test_eigenvalues_are_lapacks_and_vectors_orthonormal(values: list[float]) ->
         assert found == pytest.approx(np.linalg.eigvalsh(a), abs=4e-15 * largest)
         assert turn.T @ turn == pytest.approx(np.eye(len(values)), abs=1e-14)
         assert turn * found @ turn.T == pytest.approx(a, abs=1e-14 * largest)
+
+
+def least(a: FloatArray) -> FloatArray | None:
+    """The eigenvector of the least eigenvalue by inverse iteration; None where that gives up."""
+    n = len(a)
+    x = np.array([0.48, -0.56, 0.62, 0.27])[:n]
+    is_found = least_direction(a.copy(), np.empty(n, dtype=np.int64), np.empty(n), 1e-30, x)
+    return x if is_found else None
+
+
+@pytest.mark.parametrize(
+    "values",
+    [[0.0, 1.0, 1.0, 2.0], [1e-12, 1e-4, 1.0, 1.0], [1e-3, 0.5, 2.0, 3.0], [1e90, 1e95, 2e95]],
+    ids=str,
+)
+def test_the_least_direction_is_lapacks(values: list[float]) -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(50):
+        a = with_values(rng, values)
+        found, wanted = least(a), np.linalg.eigh(a)[1][:, 0]
+        assert found is not None
+        assert abs(found @ wanted) == pytest.approx(1.0, abs=1e-14)
+        # Both are off by rounding over the distance to the next eigenvalue.
+        off = 1e-15 * values[-1] / (values[1] - values[0])
+        assert found * np.sign(found @ wanted) == pytest.approx(wanted, abs=20 * off)
+
+
+@pytest.mark.parametrize(
+    "values", [[0.0, 1e-9, 1.0, 1.0], [0.9, 1.0, 1.0, 1.0], [np.nan, 1.0, 1.0, 1.0]], ids=str
+)
+def test_a_least_direction_that_is_not_by_far_the_least_is_left_to_all_eigenvectors(
+    values: list[float],
+) -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(50):
+        assert least(with_values(rng, values)) is None
 
 
 @pytest.mark.parametrize("m", [2, 3, 4])
