@@ -40,7 +40,7 @@ for name in ${PYTHONS:-$(promised_versions) "$(promised_versions | tail -n 1)-lo
             result="could not be installed"
             failed=1
         else
-            OPENBLAS_NUM_THREADS=1 "$folder/bin/python" -m pytest -q -n "${PYTEST_WORKERS:-2}" "$@" 2>&1 | tee "$log" || failed=1
+            OPENBLAS_NUM_THREADS=1 "$folder/bin/python" -m pytest -q -n "${PYTEST_WORKERS:-2}" --dist worksteal "$@" 2>&1 | tee "$log" || failed=1
             result=$(tail -n 1 "$log")
         fi
     fi

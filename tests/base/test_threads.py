@@ -169,8 +169,8 @@ def test_after_an_interrupt_ranges_are_for_all_threads_again(monkeypatch: pytest
 @pytest.mark.parametrize(
     "before",
     [
-        "pass",
-        "import scipy.linalg",
+        pytest.param("pass", marks=pytest.mark.slow),
+        pytest.param("import scipy.linalg", marks=pytest.mark.slow),
         "with blas_on_one_thread(): pass\nimport cv2",
         "from pancam_graph import solve, find_observations",
     ],

@@ -12,6 +12,7 @@ from pancam_graph.elimination import FieldColumns, LandmarkSystem, Linkage, Post
 from pancam_graph.landmarks import CameraViews, Landmarks, LossName, Measurements, loss_of, residuals
 from support.elimination_reference import Dense, dense_of, true_cost, whole
 from support.landmark_scenes import measure, random_points, random_views, unit
+from support.parameters import slow_but_for
 
 N = 4
 BEGIN = np.array([0, 11, 22, 33, 44])
@@ -77,7 +78,7 @@ class Fielded:
         return dense_of(self.after, COLUMNS, self.m, self.landmarks, loss_of(loss))
 
 
-@pytest.mark.parametrize("loss", ["none", "cauchy"])
+@pytest.mark.parametrize("loss", slow_but_for("none", ["none", "cauchy"]))
 def test_fields_eliminate_as_dense_ones(loss: LossName) -> None:
     fielded = Fielded()
     system = LandmarkSystem(fielded.linkage, fielded.m, fielded.landmarks, loss_of(loss))

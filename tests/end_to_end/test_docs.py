@@ -161,6 +161,7 @@ def run(blocks: list[str], page: str) -> dict[str, Any]:
     return names
 
 
+@pytest.mark.slow
 def test_the_python_of_own_rig_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

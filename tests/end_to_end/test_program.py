@@ -20,6 +20,7 @@ from pancam_graph import SimulationOptions, simulate, solve, write_traverse
 from pancam_graph.cameras import Brown
 from pancam_graph.results import read_solution_json, write_results
 from pancam_graph.rigs import mer_navcam
+from support.parameters import slow_but_for
 
 SMALL = SimulationOptions(stops=2, pans=2, sweep_rad=0.8, points_per_image=10, outliers=0.02)
 Run = Callable[..., subprocess.CompletedProcess[str]]
@@ -92,7 +93,7 @@ def test_solves_and_writes_the_contract(run_apart: Run, traverse_folder: Path, t
     assert b"property float sigma_m" in (out / "points.ply").read_bytes().split(b"end_header")[0]
 
 
-@pytest.mark.parametrize("model", ["circle", "free", "projective"])
+@pytest.mark.parametrize("model", slow_but_for("circle", ["circle", "free", "projective"]))
 def test_models_and_no_report(run: Run, traverse_folder: Path, tmp_path: Path, model: str) -> None:
     done = run("optimize_traverse.py", "traverse", "--out", "out", "--model", model, "--no-report")
     assert done.returncode == 0, done.stderr

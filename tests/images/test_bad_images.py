@@ -116,7 +116,7 @@ def test_an_image_file_that_cannot_be_used_is_named_and_the_rest_found(truth: Tr
     assert read_traverse(truth.folder).warnings == (said,)
 
 
-@pytest.mark.parametrize("kind", ["missing", "truncated", "of another size"])
+@pytest.mark.parametrize("kind", slow_but_for("missing", ["missing", "truncated", "of another size"]))
 def test_image_files_none_of_which_can_be_used_are_refused_by_name(truth: Traverse, kind: str) -> None:
     assert truth.folder is not None
     write_traverse(truth, truth.folder)

@@ -12,6 +12,7 @@ from pancam_graph.images import FrontEndOptions
 from pancam_graph.images._overlap import near_stops, overlapping_pairs
 from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.rigs import Rig, exomars_pancam, mer_navcam
+from support.parameters import slow_but_for
 
 OPTIONS = FrontEndOptions()
 
@@ -20,7 +21,7 @@ def traverse(rig: Rig) -> Traverse:
     return simulate(rig, SimulationOptions(stops=2, pans=6, points_per_image=1), seed=0).traverse
 
 
-@pytest.mark.parametrize("rig", [mer_navcam, exomars_pancam])
+@pytest.mark.parametrize("rig", slow_but_for([mer_navcam], [mer_navcam, exomars_pancam]))
 def test_pixels_are_left_out_at_once_only_where_they_have_no_window(rig: Callable[[], Rig]) -> None:
     t = traverse(rig())
     pairs = overlapping_pairs(t, OPTIONS, stops=np.ones((2, 2), dtype=bool))

@@ -9,9 +9,10 @@ from pancam_graph.images import FrontEndOptions
 from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._verify import PairFit, epipolar_px, fit_pair
 from support.image_scenes import SIZE_PX, disturbed, make_traverse
+from support.parameters import slow_but_for
 
 
-@pytest.mark.parametrize("sigma_deg", [5.0, 10.0, 20.0, 40.0])
+@pytest.mark.parametrize("sigma_deg", slow_but_for([20.0], [5.0, 10.0, 20.0, 40.0]))
 def test_corrections_that_turn_points_behind_the_camera_end_in_numbers(
     tmp_path: Path, sigma_deg: float
 ) -> None:

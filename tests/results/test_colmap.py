@@ -206,12 +206,14 @@ def require_consistent(solution: Solution, folder: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "rigs"),
     [
-        ({"model": "free"}, "each frame"),
-        ({"model": "circle"}, "each frame"),
-        ({"sharing": parse_sharing(["mounts=stop"])}, "each stop"),
+        pytest.param({"model": "free"}, "each frame", marks=pytest.mark.slow),
+        pytest.param({"model": "circle"}, "each frame", marks=pytest.mark.slow),
+        pytest.param({"sharing": parse_sharing(["mounts=stop"])}, "each stop", marks=pytest.mark.slow),
         ({"sharing": parse_sharing(["calibration=stop:focal"])}, "each stop"),
         ({"sharing": parse_sharing(["calibration=image:focal"])}, "each frame"),
-        ({"sharing": parse_sharing(["calibration=eye:focal", "mounts=eye"])}, "all"),
+        pytest.param(
+            {"sharing": parse_sharing(["calibration=eye:focal", "mounts=eye"])}, "all", marks=pytest.mark.slow
+        ),
     ],
 )
 def test_what_is_not_rigid_together_is_not_one_rig(

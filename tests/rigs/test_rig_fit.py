@@ -22,6 +22,7 @@ from pancam_graph.rigs import (
     stereo_pan_tilt,
 )
 from pancam_graph.rigs._chain import Chain, PosedCameras
+from support.parameters import slow_but_for
 from support.published_cameras import MODEL_B
 from support.rig_cameras import (
     ALWAYS_FREE,
@@ -284,7 +285,7 @@ def test_pointings_that_share_angles_share_their_errors() -> None:
 # --- Opportunity ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("source", ["encoders", "quaternions"])
+@pytest.mark.parametrize("source", slow_but_for("encoders", ["encoders", "quaternions"]))
 def test_opportunitys_labels_follow_the_chain(source: str, opportunity_folder: Path) -> None:
     """Five labels, their own angles, no reference: 0.1 mm and 0.05 mrad were asked for.
 

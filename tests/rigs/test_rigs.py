@@ -5,6 +5,7 @@ import runpy
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import cv2
@@ -38,6 +39,7 @@ from pancam_graph.rigs import (
     rig_template,
     stereo_pan_tilt,
 )
+from support.parameters import slow_but_for
 from support.published_cameras import LINEAR_PIXEL_B, PIXEL_B, PIXELS_C, POINT_B, POINTS_C
 
 FLIP = np.diag([1.0, -1.0, -1.0])
@@ -245,8 +247,12 @@ def test_ladybug_cameras_stand_as_a_units_file_has_them() -> None:
 LADYBUG_DRIVE = SimulationOptions(stops=4, points_per_image=40, spacing_m=2.0)
 
 
-@pytest.mark.parametrize("make", [ladybug3, ladybug5])
-@pytest.mark.parametrize("model", ["mast", "circle"])
+@pytest.mark.parametrize(
+    ("make", "model"),
+    slow_but_for(
+        [(ladybug3, "circle"), (ladybug5, "mast")], product([ladybug3, ladybug5], ["mast", "circle"])
+    ),
+)
 def test_a_ladybug_drive_is_exact_without_noise(make: Callable[[], Rig], model: str) -> None:
     simulation = simulate(make(), replace(LADYBUG_DRIVE, noise_px=0.0, prior="truth"), seed=2)
     t, telemetry = simulation.traverse, simulation.telemetry_start
@@ -424,7 +430,9 @@ def test_a_template_has_its_name_and_its_source(template: str) -> None:
     assert rig.source
 
 
-@pytest.mark.parametrize("template", TEMPLATES)
+@pytest.mark.parametrize(
+    "template", slow_but_for(["mer-navcam", "mars2020-mastcam-z-34mm", "ladybug5"], TEMPLATES)
+)
 def test_the_program_simulates_every_template_and_the_file_may_name_it(
     template: str, scripts_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import gtsam
@@ -23,6 +24,7 @@ from pancam_graph.graph import (
     read_variable,
 )
 from pancam_graph.rigs import Rig, exomars_pancam, mer_navcam
+from support.parameters import slow_but_for, slow_for
 
 PAN_T_TILT = gtsam.Pose3(gtsam.Rot3.Rodrigues(0.2, -0.1, 0.3), np.array([0.03, -0.02, 0.05]))
 
@@ -148,13 +150,24 @@ def templates(t: Traverse, sharing: Sharing | None = None) -> dict[str, FactorTe
 @pytest.mark.parametrize(
     ("name", "kind", "sharing"),
     [
-        *((name, "hard", "nothing") for name in TRAVERSES),
-        *((name, "hard", "all") for name in TRAVERSES),
-        *(("all free", "hard", sharing) for sharing in SHARINGS),
-        *((name, "hard", sharing) for name in TRAVERSES for sharing in FLEXING),
-        *(("all free", "mast", sharing) for sharing in SHARINGS),
+        *slow_but_for(
+            [("a tilt held", "hard", "nothing")], ((name, "hard", "nothing") for name in TRAVERSES)
+        ),
+        *slow_for([("all free", "hard", "all")], ((name, "hard", "all") for name in TRAVERSES)),
+        *slow_but_for(
+            [("all free", "hard", "per stop"), ("all free", "hard", "per image")],
+            (("all free", "hard", sharing) for sharing in SHARINGS if sharing not in ("nothing", "all")),
+        ),
+        *slow_but_for(
+            [("all free", "hard", "flex and all"), ("frames held", "hard", "twist alone")],
+            ((name, "hard", sharing) for name in TRAVERSES for sharing in FLEXING),
+        ),
+        *slow_but_for(
+            [("all free", "mast", "nothing"), ("all free", "mast", "all"), ("all free", "mast", "per stop")],
+            (("all free", "mast", sharing) for sharing in SHARINGS),
+        ),
         ("a stop held", "circle", "nothing"),
-        ("all free", "projective", "nothing"),
+        pytest.param("all free", "projective", "nothing", marks=pytest.mark.slow),
         ("a stop held with its frames", "projective", "nothing"),
     ],
 )
@@ -370,8 +383,18 @@ def test_sigmas_are_handed_to_their_own_frames_and_stops(name: str) -> None:
             place += 1
 
 
-@pytest.mark.parametrize("kind", ["hard", "mast", "circle", "free"])
-@pytest.mark.parametrize("name", TRAVERSES)
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    slow_but_for(
+        [
+            *((name, "hard") for name in TRAVERSES),
+            *((name, "mast") for name in TRAVERSES),
+            ("a stop held with its frames", "circle"),
+            ("a stop held with its frames", "free"),
+        ],
+        product(TRAVERSES, ["hard", "mast", "circle", "free"]),
+    ),
+)
 def test_angles_move_with_their_variables_as_their_rows_say(name: str, kind: str) -> None:
     t = TRAVERSES[name]()
     template, state = templates(t)[kind], state_of(t)

@@ -18,6 +18,7 @@ from pancam_graph.cameras import Pinhole
 from pancam_graph.io import read_image, read_traverse
 from pancam_graph.rigs import TEMPLATES, Rig, rig_template
 from pancam_graph.simulate import Rendering, RenderOptions, render, write_rendering
+from support.parameters import slow_but_for
 from support.small_worlds import smaller_worlds
 
 STEREO = RenderOptions(
@@ -156,7 +157,7 @@ def test_depths_and_heights_are_of_the_surface_that_pixels_see(small_world: None
         bare.heights_m(xy, 0.0)
 
 
-@pytest.mark.parametrize("template", TEMPLATES)
+@pytest.mark.parametrize("template", slow_but_for(["mer-navcam", "msl-mastcam", "ladybug3"], TEMPLATES))
 def test_any_rig_renders(template: str) -> None:
     options = RenderOptions(stops=1, pans=1, tilts_rad=(-0.5,), rock_abundance=0.0)
     rig = cropped(rig_template(template), 40, 30)

@@ -14,6 +14,7 @@ from pancam_graph.rigs import mer_navcam
 from pancam_graph.simulate import Simulation
 from pancam_graph.smoother import solve_incrementally
 from pancam_graph.smoother._order import order_of_stops
+from support.parameters import slow_but_for, slow_for
 from support.truth import errors_in_sigmas
 
 DRIVE = SimulationOptions(
@@ -102,7 +103,7 @@ def test_a_file_in_the_order_of_the_drive_keeps_it() -> None:
     assert order_of_stops(backwards) == [(4, None), (3, 4), (2, 3), (1, 2), (0, 1)]  # the held one is last
 
 
-@pytest.mark.parametrize("at", [0, 1])
+@pytest.mark.parametrize("at", slow_but_for([1], [0, 1]))
 def test_a_stop_without_frames_stays_where_telemetry_has_it(at: int) -> None:
     simulation = simulated(SHORT)
     t = simulation.traverse
@@ -127,7 +128,7 @@ def test_a_stop_without_frames_stays_where_telemetry_has_it(at: int) -> None:
     assert stops.max() < 2.5
 
 
-@pytest.mark.parametrize("stop", [0, 1])
+@pytest.mark.parametrize("stop", slow_but_for([0], [0, 1]))
 def test_a_stop_without_observations_is_no_reason_to_refuse_a_drive(stop: int) -> None:
     simulation = simulated(SHORT)
     solution = solve_incrementally(without(simulation.traverse, stop))
@@ -138,8 +139,17 @@ def test_a_stop_without_observations_is_no_reason_to_refuse_a_drive(stop: int) -
 
 
 # With the rig free too, 1000 m are near what double precision resolves: sigmas are a fifth too small.
-@pytest.mark.parametrize(("sigma_m", "rig"), [(1.5, "held"), (1.5, "estimated"), (1000.0, "held")])
-@pytest.mark.parametrize("way", [solve, solve_incrementally])
+@pytest.mark.parametrize(
+    ("way", "sigma_m", "rig"),
+    slow_for(
+        [(solve, 1.5, "estimated"), (solve, 1.5, "held"), (solve_incrementally, 1000.0, "held")],
+        [
+            (way, *case)
+            for way in (solve, solve_incrementally)
+            for case in [(1.5, "held"), (1.5, "estimated"), (1000.0, "held")]
+        ],
+    ),
+)
 def test_where_nothing_is_held_telemetry_holds_all_stops_in_common(
     way: Callable[[Traverse, SolveOptions], Solution], sigma_m: float, rig: RigTreatment
 ) -> None:

@@ -31,7 +31,7 @@ from pancam_graph.rigs import mer_navcam
 from pancam_graph.solve import Fitted
 from pancam_graph.solve import _alternation as alternation
 from support.elimination_reference import whole
-from support.parameters import slow_but_for
+from support.parameters import slow_but_for, slow_for
 from support.solving import fitted
 
 SMALL = SimulationOptions(stops=2, pans=3, sweep_rad=1.5, points_per_image=15)
@@ -104,7 +104,7 @@ def test_both_ways_lead_to_one_optimum_the_joint_one_sooner(name: str) -> None:
     assert turns.stop_covariance == pytest.approx(joint.stop_covariance, rel=1e-2, abs=1e-9)
 
 
-@pytest.mark.parametrize("name", SHARED)
+@pytest.mark.parametrize("name", slow_but_for(["radius", "axis, focal length"], SHARED))
 def test_the_cost_never_rises_and_is_the_true_one(name: str) -> None:
     turns = solved(name, "alternation")
     # Where ties are soft a rigid mast comes first; the change from one to the other is no step.
@@ -152,7 +152,7 @@ def test_gains_shrink_as_fast_as_theory_says() -> None:
 
 
 def test_outliers_are_sought_jointly_and_the_same_ones_go() -> None:
-    t = simulate(mer_navcam(), replace(SMALL, points_per_image=40, outliers=0.02), seed=1).traverse
+    t = simulate(mer_navcam(), replace(SMALL, points_per_image=20, outliers=0.02), seed=1).traverse
     joint, turns = (
         solve(t, replace(options, loss="huber", relative_decrease=1e-7)) for options in ways("radius")
     )
@@ -207,7 +207,7 @@ def refusing(monkeypatch: pytest.MonkeyPatch, which: str, *, times: int) -> list
 
 
 @pytest.mark.parametrize("name", slow_but_for("radius", ["radius", "calibration"]))
-@pytest.mark.parametrize("which", ["regular", "shared"])
+@pytest.mark.parametrize("which", slow_but_for("shared", ["regular", "shared"]))
 def test_a_set_that_stalls_rests_and_is_tried_again(
     which: str, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -258,7 +258,7 @@ def ended(options: SolveOptions) -> Fitted:
     return fitted(traverse(), options)
 
 
-@pytest.mark.parametrize("name", CRITERIA)
+@pytest.mark.parametrize("name", slow_for("residuals", CRITERIA))
 def test_each_criterion_alone_ends_it_and_says_so(name: str) -> None:
     criterion, reason = CRITERIA[name]
     outcome = ended(replace(BARE, **criterion)).outcome  # type: ignore[arg-type]  # options by name

@@ -29,7 +29,7 @@ from pancam_graph.smoother import solve_incrementally
 from pancam_graph.solve import Problem, constrained, prepare
 from pancam_graph.solve._reduced import panels_of
 from support.gtsam_factors import distance_factor
-from support.parameters import slow_but_for
+from support.parameters import slow_but_for, slow_for
 from support.small_drives import HARD, SOFT, near_part, simulated
 from support.tied_drives import landmark_ties, noise_free, seen_often
 
@@ -138,7 +138,7 @@ def system_cost(problem: Problem) -> float:
     return problem.cost()
 
 
-@pytest.mark.parametrize("state", ["random", "near the optimum", "far"])
+@pytest.mark.parametrize("state", slow_for("random", ["random", "near the optimum", "far"]))
 def test_the_gradient_of_tied_landmarks_is_that_of_the_cost(state: str) -> None:
     """Of the cost with landmarks eliminated, by the masts: analytic in the kernel against differences."""
     simulation = simulated(2, 3)

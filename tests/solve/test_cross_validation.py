@@ -28,7 +28,7 @@ from pancam_graph.report._page import make_page
 from pancam_graph.results import read_solution_json, write_results
 from pancam_graph.rigs import mer_navcam
 from pancam_graph.solve.cross_validation._halves import Groups, random_half, upper_half
-from support.parameters import slow_for
+from support.parameters import slow_but_for
 
 SMALL = SimulationOptions(stops=2, pans=3, sweep_rad=1.5, points_per_image=15)
 PLAIN = SolveOptions(rig="held", loss="none")
@@ -264,7 +264,7 @@ OPTIONS = {
 }
 
 
-@pytest.mark.parametrize("name", slow_for("explicit", OPTIONS))
+@pytest.mark.parametrize("name", slow_but_for(["circle", "soft tie"], OPTIONS))
 def test_models_ties_and_landmarks(traverse: Traverse, found: CrossValidation, name: str) -> None:
     other = cross_validate(traverse, OPTIONS[name], halvings=1)
     assert other.warnings == ()

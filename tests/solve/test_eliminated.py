@@ -17,7 +17,7 @@ from pancam_graph.landmarks import LossName
 from pancam_graph.rigs import Eye, Rig, mer_navcam
 from pancam_graph.simulate import Simulation
 from pancam_graph.solve import Problem, fit, prepare, screen
-from support.parameters import slow_for
+from support.parameters import slow_but_for, slow_for
 from support.solving import fitted, solution_from
 
 SMALL = SimulationOptions(stops=2, pans=3, sweep_rad=1.5, points_per_image=15)
@@ -59,7 +59,7 @@ def masts_apart(a: Solution, b: Solution) -> float:
 # --- the same as explicit landmarks ---
 
 
-@pytest.mark.parametrize("model", slow_for("mast", MODELS))
+@pytest.mark.parametrize("model", slow_but_for("free", MODELS))
 def test_near_landmarks_eliminated_or_explicit_give_one_optimum(model: str) -> None:
     traverse = near(small(2))
     ours, theirs = (solve(traverse, to_the_end(model, landmarks=way)) for way in ("eliminated", "explicit"))
@@ -117,7 +117,7 @@ def test_covariance_of_a_stop_is_gtsams(model: str) -> None:
     assert solution.stop_covariance[1] == pytest.approx(expected, rel=1e-6, abs=1e-8 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", slow_for("circle", MODELS))
 def test_sigmas_of_pan_and_tilt_are_gtsams(model: str) -> None:
     """Of the angles themselves, or of what camera poses and mast say of them, by differences of the state."""
     problem, solution, marginals = solved(model)
@@ -204,7 +204,7 @@ def test_a_soft_tie_meets_the_hard_one_as_its_sigma_goes_to_zero() -> None:
 # --- threads ---
 
 
-@pytest.mark.parametrize("loss", ["none", "huber"])
+@pytest.mark.parametrize("loss", slow_but_for("huber", ["none", "huber"]))
 def test_the_number_of_threads_changes_no_bit(monkeypatch: pytest.MonkeyPatch, loss: LossName) -> None:
     simulation = simulate(mer_navcam(), replace(SMALL, pans=4, points_per_image=80, outliers=0.01), seed=0)
     assert simulation.traverse.observations is not None

@@ -18,6 +18,7 @@ from pancam_graph.rigs import mer_navcam
 from pancam_graph.solve import Problem, prepare
 from pancam_graph.solve._joint import JointSystem, OnLastGroup
 from pancam_graph.solve._problem import system_of
+from support.parameters import slow_for
 from support.solving import fitted
 
 OPTIONS = SimulationOptions(stops=3, spacing_m=4.0, pans=3, sweep_rad=0.9, points_per_image=15)
@@ -64,7 +65,10 @@ def moved(problem: Problem, to: gtsam.Values) -> FloatArray:
 
 @pytest.mark.parametrize(
     ("model", "shared"),
-    [("free", False), ("free", True), ("circle", False), ("circle", True), ("projective", False)],
+    slow_for(
+        [("free", False), ("circle", True)],
+        [("free", False), ("free", True), ("circle", False), ("circle", True), ("projective", False)],
+    ),
 )
 def test_a_step_is_that_of_the_whole_system_damped_alike(model: Model, shared: bool) -> None:
     problem = problem_of(model, shared=shared)
@@ -116,7 +120,7 @@ def test_what_no_damping_lets_lower_the_cost_stays_where_it_is() -> None:
     "options",
     [
         SolveOptions(rig="held"),
-        SolveOptions(),
+        pytest.param(SolveOptions(), marks=pytest.mark.slow),
         pytest.param(SolveOptions(model="free"), marks=pytest.mark.slow),
         pytest.param(
             SolveOptions(rig="held", method="alternation", sharing=Sharing(mounts=Freedom(scope="eye"))),

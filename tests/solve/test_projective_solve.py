@@ -16,6 +16,7 @@ from pancam_graph.graph import Flex
 from pancam_graph.initialise import FreeCameras, Start, extract_free, start_from_cameras
 from pancam_graph.rigs import mer_navcam
 from pancam_graph.simulate import Simulation
+from support.parameters import slow_but_for
 
 SMALL = SimulationOptions(stops=2, pans=3, sweep_rad=1.5, points_per_image=15)
 TO_THE_END = SolveOptions(rig="held", model="projective", loss="none", relative_decrease=1e-12)
@@ -186,7 +187,7 @@ def test_the_worlds_origin_does_not_matter() -> None:
 # --- starts ---
 
 
-@pytest.mark.parametrize("model", ["free", "projective"])
+@pytest.mark.parametrize("model", slow_but_for("free", ["free", "projective"]))
 def test_given_cameras_are_where_the_solve_starts(model: str) -> None:
     simulation = small()
     given = cameras_of(simulation, turn_rad=1e-3, shift_m=5e-3, focal=2e-3 if model == "projective" else 0.0)

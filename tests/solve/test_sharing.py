@@ -67,6 +67,20 @@ EXACT: dict[str, tuple[Model, dict[str, float], Sharing]] = {
 }
 
 
+QUICK = [
+    ("calibration and mounts per eye", "hard"),
+    ("calibration and mounts per stop", "hard"),
+    ("focal and mounts' turns per image", "hard"),
+    ("calibration of all", "soft"),
+    ("axis of all", "soft"),
+    ("axis per stop", "hard"),
+    ("focal per image, circle", "soft"),
+    ("focal per stop, free", "soft"),
+    ("radius per eye", "soft"),
+]
+"""Each quantity, scope, model and tie at least once."""
+
+
 def assert_rigs_agree(found: Rig, true: Rig, tolerance: float) -> None:
     for a, b in zip(found.eyes, true.eyes, strict=True):
         assert np.abs(a.head_T_camera.localCoordinates(b.head_T_camera)).max() < tolerance
@@ -77,7 +91,9 @@ def assert_rigs_agree(found: Rig, true: Rig, tolerance: float) -> None:
 
 @pytest.mark.parametrize(
     ("name", "tie"),
-    [(name, tie) for name in EXACT for tie in ("soft", "hard")[: 1 + (EXACT[name][0] == "mast")]],
+    slow_but_for(
+        QUICK, [(name, tie) for name in EXACT for tie in ("soft", "hard")[: 1 + (EXACT[name][0] == "mast")]]
+    ),
 )
 def test_without_noise_the_true_rig_comes_back(name: str, tie: Tie) -> None:
     """From a wrong rig and telemetry. Priors of telemetry are centred on the truth; the rig has none."""
@@ -129,7 +145,7 @@ def equal_bits(a: Solution, b: Solution) -> bool:
     )
 
 
-@pytest.mark.parametrize("model", ["mast", "circle", "free"])
+@pytest.mark.parametrize("model", slow_but_for("mast", ["mast", "circle", "free"]))
 def test_saying_that_all_is_held_changes_no_bit(model: Model) -> None:
     t = simulated().traverse
     plain = solve(t, SolveOptions(rig="held", model=model))

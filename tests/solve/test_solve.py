@@ -3,6 +3,7 @@
 import runpy
 import sys
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import gtsam
@@ -24,9 +25,18 @@ from pancam_graph.graph import ExplicitLandmarks, Flex, SoftTemplate
 from pancam_graph.initialise import Start
 from pancam_graph.rigs import TEMPLATES, Eye, Rig, mer_navcam
 from pancam_graph.simulate import Simulation
+from support.parameters import slow_but_for
 from support.solving import fitted, solution_from
 
 SMALL = SimulationOptions(stops=2, pans=3, sweep_rad=1.5, points_per_image=15)
+
+QUICK = [
+    *((name, "mast") for name in ("mer-pancam", "msl-mastcam", "exomars-pancam", "mars2020-mastcam-z-110mm")),
+    *(("mer-navcam", model) for model in ("mast", "circle", "free")),
+    *(("ladybug5", model) for model in ("mast", "free")),
+    ("stereo-pan-tilt", "circle"),
+]
+"""A template of each build with a mast, and each model with cameras of few pixels."""
 
 CERES_COST = {"mer-pancam": 925.735246, "mer-navcam": 10935.916532, "exomars-wac": 7402.282391}
 """Final costs of Ceres 2.1 (DENSE_SCHUR, function tolerance 1e-12) on make_traverse.py --stops 3, seed 0."""
@@ -44,8 +54,9 @@ def assert_truth(simulation: Simulation, solution: object, *, angle: float, pose
         assert np.abs(true.localCoordinates(found)).max() < pose
 
 
-@pytest.mark.parametrize("name", TEMPLATES)
-@pytest.mark.parametrize("model", ["mast", "circle", "free"])
+@pytest.mark.parametrize(
+    ("name", "model"), slow_but_for(QUICK, product(TEMPLATES, ["mast", "circle", "free"]))
+)
 def test_exact_without_noise(name: str, model: str) -> None:
     """From telemetry-sized errors back to the truth, where the priors are centred."""
     simulation = simulate(TEMPLATES[name](), replace(SMALL, noise_px=0.0, prior="truth"), seed=3)
@@ -80,7 +91,8 @@ def test_optimum_of_an_independent_solver(
     assert solution.cost_final == pytest.approx(CERES_COST[rig], rel=1e-4)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 15])  # 15: diverging rays of a pair once passed for a far landmark
+# 15: diverging rays of a pair once passed for a far landmark
+@pytest.mark.parametrize("seed", slow_but_for([15], [0, 1, 15]))
 def test_outliers_go_and_inliers_stay(seed: int) -> None:
     """Of tracks seen three times or more: of a pair that disagrees nothing tells which one is wrong."""
     options = SimulationOptions(stops=2, pans=4, sweep_rad=2.0, outliers=0.05, min_views=3)

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import cache
+from itertools import product
 from typing import cast
 
 import gtsam
@@ -18,6 +19,7 @@ from pancam_graph.rigs import mer_navcam
 from pancam_graph.solve import Fitted, InOrder, OnGraph, Problem, judge
 from pancam_graph.solve._optimise import Optimiser, _is_settled
 from pancam_graph.solve._stopping import criteria, sigmas_left
+from support.parameters import slow_but_for, slow_for
 from support.solving import fitted, solution_from
 
 SMALL = SimulationOptions(stops=2, pans=2, sweep_rad=0.8, points_per_image=12)
@@ -72,8 +74,10 @@ CRITERIA = {
 }
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-@pytest.mark.parametrize("name", CRITERIA)
+@pytest.mark.parametrize(
+    ("solver", "name"),
+    slow_for([("explicit", "residual_sigmas"), ("explicit", "max_gradient")], product(SOLVERS, CRITERIA)),
+)
 def test_each_criterion_alone_ends_a_solve_and_says_so(solver: str, name: str) -> None:
     bound, reason = CRITERIA[name]
     options = replace(SOLVERS[solver], **{name: bound})  # type: ignore[arg-type]  # options by name
@@ -138,7 +142,7 @@ def profile_gradient(problem: Problem) -> float:
     return largest_slope(cost, problem.values, problem.template.held_columns(), 1e-7)
 
 
-@pytest.mark.parametrize("solver", ["eliminated", "circle"])
+@pytest.mark.parametrize("solver", slow_but_for("eliminated", ["eliminated", "circle"]))
 def test_the_gradient_is_that_of_the_cost_where_landmarks_fit_best(solver: str) -> None:
     options = replace(SOLVERS[solver], max_gradient=100.0)
     assert profile_gradient(ended(options).problem) < 110

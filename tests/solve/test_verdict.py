@@ -18,7 +18,7 @@ from pancam_graph.solve._problem import Problem
 from pancam_graph.solve._rig_score import HeldEntry, held_entries
 from pancam_graph.solve._rig_told import rig_told
 from pancam_graph.solve._telemetry_tests import entry_errors, leg_errors, telemetry_of, total
-from support.parameters import slow_for
+from support.parameters import slow_but_for, slow_for
 from support.solving import fitted
 from support.truth import errors_in_sigmas
 
@@ -117,7 +117,7 @@ def test_a_drive_that_was_solved_stop_by_stop_has_a_verdict() -> None:
     assert solve_incrementally(drive().traverse).passed
 
 
-@pytest.mark.parametrize("factor", [0.1, 0.3])
+@pytest.mark.parametrize("factor", slow_but_for([0.3], [0.1, 0.3]))
 def test_sigmas_that_are_too_small_are_said_with_the_factor(factor: float) -> None:
     solution = solve(with_sigmas(drive().traverse, factor))
     noise = named(solution)["noise"]
@@ -141,7 +141,7 @@ def test_landmarks_move_on_where_cameras_have_nothing_to_gain() -> None:
     assert (named(solution)["optimum"].value or 0.0) < 0.01
 
 
-@pytest.mark.parametrize("sigma_m", [100.0, 1000.0])
+@pytest.mark.parametrize("sigma_m", slow_but_for([1000.0], [100.0, 1000.0]))
 def test_where_nothing_but_weak_priors_holds_the_drive_it_is_as_sure_as_they_are(sigma_m: float) -> None:
     """Rounding errors of the images' information took part: one sigma was 1 to 99 % too small."""
     traverse = simulate(TEMPLATES["exomars-pancam"](), FEW, seed=3).traverse

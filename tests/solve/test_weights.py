@@ -23,6 +23,7 @@ from pancam_graph.simulate import Simulation
 from pancam_graph.smoother import solve_incrementally
 from pancam_graph.solve import prepare
 from pancam_graph.solve._screen import ScreeningRounds
+from support.parameters import slow_but_for
 from support.truth import errors_in_sigmas
 
 SMALL = SimulationOptions(stops=2, pans=3, sweep_rad=1.5, points_per_image=15, noise_stretch=5.0)
@@ -180,7 +181,7 @@ def test_simulated_stretch_below_1_is_refused() -> None:
 # --- in the solve ---
 
 
-@pytest.mark.parametrize("loss", ["none", "huber"])
+@pytest.mark.parametrize("loss", slow_but_for("none", ["none", "huber"]))
 def test_round_covariances_are_sigmas(loss: str) -> None:
     options = replace(SMALL, noise_stretch=1.0, outliers=0.05 if loss == "huber" else 0.0)
     t = simulate(mer_navcam(), options, seed=3).traverse
@@ -276,7 +277,7 @@ def test_the_narrow_axis_of_an_ellipse_bears_the_errors_of_telemetry_at_the_star
     assert rounds.problem.accepted.mean() > 0.999
 
 
-@pytest.mark.parametrize("stretch", [5.0, 20.0])
+@pytest.mark.parametrize("stretch", slow_but_for([20.0], [5.0, 20.0]))
 def test_outliers_go_and_inliers_stay(stretch: float) -> None:
     options = SimulationOptions(
         stops=2, pans=4, sweep_rad=2.0, outliers=0.05, min_views=3, noise_stretch=stretch
