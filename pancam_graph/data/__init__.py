@@ -44,6 +44,9 @@ from pancam_graph.data._sharing import Scope as Scope
 from pancam_graph.data._sharing import Sharing as Sharing
 from pancam_graph.data._sharing import default_sigma as default_sigma
 from pancam_graph.data._sharing import parse_sharing as parse_sharing
+from pancam_graph.data._site import BODIES as BODIES
+from pancam_graph.data._site import Body as Body
+from pancam_graph.data._site import Site as Site
 from pancam_graph.data._solution import Incremental as Incremental
 from pancam_graph.data._solution import Refined as Refined
 from pancam_graph.data._solution import RigCorrection as RigCorrection

@@ -24,6 +24,7 @@ from pancam_graph.data._matching import Matching
 from pancam_graph.data._noise import PixelNoise, mean_sigma_px
 from pancam_graph.data._points import NamedPoints
 from pancam_graph.data._sharing import Sharing
+from pancam_graph.data._site import Site
 from pancam_graph.rigs import Rig
 
 __all__ = [
@@ -264,6 +265,8 @@ class Traverse:
     """Statistics of the search for observations in images; None for observations from elsewhere."""
     constraints: tuple[Constraint, ...] = ()
     """What is known of terrain points and stops beside pictures and telemetry."""
+    site: Site | None = None
+    """Where the world is on its planet; None: unknown, all is local."""
     points: NamedPoints | None = None
     """Marks of named points; `observations`, once there are any, have them too (`with_points`)."""
 

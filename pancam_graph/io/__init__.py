@@ -24,6 +24,9 @@ from pancam_graph.io._json import read_json as read_json
 from pancam_graph.io._json import refused_by_schema as refused_by_schema
 from pancam_graph.io._json import short as short
 from pancam_graph.io._json import validated as validated
+from pancam_graph.io._maps import crs_name as crs_name
+from pancam_graph.io._maps import site_crs as site_crs
+from pancam_graph.io._maps import world_affine as world_affine
 from pancam_graph.io._mask_files import mask_file as mask_file
 from pancam_graph.io._mask_files import read_mask as read_mask
 from pancam_graph.io._npz import NpzFile as NpzFile
@@ -37,6 +40,7 @@ from pancam_graph.io._rig_json import read_rig as read_rig
 from pancam_graph.io._rig_json import rig_json as rig_json
 from pancam_graph.io._rig_json import use_rig as use_rig
 from pancam_graph.io._schema import SharingEntry as SharingEntry
+from pancam_graph.io._schema import SiteEntry as SiteEntry
 from pancam_graph.io._schema import TraverseFile as TraverseFile
 from pancam_graph.io._seen_pictures import picture_digests as picture_digests
 from pancam_graph.io._surfaces import read_surface as read_surface

@@ -9,7 +9,7 @@ from pydantic import Discriminator, Field, Tag
 
 from pancam_graph.base.choices import expected_one_of
 from pancam_graph.base.errors import InputError
-from pancam_graph.data import QUANTITIES, Freedom, Image, Sharing, Tile
+from pancam_graph.data import QUANTITIES, Body, Freedom, Image, Sharing, Site, Tile
 from pancam_graph.io._camera_entry import AnyCamera, camera_entry
 from pancam_graph.io._constraint_entries import AnyConstraint
 from pancam_graph.io._entries import Entry, Label, PoseEntry, SparseEntry, Text
@@ -22,6 +22,7 @@ __all__ = [
     "ImageEntry",
     "OwnRigEntry",
     "SharingEntry",
+    "SiteEntry",
     "StopEntry",
     "TemplateRigEntry",
     "TraverseFile",
@@ -280,6 +281,25 @@ class SharingEntry(Entry):
         return SharingEntry(**{name: entry for name, entry in given.items() if entry != usual[name]})
 
 
+class SiteEntry(Entry):
+    """Where the world's origin is on its planet, and where north is."""
+
+    body: Body
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+    north_rad: float
+
+    @staticmethod
+    def of(site: Site) -> "SiteEntry":
+        """The entry of a site."""
+        return SiteEntry(**{name: getattr(site, name) for name in SiteEntry.model_fields})
+
+    def site(self) -> Site:
+        """The site. Raises InputError for numbers out of range."""
+        return Site(**dict(self))
+
+
 class TraverseFile(Entry):
     """`traverse.json`."""
 
@@ -294,6 +314,7 @@ class TraverseFile(Entry):
     sharing: SharingEntry | None = None
     constraints: list[AnyConstraint] = []  # noqa: RUF012  pydantic copies it
     points: Label | None = None
+    site: SiteEntry | None = None
 
 
 def rig_entry(rig: Rig) -> OwnRigEntry:

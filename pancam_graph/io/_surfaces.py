@@ -10,7 +10,8 @@ from pancam_graph.base.errors import InputError
 from pancam_graph.base.extras import needed
 from pancam_graph.base.geometry import FloatArray
 from pancam_graph.base.regular_files import instead_of_file
-from pancam_graph.data import Surface
+from pancam_graph.data import Site, Surface
+from pancam_graph.io._maps import cell_m, crs_name, on_world_grid, require_same_body, world_box_m
 
 __all__ = ["REACH_M", "read_surface", "write_surface"]
 
@@ -19,13 +20,14 @@ REACH_M = 1000.0
 _MOST_NODES = 1 << 26
 
 
-def read_surface(path: Path, near_m: FloatArray | None = None) -> Surface:
+def read_surface(path: Path, near_m: FloatArray | None = None, site: Site | None = None) -> Surface:
     """A surface whose columns and rows run along x and y of the world.
 
-    `near_m` (n, 2) are places: only what lies within `REACH_M` of their box is read; default: all. A file
-    without a coordinate system, or with a local one, is in the world frame. Raises InputError naming the file
-    where it is no such GeoTIFF, is in a map projection, or is of more than 2^26 nodes there, and where the
-    extra is missing.
+    `near_m` (n, 2) are places: only what lies within `REACH_M` of their box is read; default: all, of a map
+    around the world's origin. A file without a coordinate system, or with a local one, is in the world frame.
+    A map is drawn anew on the world's axes, in steps of its own cells, and its heights are taken from that of
+    the `site`. Raises InputError naming the file where it is no such GeoTIFF, is a map without a site or of
+    another body, or has more than 2^26 nodes there, and where the extra is missing.
     """
     found = instead_of_file(path)
     if found is not None:
@@ -34,19 +36,22 @@ def read_surface(path: Path, near_m: FloatArray | None = None) -> Surface:
     logging.getLogger("rasterio").setLevel(logging.ERROR)
     try:
         with rasterio.open(path, driver="GTiff") as file:
-            return _read(file, path, near_m)
+            crs = file.crs
+            if crs is None or not (crs.is_projected or crs.is_geographic):
+                return _read(file, path, near_m)
+            if site is None:
+                raise InputError(
+                    f"{path}: expected heights in the world frame of the traverse (no coordinate system, or "
+                    f'a local one), or a "site" in traverse.json; found {crs_name(crs)} and no site'
+                )
+            require_same_body(crs, site, path)
+            return _from_map(file, path, np.zeros((1, 2)) if near_m is None else near_m, site)
     except (rasterio.errors.RasterioError, rasterio.errors.CRSError, OSError) as error:
         raise InputError(f"{path}: expected a GeoTIFF, found: {_plain(error)}") from error
 
 
 def _read(file: Any, path: Path, near_m: FloatArray | None) -> Surface:
-    crs, place = file.crs, file.transform
-    if crs is not None and (crs.is_projected or crs.is_geographic):
-        name = crs.to_wkt().split('"')[1]
-        raise InputError(
-            f"{path}: expected heights in the world frame of the traverse (no coordinate system, or a local "
-            f"one), found {name}"
-        )
+    place = file.transform
     if place.b or place.d:
         raise InputError(f"{path}: expected columns along x and rows along y, found a turned raster")
     step = np.array([place.a, place.e])
@@ -68,12 +73,36 @@ def _read(file: Any, path: Path, near_m: FloatArray | None) -> Surface:
         )
     window = needed("rasterio.windows", "terrain").Window(*begin.tolist(), *size.tolist())
     height = file.read(1, window=window, masked=True).astype(float).filled(np.nan)
-    if not np.isfinite(height).any():
+    return _surface(path, first + begin * step, step, height * file.scales[0] + file.offsets[0])
+
+
+def _from_map(file: Any, path: Path, near_m: FloatArray, site: Site) -> Surface:
+    """The part of a map near the stops on the world's axes: heights less the site's, and less its curve."""
+    cell, (low, high) = cell_m(file, site), world_box_m(file, site)
+    begin = np.floor(np.maximum(near_m.min(axis=0) - REACH_M, low) / cell) * cell
+    size = np.ceil((np.minimum(near_m.max(axis=0) + REACH_M, high) - begin) / cell).astype(int) + 1
+    if np.any(size < 1):
         raise InputError(
-            f"{path}: expected heights within {REACH_M:.0f} m of the stops, found none (no data)"
+            f"{path}: expected heights within {REACH_M:.0f} m of the stops, found them at "
+            f"x {low[0]:.0f} to {high[0]:.0f} m, y {low[1]:.0f} to {high[1]:.0f} m of the site"
         )
+    columns, rows = int(size[0]), int(size[1])
+    if columns * rows > _MOST_NODES:
+        raise InputError(
+            f"{path}: expected at most {_MOST_NODES} nodes near the stops, found {columns} x {rows}"
+        )
+    first, step = np.array([begin[0], begin[1] + (rows - 1) * cell]), np.array([cell, -cell])
+    height = on_world_grid(file, site, first, step, (rows, columns)) * file.scales[0] + file.offsets[0]
+    x, y = first[0] + cell * np.arange(columns), first[1] - cell * np.arange(rows)[:, None]
+    fallen = (x * x + y * y) / (2 * site.map_scale * site.shape.map_radius_m)
+    return _surface(path, first, step, height - site.height_m - fallen)
+
+
+def _surface(path: Path, first: FloatArray, step: FloatArray, height: FloatArray) -> Surface:
+    if not np.isfinite(height).any():
+        raise InputError(f"{path}: expected heights within {REACH_M:.0f} m of the stops, found none")
     try:
-        return Surface(first_m=first + begin * step, step_m=step, height_m=height, file=path)
+        return Surface(first_m=first, step_m=step, height_m=height, file=path)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 

@@ -22,6 +22,7 @@ from pancam_graph.io._schema import (
     FrameEntry,
     ImageEntry,
     SharingEntry,
+    SiteEntry,
     StopEntry,
     TraverseFile,
     rig_entry,
@@ -117,13 +118,15 @@ def write_traverse(traverse: Traverse, folder: Path | str, *, overwrite: bool = 
     observations = traverse.observations
     with refused_by_schema(path):
         entries = traverse_entries(traverse)
-    content = entries.model_dump(exclude={"sharing", "constraints", "points"})
+    content = entries.model_dump(exclude={"sharing", "constraints", "points", "site"})
     if entries.sharing is not None:
         content["sharing"] = entries.sharing.model_dump(exclude_defaults=True)
     if entries.constraints:
         content["constraints"] = [one.model_dump() for one in entries.constraints]
     if entries.points is not None:
         content["points"] = entries.points
+    if entries.site is not None:
+        content["site"] = entries.site.model_dump()
     text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -166,13 +169,17 @@ def traverse_of(
         )
         for i, s in enumerate(entries.stops)
     )
+    site = None
+    if entries.site is not None:
+        with prefixed("site"):
+            site = entries.site.site()
     constraints = []
     surfaces: dict[str, Surface] = {}
     for i, entry in enumerate(entries.constraints):
         with prefixed(f"constraints[{i}] ({entry.kind})"):
             if isinstance(file := getattr(entry, "file", None), str) and file not in surfaces:
                 places = np.array([s.world_T_mast.translation()[:2] for s in stops])
-                surfaces[file] = read_surface(_inside(folder, file, "file"), places)
+                surfaces[file] = read_surface(_inside(folder, file, "file"), places, site)
             constraints.append(entry.constraint(surfaces))
     return Traverse(
         name=entries.name if entries.name is not None else visible(folder.resolve().name),
@@ -185,6 +192,7 @@ def traverse_of(
         folder=folder,
         constraints=tuple(constraints),
         points=points,
+        site=site,
     )
 
 
@@ -221,6 +229,7 @@ def traverse_entries(traverse: Traverse) -> TraverseFile:
         sharing=None if traverse.sharing is None else SharingEntry.of(traverse.sharing),
         constraints=[constraint_entry(one, surfaces) for one in traverse.constraints],  # type: ignore[misc]  # of its union
         points=None if traverse.points is None else _POINTS,
+        site=None if traverse.site is None else SiteEntry.of(traverse.site),
     )
 
 

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from pancam_graph.base.geometry import FloatArray
 from pancam_graph.charts import STEPS, Axis, Picture, framed, write, write_over
 from pancam_graph.mosaic._make import Mosaic, StopMosaics
 from pancam_graph.mosaic._placed import POINTINGS, Pointing
@@ -28,11 +29,19 @@ def shrunk(picture: Picture, width_px: int) -> Picture:
     return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def with_axes(mosaic: Mosaic, pointing: Pointing, title: str, width_px: int | None = None) -> Picture:
+def with_axes(
+    mosaic: Mosaic,
+    pointing: Pointing,
+    title: str,
+    width_px: int | None = None,
+    *,
+    north_deg: float | None = None,
+) -> Picture:
     """A mosaic in colour (blue, green, red) with its axes, made smaller where it is wider than a screen.
 
     Around the horizon the axes are azimuth and elevation. From above they are world x and y; circles about
-    the mast and lines of azimuth are drawn over it.
+    the mast and lines of azimuth are drawn over it. Azimuths count clockwise from north, where `north_deg`,
+    the direction of north anticlockwise from the world's x axis, is known; else anticlockwise from that axis.
     """
     projection = mosaic.projection
     widest = _CYLINDER_WIDTH_PX if isinstance(projection, Cylinder) else _GROUND_WIDTH_PX
@@ -40,8 +49,9 @@ def with_axes(mosaic: Mosaic, pointing: Pointing, title: str, width_px: int | No
     scale = grey.shape[1] / projection.width_px
     picture: Picture = np.repeat(grey[..., None], 3, axis=-1)
     if isinstance(projection, Cylinder):
+        ends_deg = projection.azimuth_deg(np.array([0.0, projection.width_px - 1.0]))
         across = Axis.of(
-            projection.azimuth_deg(np.array([0.0, projection.width_px - 1.0])),
+            ends_deg if north_deg is None else north_deg - ends_deg,
             scale,
             projection.width_px,
             wrap=True,
@@ -52,20 +62,27 @@ def with_axes(mosaic: Mosaic, pointing: Pointing, title: str, width_px: int | No
             projection.height_px,
             room_px=_LINE_ROOM_PX,
         )
-        names = "azimuth, degrees anticlockwise from the world's x axis", "elevation, degrees"
+        way = "anticlockwise from the world's x axis" if north_deg is None else "clockwise from north"
+        names = f"azimuth, degrees {way}", "elevation, degrees"
     else:
         x, y = projection.origin_m[0] + projection.left_m, projection.origin_m[1] + projection.top_m
         side = (projection.width_px - 1) * projection.m_per_px
         across = Axis.of(np.array([x, x + side]), scale, projection.width_px)
         down = Axis.of(np.array([y, y - side]), scale, projection.height_px)
         names = "world x, metres", "world y, metres"
-        _draw_circles(picture, projection, scale)
-        title = f"{title}; circles: distance, lines: azimuth in degrees" if title else ""
+        _draw_circles(picture, projection, scale, north_deg)
+        way = "" if north_deg is None else " from north"
+        title = f"{title}; circles: distance, lines: azimuth in degrees{way}" if title else ""
     return framed(picture, across, down, names, title)
 
 
-def _draw_circles(picture: Picture, projection: Ground, scale: float) -> None:
-    """Circles of equal distance from the mast, and lines of equal azimuth."""
+def _draw_circles(picture: Picture, projection: Ground, scale: float, north_deg: float | None) -> None:
+    """Circles of equal distance from the mast, and lines of equal azimuth; see `with_axes`."""
+
+    def along(azimuth: float) -> FloatArray:
+        anticlockwise = np.deg2rad(azimuth if north_deg is None else north_deg - azimuth)
+        return np.array([np.cos(anticlockwise), -np.sin(anticlockwise)])
+
     per_m = scale / projection.m_per_px
     centre = [((c / projection.m_per_px + 0.5) * scale - 0.5) for c in (-projection.left_m, projection.top_m)]
     radius_m = 0.5 * projection.width_px * projection.m_per_px
@@ -77,7 +94,7 @@ def _draw_circles(picture: Picture, projection: Ground, scale: float) -> None:
     for r in rings:
         cv2.circle(layer, middle, round(float(r) * per_m), (60, 190, 255), 1, cv2.LINE_AA)
     for azimuth in range(0, 360, 30):
-        d = np.array([np.cos(np.deg2rad(azimuth)), -np.sin(np.deg2rad(azimuth))])
+        d = along(azimuth)
         ends = [
             tuple(np.rint(np.array(centre) + d * m * per_m).astype(int).tolist())
             for m in (rings[0] if len(rings) else 0, outer)
@@ -86,10 +103,10 @@ def _draw_circles(picture: Picture, projection: Ground, scale: float) -> None:
     cv2.addWeighted(layer, 0.6, picture, 0.4, 0, dst=picture)
     cv2.drawMarker(picture, middle, (0, 94, 213), cv2.MARKER_CROSS, 18, 2)
     for r in rings:  # between two lines of azimuth, where no other label is
-        d = np.array([np.cos(np.deg2rad(-15)), -np.sin(np.deg2rad(-15))]) * (float(r) * per_m - 22)
+        d = along(-15) * (float(r) * per_m - 22)
         write_over(picture, f"{r:g} m", np.array(centre) + d)
     for azimuth in range(0, 360, 30):
-        d = np.array([np.cos(np.deg2rad(azimuth)), -np.sin(np.deg2rad(azimuth))])
+        d = along(azimuth)
         write_over(picture, f"{azimuth}", np.array(centre) + d * (outer * per_m - 24))
 
 
@@ -111,10 +128,12 @@ def _magnified(piece: Picture) -> Picture:
     return np.asarray(cv2.resize(np.ascontiguousarray(piece), size, interpolation=cv2.INTER_CUBIC), np.uint8)
 
 
-def comparison(mosaics: StopMosaics, title: str) -> Picture:
+def comparison(mosaics: StopMosaics, title: str, north_deg: float | None) -> Picture:
     """The refined panorama over pieces of its overlaps with telemetry's and with refined pointing."""
     width = 1800
-    panorama = with_axes(mosaics.cylinder, "refined", f"{title}: refined pointing", width - 142)
+    panorama = with_axes(
+        mosaics.cylinder, "refined", f"{title}: refined pointing", width - 142, north_deg=north_deg
+    )
     rows: list[Picture] = [panorama]
     pieces = close_ups(mosaics, 3)
     if pieces:

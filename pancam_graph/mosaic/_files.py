@@ -75,6 +75,7 @@ def write_mosaics(
     called with a stage, how many of its parts are done, and how many there are.
     """
     traverse = solution.traverse
+    north_deg = None if traverse.site is None else math.degrees(traverse.site.north_rad)
     pairs = sorted(set(zip(traverse.image_stop.tolist(), traverse.image_eye.tolist(), strict=True)))
     entries: list[Json] = []
     blinks: list[Blink] = []
@@ -93,11 +94,11 @@ def write_mosaics(
         else:
             name = f"{stop + 1:03d}-{eye + 1}_{_plain(stop_id)}_{_plain(camera)}"
             title = f"stop {stop_id}, camera {camera}"
-            entries += _write(made, folder, name, title)
+            entries += _write(made, folder, name, title, north_deg)
             lines.append(f"{title}: {_in_words(made)}")
             warnings += made.warnings
             if spent < _BLINK_BUDGET:
-                new = _blinks(made, title)
+                new = _blinks(made, title, north_deg)
                 spent += sum(len(data) for blink in new for data in blink.jpeg.values())
                 blinks += new
         if progress is not None:
@@ -125,7 +126,7 @@ def _in_words(made: StopMosaics) -> str:
     )
 
 
-def _write(made: StopMosaics, folder: Path, name: str, title: str) -> list[Json]:
+def _write(made: StopMosaics, folder: Path, name: str, title: str, north_deg: float | None) -> list[Json]:
     """Write the pictures of one eye at one stop; returns their entries in the index."""
     entries = []
     for kind, mosaic in (("cylinder", made.cylinder), ("ground", made.ground)):
@@ -135,15 +136,19 @@ def _write(made: StopMosaics, folder: Path, name: str, title: str) -> list[Json]
         for pointing in POINTINGS:
             plain, drawn = (f"{name}_{kind}_{pointing}{end}" for end in (".png", "_axes.jpg"))
             _save(folder / plain, mosaic.pictures[pointing])
-            _save(folder / drawn, with_axes(mosaic, pointing, f"{title}: {_POINTING[pointing]} pointing"))
+            caption = f"{title}: {_POINTING[pointing]} pointing"
+            _save(folder / drawn, with_axes(mosaic, pointing, caption, north_deg=north_deg))
             files |= {pointing: plain, f"{pointing}_axes": drawn}
+            if isinstance(mosaic.projection, Cylinder):
+                (folder / plain).with_suffix(".pgw").write_text(_world_file(mosaic.projection, north_deg))
+                files[f"{pointing}_world_file"] = plain.removesuffix(".png") + ".pgw"
             if mosaic.samples is not None:
                 deep = f"{name}_{kind}_{pointing}_16bit.png"
                 _save(folder / deep, mosaic.samples[pointing])
                 files[f"{pointing}_16bit"] = deep
         if kind == "cylinder":
             files["comparison"] = f"{name}_comparison.jpg"
-            _save(folder / f"{name}_comparison.jpg", comparison(made, title))
+            _save(folder / f"{name}_comparison.jpg", comparison(made, title, north_deg))
         entry: Json = {"stop": made.stop, "camera": made.camera, "kind": kind, "images": list(made.images)}
         entry |= {"files": files} | _place(mosaic)
         entry |= {"dark": mosaic.dark, "bright": mosaic.bright}
@@ -155,6 +160,17 @@ def _write(made: StopMosaics, folder: Path, name: str, title: str) -> list[Json]
 
 
 _POINTING: dict[Pointing, str] = {"telemetry": "telemetry's", "refined": "refined"}
+
+
+def _world_file(cylinder: Cylinder, north_deg: float | None) -> str:
+    """The six lines of a world file: degrees a pixel, and azimuth and elevation of the first pixel's middle.
+
+    Azimuths count as those of `with_axes`: clockwise from north grow to the right, anticlockwise ones fall.
+    """
+    step = 1 / cylinder.px_per_degree
+    left = cylinder.left_deg if north_deg is None else (north_deg - cylinder.left_deg) % 360
+    lines = (-step if north_deg is None else step, 0.0, 0.0, -step, left, cylinder.top_deg)
+    return "".join(f"{number:.12g}\n" for number in lines)
 
 
 def _place(mosaic: Mosaic) -> Json:
@@ -196,9 +212,9 @@ def _save(path: Path, picture: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
     path.write_bytes(encoded(picture, path.suffix, _QUALITY))
 
 
-def _blinks(made: StopMosaics, group: str) -> list[Blink]:
+def _blinks(made: StopMosaics, group: str, north_deg: float | None) -> list[Blink]:
     """The panorama, pieces of its overlaps, and the view from above."""
-    blinks = [_blink_of(made.cylinder, group, "panorama", _BLINK_WIDTH_PX)]
+    blinks = [_blink_of(made.cylinder, group, "panorama", _BLINK_WIDTH_PX, north_deg)]
     for k, pieces in close_ups(made, _CLOSE_UPS):
         overlap = made.seams.overlaps[k]
         captions: dict[Pointing, str] = {
@@ -208,13 +224,14 @@ def _blinks(made: StopMosaics, group: str) -> list[Blink]:
         title = f"overlap of {overlap.images[0]} and {overlap.images[1]}"
         blinks.append(_blink(group, title, captions, pieces))
     if made.ground is not None:
-        blinks.append(_blink_of(made.ground, group, "from above", _BLINK_GROUND_PX))
+        blinks.append(_blink_of(made.ground, group, "from above", _BLINK_GROUND_PX, north_deg))
     return blinks
 
 
-def _blink_of(mosaic: Mosaic, group: str, title: str, width_px: int) -> Blink:
+def _blink_of(mosaic: Mosaic, group: str, title: str, width_px: int, north_deg: float | None) -> Blink:
     captions = {p: f"{_POINTING[p]} pointing" for p in POINTINGS}
-    return _blink(group, title, captions, {p: with_axes(mosaic, p, "", width_px) for p in POINTINGS})
+    shown = {p: with_axes(mosaic, p, "", width_px, north_deg=north_deg) for p in POINTINGS}
+    return _blink(group, title, captions, shown)
 
 
 def _blink(

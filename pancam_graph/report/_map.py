@@ -3,7 +3,7 @@
 import numpy as np
 
 from pancam_graph.base.geometry import FloatArray, pose_arrays
-from pancam_graph.data import Solution
+from pancam_graph.data import Site, Solution
 from pancam_graph.report._escaped import escape
 from pancam_graph.report._look import AFTER, BEFORE, INK, RESIDUAL_SCALE, Figure, axis, layout
 from pancam_graph.report._numbers import Json, decimals_for, polyline, round_factor, rounded, short, thinned
@@ -61,14 +61,21 @@ def place_labels(at_m: FloatArray, sizes_m: list[FloatArray], *, clear_m: float)
     return placed
 
 
-def _landmark_trace(terrain: ShownTerrain) -> Json:
+def _north_up(solution: Solution) -> FloatArray:
+    """(2, 2) turn from the world's x and y to east and north; nothing is turned without a site."""
+    site = solution.traverse.site
+    return np.eye(2) if site is None else site.level_R_world[:2, :2]
+
+
+def _landmark_trace(terrain: ShownTerrain, turn: FloatArray) -> Json:
+    points = terrain.points_m[:, :2] @ turn.T
     keep = thinned(len(terrain.points_m), _MAX_LANDMARKS)
     decimals = decimals_for(terrain.extent_m)
     return {
         "type": "scatter",
         "mode": "markers",
-        "x": rounded(terrain.points_m[keep, 0], decimals),
-        "y": rounded(terrain.points_m[keep, 1], decimals),
+        "x": rounded(points[keep, 0], decimals),
+        "y": rounded(points[keep, 1], decimals),
         "marker": {
             "size": 3,
             "opacity": 0.7,
@@ -82,7 +89,7 @@ def _landmark_trace(terrain: ShownTerrain) -> Json:
     }
 
 
-def _direction_trace(solution: Solution, terrain: ShownTerrain, length_m: float) -> Json:
+def _direction_trace(solution: Solution, terrain: ShownTerrain, length_m: float, turn: FloatArray) -> Json:
     """A line from the mast along each frame's mean line of sight."""
     traverse = solution.traverse
     sight = np.zeros((len(traverse.frames), 2))
@@ -92,7 +99,7 @@ def _direction_trace(solution: Solution, terrain: ShownTerrain, length_m: float)
     _, stops_m = pose_arrays(solution.final.world_T_mast)
     start = (stops_m - terrain.origin_m)[traverse.frame_stop[seen], :2]
     end = start + length_m * sight[seen] / norm[seen, None]
-    x, y = polyline(np.stack([start, end], axis=1), decimals_for(terrain.extent_m) + 1)
+    x, y = polyline(np.stack([start, end], axis=1) @ turn.T, decimals_for(terrain.extent_m) + 1)
     line = {"color": BEFORE, "width": 1}
     name = "frame: viewing direction"
     return {
@@ -110,19 +117,21 @@ def make_map(solution: Solution, terrain: ShownTerrain) -> Figure:
     """The map of a solution, over the ground plan of the scene's box.
 
     Ellipses hold 95 % of the formal uncertainty, body covariances turned to the world; where they are too
-    small to be seen they are enlarged by a factor that the caption states. A held stop has none.
+    small to be seen they are enlarged by a factor that the caption states. A held stop has none. North is up
+    where the traverse has a site.
     """
-    traverse = solution.traverse
+    traverse, turn = solution.traverse, _north_up(solution)
     stops_R, stops_m = pose_arrays(solution.final.world_T_mast)
-    at = stops_m[:, :2] - terrain.origin_m[:2]
+    at = (stops_m[:, :2] - terrain.origin_m[:2]) @ turn.T
     decimals = decimals_for(terrain.extent_m) + 1
     covariance = translation_covariance_in_world(stops_R, solution.stop_covariance)[:, :2, :2]
+    covariance = turn @ covariance @ turn.T
     uncertain = np.isfinite(covariance).all(axis=(1, 2)) & (np.trace(covariance, axis1=1, axis2=2) > 0)
     outlines = ellipse_outlines(covariance[uncertain], _RADIUS_95)
     largest_m = float(np.linalg.norm(outlines, axis=2).max()) if len(outlines) else 0.0
     room_m = min(0.05 * terrain.extent_m, 0.45 * near_spacing(stops_m))
     enlarged = round_factor(room_m / largest_m) if 0 < largest_m < 0.2 * room_m else 1.0
-    traces = [_landmark_trace(terrain), _direction_trace(solution, terrain, 0.9 * room_m)]
+    traces = [_landmark_trace(terrain, turn), _direction_trace(solution, terrain, 0.9 * room_m, turn)]
     if len(outlines):
         x, y = polyline(at[uncertain][:, None] + enlarged * outlines, decimals)
         times = f", {enlarged:,.0f} times enlarged" if enlarged > 1 else ""
@@ -139,6 +148,7 @@ def make_map(solution: Solution, terrain: ShownTerrain) -> Figure:
                 "name": f"95 % ellipse{times}",
             }
         )
+    east, north = ("x", "y") if traverse.site is None else ("east", "north")
     names = [escape(s.id) for s in traverse.stops]
     for name, chosen, symbol in (("stop", uncertain, "circle"), ("stop, held", ~uncertain, "square-open")):
         rows = np.flatnonzero(chosen).tolist()
@@ -151,7 +161,7 @@ def make_map(solution: Solution, terrain: ShownTerrain) -> Figure:
                     "y": rounded(at[rows, 1], decimals),
                     "marker": {"size": 8, "color": INK, "symbol": symbol, "line": {"width": 2, "color": INK}},
                     "text": [names[row] for row in rows],
-                    "hovertemplate": "stop %{text}<br>x %{x} m, y %{y} m<extra></extra>",
+                    "hovertemplate": f"stop %{{text}}<br>{east} %{{x}} m, {north} %{{y}} m<extra></extra>",
                     "name": name,
                 }
             )
@@ -168,19 +178,32 @@ def make_map(solution: Solution, terrain: ShownTerrain) -> Figure:
         }
         for row, (x, y) in place_labels(at, sizes, clear_m=1.1 * room_m).items()
     ]
-    low, high = (corner[:2].round(6).tolist() for corner in (terrain.low_m, terrain.high_m))
+    ends = np.array([terrain.low_m[:2], terrain.high_m[:2]])
+    corners = ends[[[0, 0], [0, 1], [1, 0], [1, 1]], [0, 1]] @ turn.T
+    caption = _caption(terrain, enlarged, largest_m, held=int(np.sum(~uncertain)))
+    low, high = corners.min(axis=0).round(6).tolist(), corners.max(axis=0).round(6).tolist()
     return Figure(
         id="map",
         traces=tuple(traces),
         layout=layout(
-            xaxis=axis("x (m)", range=[low[0], high[0]], zeroline=False),
-            yaxis=axis("y (m)", range=[low[1], high[1]], zeroline=False, scaleanchor="x"),
+            xaxis=axis(f"{east} (m)", range=[low[0], high[0]], zeroline=False),
+            yaxis=axis(f"{north} (m)", range=[low[1], high[1]], zeroline=False, scaleanchor="x"),
             annotations=labels,
             margin={"l": 60, "r": 15, "t": 32, "b": 110},
             legend={"orientation": "h", "x": 0, "y": -0.15, "yanchor": "top", "itemsizing": "constant"},
         ),
-        caption=_caption(terrain, enlarged, largest_m, held=int(np.sum(~uncertain))),
+        caption=f"{caption} {_where(traverse.site)}",
     )
+
+
+def _where(site: Site | None) -> str:
+    """What is up, and where the place is."""
+    if site is None:
+        return "Axes are those of the local frame; where north is, is not told (site)."
+    latitude = f"{abs(site.latitude_deg):.5f}\N{DEGREE SIGN} {'N' if site.latitude_deg >= 0 else 'S'}"
+    longitude = f"{site.longitude_deg % 360:.5f}\N{DEGREE SIGN} E"
+    kind = "" if site.shape.is_geodetic else ", planetocentric"
+    return f"North is up. The world's origin is on {site.body} at {latitude}, {longitude}{kind}."
 
 
 def _caption(terrain: ShownTerrain, enlarged: float, largest_m: float, *, held: int) -> str:

@@ -127,7 +127,7 @@ def stop_table(solution: Solution) -> str:
     in_world = translation_covariance_in_world(stops_R, solution.stop_covariance)
     sigma_mm = 1e3 * np.sqrt(np.maximum(np.diagonal(in_world, axis1=1, axis2=2), 0))
     turn = np.sqrt(np.maximum(np.diagonal(solution.stop_covariance[:, :3, :3], axis1=1, axis2=2), 0))
-    columns = (
+    columns: tuple[tuple[str, str], ...] = (
         ("stop", "id of the stop"),
         ("x (m)", "position of the mast in the world"),
         ("y (m)", "position of the mast in the world"),
@@ -158,4 +158,16 @@ def stop_table(solution: Solution) -> str:
                 *turns,
             )
         )
+    if (site := traverse.site) is not None:
+        placed = (
+            ("latitude (°)", "planetocentric on Mars and Moon, geodetic on Earth"),
+            ("longitude (°)", "east"),
+            ("height (m)", "as of the site's"),
+            ("azimuth (°)", "of the mast's x axis, clockwise from north"),
+        )
+        columns = (*columns, *placed)
+        forward = np.arctan2(stops_R[:, 1, 0], stops_R[:, 0, 0])
+        for i, (place, heading) in enumerate(zip(site.geographic(stops_m), forward.tolist(), strict=True)):
+            degrees = fixed(place[0], 7), fixed(place[1], 7), fixed(place[2], 2)
+            rows[i] = (*rows[i], *degrees, fixed(site.azimuth_deg(heading), 3))
     return table("Stops", columns, rows, texts=1)

@@ -19,6 +19,7 @@ from pancam_graph.data import (
     Incremental,
     Quantity,
     RigTreatment,
+    Site,
     Solution,
     Verdict,
     VerdictTest,
@@ -31,6 +32,7 @@ from pancam_graph.io import (
     Entry,
     Label,
     PoseEntry,
+    SiteEntry,
     SparseEntry,
     Text,
     camera_entry,
@@ -68,13 +70,21 @@ class CountsEntry(Entry):
     rejected: int
 
 
-class SolvedStopEntry(Entry):
+class SolvedStopEntry(SparseEntry):
     """Mast pose of a stop; null where it is not finite."""
+
+    _OPTIONAL: ClassVar = frozenset({"latitude_deg", "longitude_deg", "height_m", "azimuth_deg"})
 
     id: str
     world_T_mast: PoseEntry | None
     covariance: Annotated[list[Vector6], Field(min_length=6, max_length=6)] | None
     """6 x 6, rotation first, body frame; 0 for a held stop, null where unknown."""
+    latitude_deg: float | None = None
+    """Of the mast's origin on the site's planet; these keys are missing without a site."""
+    longitude_deg: float | None = None
+    height_m: float | None = None
+    azimuth_deg: float | None = None
+    """Where the mast's x axis points, clockwise from north."""
 
 
 class FlexEntry(Entry):
@@ -110,14 +120,20 @@ class SolvedFrameEntry(SparseEntry):
     """How its head stands off the rigid mast, by entry; the key is missing where heads sit firmly."""
 
 
-class SolvedImageEntry(Entry):
+class SolvedImageEntry(SparseEntry):
     """Camera pose of an image; count and RMS residual length of its used observations."""
+
+    _OPTIONAL: ClassVar = frozenset({"azimuth_deg", "elevation_deg"})
 
     id: str
     world_T_camera: PoseEntry | None
     rms_px: float | None
     """Null without used observations."""
     observations: int
+    azimuth_deg: float | None = None
+    """Of the camera's axis, clockwise from north; these keys are missing without a site."""
+    elevation_deg: float | None = None
+    """Of the camera's axis above the horizontal."""
 
 
 class RefinedEntry(Entry):
@@ -224,6 +240,8 @@ class SolutionFile(Entry):
     warnings: list[str]
     folder: Text | None = None
     """The folder that was refined, relative to that of the results; the key is missing without one."""
+    site: SiteEntry | None = None
+    """Where the world is on its planet; the key is missing where that is not known."""
     cross_validation: CrossValidationEntry | None = None
     """Where it was asked for; else the key is missing."""
     incremental: IncrementalEntry | None = None
@@ -248,6 +266,7 @@ def solution_json(solution: Solution, out: Path | None = None) -> bytes:
         "refined": not solution.refined,
         "fields": not any(isinstance(eye.camera, FieldCamera) for eye in solution.rig.eyes),
         "folder": out is None or solution.traverse.folder is None,
+        "site": solution.traverse.site is None,
         "cross_validation": solution.cross_validation is None,
         "incremental": solution.incremental is None,
     }
@@ -270,7 +289,12 @@ def solution_file(solution: Solution, out: Path | None = None) -> SolutionFile:
     """A solution as the model of its file; see `solution_json`."""
     traverse, final = solution.traverse, solution.final
     stops = [
-        SolvedStopEntry(id=stop.id, world_T_mast=_pose(pose), covariance=_covariance(covariance))
+        SolvedStopEntry(
+            id=stop.id,
+            world_T_mast=_pose(pose),
+            covariance=_covariance(covariance),
+            **_place_of(traverse.site, pose),
+        )
         for stop, pose, covariance in zip(
             traverse.stops, final.world_T_mast, solution.stop_covariance, strict=True
         )
@@ -341,6 +365,7 @@ def solution_file(solution: Solution, out: Path | None = None) -> SolutionFile:
         # Warnings of the reader come first, and once, also where the solver passed them on.
         warnings=list(dict.fromkeys([*traverse.warnings, *solution.warnings])),
         folder=None if out is None or traverse.folder is None else _way(traverse.folder, out),
+        site=None if traverse.site is None else SiteEntry.of(traverse.site),
         method=solution.method,
         cross_validation=None if validation is None else CrossValidationEntry.of(validation, traverse),
         incremental=None if solution.incremental is None else IncrementalEntry.of(solution.incremental),
@@ -386,11 +411,36 @@ def _images(solution: Solution) -> list[SolvedImageEntry]:
             world_T_camera=_pose_of(rotation, translation),
             rms_px=_number(np.sqrt(total / views)) if views else None,
             observations=int(views),
+            **_direction_of(traverse.site, rotation[:, 2]),
         )
         for entry, rotation, translation, views, total in zip(
             traverse.images, final.world_R_camera, final.world_t_camera, count, squared, strict=True
         )
     ]
+
+
+def _place_of(site: Site | None, world_T_mast: gtsam.Pose3) -> dict[str, float]:
+    """Where a mast is on its planet, and where its x axis points; nothing without a site or a finite pose."""
+    if site is None or not np.isfinite(world_T_mast.matrix()).all():
+        return {}
+    ((latitude, longitude, height),) = site.geographic(world_T_mast.translation()[None]).tolist()
+    forward = world_T_mast.rotation().matrix()[:, 0]
+    return {
+        "latitude_deg": latitude,
+        "longitude_deg": longitude,
+        "height_m": height,
+        "azimuth_deg": site.azimuth_deg(float(np.arctan2(forward[1], forward[0]))),
+    }
+
+
+def _direction_of(site: Site | None, axis: FloatArray) -> dict[str, float]:
+    """Azimuth and elevation of a direction (3,) of the world; nothing without a site, or if not finite."""
+    if site is None or not np.isfinite(axis).all():
+        return {}
+    return {
+        "azimuth_deg": site.azimuth_deg(float(np.arctan2(axis[1], axis[0]))),
+        "elevation_deg": float(np.degrees(np.arctan2(axis[2], np.hypot(axis[0], axis[1])))),
+    }
 
 
 def _number(value: float) -> float | None:

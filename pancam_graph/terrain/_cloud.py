@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pancam_graph.data import Site
 from pancam_graph.terrain._extra import needed
 from pancam_graph.terrain._make import Cloud
 
@@ -13,15 +14,17 @@ __all__ = ["write_cloud"]
 _SCALE_M = 1e-4
 
 
-def write_cloud(clouds: Sequence[Cloud], path: Path, crs: str) -> int:
+def write_cloud(clouds: Sequence[Cloud], path: Path, crs: str, site: Site | None) -> int:
     """Write points with colour (the grey of the pictures), `sigma_m` and `frame`; returns how many.
 
     `frame` is the row of the frame in the traverse, `sigma_m` the standard deviation along the line of sight.
-    Coordinates are whole tenths of a millimetre.
+    Coordinates are whole tenths of a millimetre: of the world, or east, north and height of a site.
     """
     laspy = needed("laspy")
     needed("lazrs")
     xyz = np.concatenate([c.points.xyz_m for c in clouds])
+    if site is not None:
+        xyz = xyz @ site.level_R_world.T + [0.0, 0.0, site.height_m]
     grey = np.concatenate([c.points.grey for c in clouds])
     header = laspy.LasHeader(point_format=7, version="1.4")
     header.scales = np.full(3, _SCALE_M)

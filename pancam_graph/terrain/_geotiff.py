@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pancam_graph.data import Site
+from pancam_graph.io import site_crs, world_affine
 from pancam_graph.terrain._extra import needed
 from pancam_graph.terrain._grid import Grid
 from pancam_graph.terrain._make import Fused
@@ -21,8 +23,13 @@ _SMALLEST_OVERVIEW = 256
 _TILE_PX = 256
 
 
-def crs_wkt(name: str) -> str:
-    """The world frame of a traverse as a coordinate system: local metres, x to the right, y up, z up."""
+def crs_wkt(name: str, site: Site | None) -> str:
+    """The coordinate system of a traverse: metres east and north of its site, where it has one.
+
+    Else its world frame: local metres, x to the right, y up, z up.
+    """
+    if site is not None:
+        return str(site_crs(site, name).to_wkt())
     plain = "".join(c if c.isalnum() or c in " .-_" else "_" for c in name)[:80] or "traverse"
     return (
         f'LOCAL_CS["pancam-graph world of {plain}",LOCAL_DATUM["first mast, z up",32767],'
@@ -30,22 +37,26 @@ def crs_wkt(name: str) -> str:
     )
 
 
-def write_dem(fused: Fused, path: Path, crs: str) -> None:
-    """Write the bands of a surface; NaN where nothing is seen, which is the value for no data."""
+def write_dem(fused: Fused, path: Path, crs: str, site: Site | None) -> None:
+    """Write the bands of a surface; NaN where nothing is seen, which is the value for no data.
+
+    Heights are z of the world; where there is a site, the band's offset makes them those of the planet.
+    """
     bands = [fused.height_m, fused.sigma_m, fused.count, fused.disagreement_m]
     bands[2] = np.where(fused.count > 0, fused.count, np.float32(np.nan))
-    _write(path, fused.grid, crs, bands, BANDS, _UNITS, np.nan)
+    _write(path, fused.grid, crs, site, bands, BANDS, _UNITS, np.nan)
 
 
-def write_orthoimage(grey: NDArray[np.uint8], grid: Grid, path: Path, crs: str) -> None:
+def write_orthoimage(grey: NDArray[np.uint8], grid: Grid, path: Path, crs: str, site: Site | None) -> None:
     """Write brightness, 1 to 255; 0 is no data."""
-    _write(path, grid, crs, [grey], ("brightness",), ("",), 0)
+    _write(path, grid, crs, site, [grey], ("brightness",), ("",), 0)
 
 
 def _write(
     path: Path,
     grid: Grid,
     crs: str,
+    site: Site | None,
     bands: Sequence[NDArray[Any]],
     names: Sequence[str],
     units: Sequence[str],
@@ -55,7 +66,7 @@ def _write(
     logging.getLogger("rasterio").setLevel(logging.ERROR)
     resampling = needed("rasterio.enums").Resampling.average
     whole_numbers = bands[0].dtype == np.uint8
-    place = needed("rasterio.transform").from_origin(grid.left_m, grid.top_m, grid.cell_m, grid.cell_m)
+    place = world_affine(site, grid.left_m, grid.top_m, np.array([grid.cell_m, -grid.cell_m]))
     with rasterio.open(
         path,
         "w",
@@ -80,6 +91,8 @@ def _write(
             file.set_band_description(number, name)
             if unit:
                 file.set_band_unit(number, unit)
+        if site is not None and not whole_numbers:
+            file.offsets = (site.height_m, *(0.0 for _ in bands[1:]))
         levels = [2**k for k in range(1, 12) if max(grid.rows, grid.columns) >= _SMALLEST_OVERVIEW * 2**k]
         if levels:
             file.build_overviews(levels, resampling)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pancam_graph.charts import Picture, encoded
-from pancam_graph.data import Traverse
+from pancam_graph.data import Site, Traverse
 from pancam_graph.io import TERRAIN_FORMAT, VERSION
 from pancam_graph.terrain._cloud import write_cloud
 from pancam_graph.terrain._extra import require_extra
@@ -51,7 +51,8 @@ def write_terrain(
     Raises InputError where a package of the extra `terrain` is missing.
     """
     require_extra()
-    crs = crs_wkt(traverse.name)
+    site = traverse.site
+    crs = crs_wkt(traverse.name, site)
     names = _folder_names(list(terrain.stops))
     sets: list[tuple[str | None, str, Fused, Sequence[Cloud]]] = [
         (None, "", terrain.drive, list(terrain.clouds.values()))
@@ -62,14 +63,19 @@ def write_terrain(
         place = folder / name if name else folder
         place.mkdir(exist_ok=True)
         title = f"traverse {traverse.name}" if stop is None else f"stop {stop}"
-        products.append(_write_set(fused, clouds, place, name, stop, title, crs, options))
+        products.append(_write_set(fused, clouds, place, name, stop, title, crs, site, options))
         if progress is not None:
             progress("writing terrain", n + 1, len(sets))
     whole = {
         "format": TERRAIN_FORMAT,
         "version": VERSION,
         "cell_m": terrain.drive.grid.cell_m,
-        "crs": {"name": "world frame of the traverse, z up, metres", "wkt": crs},
+        "crs": {
+            "name": "world frame of the traverse, z up, metres"
+            if site is None
+            else f"metres east and north of the site on {site.body}; heights are of the world, z up",
+            "wkt": crs,
+        },
         "disagreement_m": _both(terrain, same_stop=None),
         "disagreement_sigmas": _number(terrain.agreement.median_sigmas),
         "disagreement_within_stops_m": _both(terrain, same_stop=True),
@@ -90,16 +96,17 @@ def _write_set(
     stop: str | None,
     title: str,
     crs: str,
+    site: Site | None,
     options: TerrainOptions,
 ) -> Json:
     """Write the files of one surface; returns its entry in the index."""
     grey = _stretched(fused.grey)
-    write_dem(fused, place / _FILES["dem"], crs)
-    write_orthoimage(grey, fused.grid, place / _FILES["orthoimage"], crs)
+    write_dem(fused, place / _FILES["dem"], crs, site)
+    write_orthoimage(grey, fused.grid, place / _FILES["orthoimage"], crs, site)
     _save(place / _FILES["hillshade"], hillshade_picture(fused, title))
     _save(place / _FILES["slope"], slope_picture(fused, title))
     triangles = write_mesh(fused, grey, place / _FILES["mesh"], options.most_mesh_cells)
-    points = write_cloud(clouds, place / _FILES["cloud"], crs)
+    points = write_cloud(clouds, place / _FILES["cloud"], crs, site)
     seen = np.isfinite(fused.height_m)
     grid = fused.grid
     return {
