@@ -1,6 +1,5 @@
 """The subcommand terrain: dense surfaces of a drive that was refined earlier."""
 
-import math
 from pathlib import Path
 
 from pancam_graph.base.text import shortened
@@ -14,9 +13,9 @@ _DESCRIPTION = """\
 Make terrain of refined stereo frames: heights with sigmas, orthoimage, hillshade, mesh and cloud.
 
 OUT is a folder of results. OUT/terrain gets terrain.json, dem.tif (bands height, sigma, count, disagreement),
-orthoimage.tif, hillshade.png, slope.png, mesh.glb and cloud.laz of the drive, and OUT/terrain/STOP those of
-each stop; an older one is replaced once all is complete. terrain.json says by how much the surfaces of frames
-differ where they see the same ground, with telemetry's and with the refined pointing.
+orthoimage.tif, hillshade.png, slope.png, mesh.glb and cloud.laz of the drive, OUT/terrain/STOP those of each
+stop, and terrain.html shows them; an older one is replaced once all is complete. terrain.json says by how
+much surfaces of frames differ where they see the same ground, with telemetry's and with the refined pointing.
 
 Needs the extra: pip install 'pancam-graph[terrain]'.
 
@@ -41,6 +40,7 @@ def _add_options(parser: CommandParser) -> None:
         metavar="M",
         help="farthest ground from a mast, metres (%(default)s)",
     )
+    add("--ply", action="store_true", help="write clouds as PLY too")
     add(
         "--images",
         type=Path,
@@ -55,24 +55,16 @@ def _work(call: Invocation) -> int:
     from pancam_graph.terrain import TerrainOptions, require_extra
 
     arguments, progress = call.arguments, call.progress
-    options = TerrainOptions(cell_m=arguments.cell, reach_m=arguments.reach)
+    options = TerrainOptions(cell_m=arguments.cell, reach_m=arguments.reach, ply=arguments.ply)
     require_extra()
     with progress.shown(f"reading {arguments.out}"):
         drive = read_drive(arguments.out, arguments.images)
         terrain = write_terrain_of(drive, arguments.out, options, progress=progress.counted)
     for warning in terrain.warnings:
         write("stderr", shortened(f"warning: {warning}"))
-    grid = terrain.drive.grid
-    call.say(
-        f"{arguments.out / 'terrain'}: {len(terrain.pairs)} stereo frames of {len(terrain.stops)} stops, "
-        f"cells of {grid.cell_m:g} m"
-    )
-    before, after = (terrain.agreement.median_m(p) for p in ("telemetry", "refined"))
-    if math.isfinite(before) and math.isfinite(after):
-        call.say(
-            f"surfaces of frames differ by {100 * before:.1f} cm with telemetry, {100 * after:.1f} cm "
-            f"refined (median of {len(terrain.agreement.pairs)} pairs of frames)"
-        )
+    first, *others = terrain.says()
+    for line in (f"{arguments.out / 'terrain'}: {first}", *others):
+        call.say(line)
     file = read_solution_json(arguments.out / "solution.json")
     passed = file.converged and (file.verdict is None or file.verdict.passed)
     if not passed:

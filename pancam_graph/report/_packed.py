@@ -22,17 +22,19 @@ script-src 'unsafe-inline' 'unsafe-eval'; img-src data: blob:; connect-src data:
 <p class="lead">{lead}</p>
 """
 """Template of the beginning of a page, with places for a title, a style and an introduction."""
-UNPACKED = """async function unpacked(id) {
+UNPACKED = """async function unpacked(id, binary = false) {
   const packed = Uint8Array.from(atob(document.getElementById(id).textContent), (c) => c.charCodeAt(0));
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
-  return new Response(stream).text();
+  const response = new Response(stream);
+  return binary ? response.arrayBuffer() : response.text();
 }"""
-"""Script function that returns the text that `packed` made into the content of an element, by its id."""
+"""Script function that returns what `packed` made into the content of an element: text, or bytes."""
 
 
-def packed(text: str) -> str:
-    """Text compressed and written in letters; the same text always gives the same letters."""
-    return base64.b64encode(gzip.compress(text.encode("utf-8"), 9, mtime=0)).decode("ascii")
+def packed(content: str | bytes) -> str:
+    """Text or bytes compressed and written in letters; the same content always gives the same letters."""
+    raw = content.encode("utf-8") if isinstance(content, str) else content
+    return base64.b64encode(gzip.compress(raw, 9, mtime=0)).decode("ascii")
 
 
 @lru_cache(maxsize=1)

@@ -24,7 +24,9 @@ from pancam_graph.report._shown_terrain import shown_terrain
 from pancam_graph.report._style import STYLE
 from pancam_graph.report._tables import image_table, observation_table, stop_table
 from pancam_graph.report._template import NO_VECTORS, PAGE, SCENE_CONTROLS, VECTOR_CONTROLS
+from pancam_graph.report._terrain import terrain_section
 from pancam_graph.report._verdict import verdict_section
+from pancam_graph.terrain import WrittenTerrain
 
 __all__ = ["headline", "lead", "make_page"]
 
@@ -42,12 +44,14 @@ _REASONS = {
 }
 
 
-def make_page(solution: Solution, mosaics: WrittenMosaics | None = None) -> str:
-    """The whole page of a solution as HTML, with its mosaics where there are any."""
+def make_page(
+    solution: Solution, mosaics: WrittenMosaics | None = None, terrain: WrittenTerrain | None = None
+) -> str:
+    """The whole page of a solution as HTML, with its mosaics and its terrain where there are any."""
     table, rows_of = image_residuals(solution)
-    terrain = shown_terrain(solution)
-    scene, views = scene_figure(solution, terrain, make_masts(solution))
-    map_figure, histogram = make_map(solution, terrain), make_histogram(solution)
+    points = shown_terrain(solution)
+    scene, views = scene_figure(solution, points, make_masts(solution))
+    map_figure, histogram = make_map(solution, points), make_histogram(solution)
     corrections = make_corrections(solution)
     panels = vector_panels(solution, table, rows_of)
     vectors = _vector_figure(len(panels), seen=sum(e.used + e.rejected > 0 for e in table))
@@ -72,6 +76,7 @@ def make_page(solution: Solution, mosaics: WrittenMosaics | None = None) -> str:
         histogram=_section("Residuals before and after", histogram),
         vectors=_section("Residuals in single images", vectors, VECTOR_CONTROLS) if panels else NO_VECTORS,
         mosaics=mosaic_section(mosaics),
+        terrain=terrain_section(terrain, "terrain/") if terrain is not None else "",
         corrections=_section("Corrections of pan and tilt", corrections),
         cross_validation=cross_validation_section(solution.cross_validation, solution.traverse),
         observations=observation_table(solution),

@@ -25,7 +25,7 @@ PAGE = (
 {headline}
 </dl>
 </header>
-{mosaics}<div class="pair">
+{mosaics}{terrain}<div class="pair">
 {map}
 {histogram}
 </div>

@@ -73,7 +73,7 @@ def _no_mosaics(folder: Path) -> list[str]:
 
 def _no_terrain(folder: Path) -> list[str]:
     """Files in a folder, and in its folders, that its index does not know; all where there is no index."""
-    from pancam_graph.terrain import TERRAIN_INDEX  # noqa: PLC0415  it imports OpenCV
+    from pancam_graph.terrain import TERRAIN_INDEX, TERRAIN_PAGE  # noqa: PLC0415  it imports OpenCV
 
     if folder.is_symlink() or not folder.is_dir():
         return [f"{folder.name}/"]
@@ -82,7 +82,7 @@ def _no_terrain(folder: Path) -> list[str]:
     except InputError:
         known = set[str]()
     else:
-        known = {TERRAIN_INDEX}
+        known = {TERRAIN_INDEX, TERRAIN_PAGE}
         for entry in index["products"] if isinstance(index.get("products"), list) else []:
             files = entry.get("files") if isinstance(entry, dict) else None
             known |= {f for f in files.values() if isinstance(f, str)} if isinstance(files, dict) else set()

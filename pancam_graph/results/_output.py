@@ -11,7 +11,7 @@ from pancam_graph.results._older import ONE_FILE, Older
 if TYPE_CHECKING:  # these import OpenCV, and names of outputs must be cheap
     from pancam_graph.mosaic import MosaicOptions, WrittenMosaics
     from pancam_graph.results._brightness import Brightness
-    from pancam_graph.terrain import TerrainOptions
+    from pancam_graph.terrain import TerrainOptions, WrittenTerrain
 
 __all__ = ["Output", "OutputWriter", "Written"]
 
@@ -35,6 +35,8 @@ class Written:
     """How long writing has taken so far."""
     mosaics: "WrittenMosaics | None" = None
     """The mosaics, once they are written."""
+    terrain: "WrittenTerrain | None" = None
+    """The terrain, once it is written."""
 
 
 def _anything(traverse: Traverse) -> None:

@@ -9,7 +9,7 @@ __all__ = ["REPORT"]
 
 
 def _write(written: Written, path: Path) -> Written:
-    report.write_report(written.solution, path, written.mosaics)
+    report.write_report(written.solution, path, written.mosaics, written.terrain)
     return written
 
 

@@ -4,12 +4,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from pancam_graph import report
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.whole_files import whole_folder
 from pancam_graph.images import cache_folder
 from pancam_graph.results._older import TERRAIN, TERRAIN_FOLDER
 from pancam_graph.results._output import OutputWriter, Written
 from pancam_graph.terrain import (
+    TERRAIN_PAGE,
     Drive,
     Terrain,
     TerrainOptions,
@@ -44,7 +46,8 @@ def write_terrain_of(
     terrain = make_terrain(drive, options, progress=progress, cache=cache_folder(out))
     try:
         with whole_folder(path) as folder:
-            write_terrain(terrain, drive.traverse, folder, options, progress=progress)
+            shown = write_terrain(terrain, drive.traverse, folder, options, progress=progress)
+            report.write_terrain_page(shown, drive.traverse.name, folder / TERRAIN_PAGE)
     except OSError as error:
         raise InputError(f"{path}: expected a place where terrain can be written, found: {error}") from error
     return terrain
@@ -57,12 +60,14 @@ def _write(written: Written, folder: Path) -> Written:
         terrain = make_terrain(
             drive_of(solution), options, progress=written.progress, cache=cache_folder(written.out)
         )
-        write_terrain(terrain, solution.traverse, folder, options, progress=written.progress)
-        warnings = terrain.warnings
+        shown = write_terrain(terrain, solution.traverse, folder, options, progress=written.progress)
+        report.write_terrain_page(shown, solution.traverse.name, folder / TERRAIN_PAGE)
+        warnings = shown.warnings
     except InputError as error:  # a solve that took long must not be lost for it
-        warnings = (str(error),)
+        shown, warnings = None, (str(error),)
         folder.rmdir()
-    return replace(written, solution=replace(solution, warnings=(*solution.warnings, *warnings)))
+    warned = replace(solution, warnings=(*solution.warnings, *warnings))
+    return replace(written, solution=warned, terrain=shown)
 
 
 TERRAIN_WRITER = OutputWriter(write=_write)

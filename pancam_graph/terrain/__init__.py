@@ -8,6 +8,10 @@ from pancam_graph.terrain._extra import require_extra as require_extra
 from pancam_graph.terrain._make import Fused as Fused
 from pancam_graph.terrain._make import Terrain as Terrain
 from pancam_graph.terrain._make import make_terrain as make_terrain
+from pancam_graph.terrain._shown import Relief as Relief
+from pancam_graph.terrain._shown import ShownSurface as ShownSurface
+from pancam_graph.terrain._shown import WrittenTerrain as WrittenTerrain
 from pancam_graph.terrain._terrain_options import TerrainOptions as TerrainOptions
 from pancam_graph.terrain._write import TERRAIN_INDEX as TERRAIN_INDEX
+from pancam_graph.terrain._write import TERRAIN_PAGE as TERRAIN_PAGE
 from pancam_graph.terrain._write import write_terrain as write_terrain

@@ -45,6 +45,8 @@ class Fused:
     """Standard deviation between frames; NaN where fewer than two see the cell."""
     grey: NDArray[np.float32]
     """Brightness in samples of the pictures."""
+    telemetry_m: NDArray[np.float32]
+    """Height with telemetry's pointing; NaN where that is not known."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -67,6 +69,21 @@ class Terrain:
     agreement: Agreement
     pairs: tuple[Pair, ...]
     warnings: tuple[str, ...]
+
+    def says(self) -> list[str]:
+        """What was found, in sentences."""
+        sigma_mm = 1e3 * float(np.nanmedian(self.drive.sigma_m))
+        lines = [
+            f"{len(self.pairs)} stereo frames of {len(self.stops)} stops, cells of "
+            f"{self.drive.grid.cell_m:g} m, heights known to {sigma_mm:.1f} mm (median of formal sigmas)"
+        ]
+        before, after = (self.agreement.median_m(p) for p in ("telemetry", "refined"))
+        if np.isfinite([before, after]).all():
+            lines.append(
+                f"surfaces of frames differ by {100 * before:.1f} cm with telemetry, {100 * after:.1f} cm "
+                f"refined (median of {len(self.agreement.pairs)} pairs of frames)"
+            )
+        return lines
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -142,7 +159,7 @@ def make_terrain(
             "terrain: expected ground that two eyes see, found none: see the masks of the images"
         )
     frames = _evened(frames)
-    layers = [each.refined for each in frames]
+    layers, before = [each.refined for each in frames], _telemetry_layers(frames)
     stop_of = [traverse.frames[each.pair.frame].stop for each in frames]
     of_stop = {
         stop.id: [each for each, own in zip(frames, stop_of, strict=True) if own == stop.id]
@@ -150,12 +167,10 @@ def make_terrain(
         if stop.id in stop_of
     }
     return Terrain(
-        drive=fuse(grid, layers),
-        stops={n: fuse(grid, [e.refined for e in of]) for n, of in of_stop.items()},
+        drive=fuse(grid, layers, before),
+        stops={n: fuse(grid, [e.refined for e in of], _telemetry_layers(of)) for n, of in of_stop.items()},
         clouds={n: _cloud(of) for n, of in of_stop.items()},
-        agreement=agreement_of(
-            layers, [e.telemetry for e in frames if e.telemetry is not None], traverse.frame_stop
-        ),
+        agreement=agreement_of(layers, before, traverse.frame_stop),
         pairs=tuple(e.pair for e in frames),
         warnings=tuple(warnings),
     )
@@ -241,32 +256,53 @@ def _cloud(frames: Sequence[_Seen]) -> Cloud:
     return Cloud(points=Points(**joined), frame=frame)
 
 
-def fuse(grid: Grid, layers: Sequence[Layer]) -> Fused:
-    """Fuse the layers of some frames, on the part of the grid that they cover."""
+def _telemetry_layers(frames: Sequence[_Seen]) -> list[Layer]:
+    return [each.telemetry for each in frames if each.telemetry is not None]
+
+
+def fuse(grid: Grid, layers: Sequence[Layer], telemetry: Sequence[Layer] = ()) -> Fused:
+    """Fuse the layers of some frames on the part of the grid that they cover, and there telemetry's too."""
     boxes = [layer.box for layer in layers]
-    top, left = min(r.start for r, _ in boxes), min(c.start for _, c in boxes)
-    rows, columns = max(r.stop for r, _ in boxes) - top, max(c.stop for _, c in boxes) - left
-    fused = np.empty((5, rows, columns), dtype=np.float32)
-    for begin in range(0, rows, _ROWS):
-        end = min(begin + _ROWS, rows)
-        here = [lay for lay in layers if lay.first_row < top + end and lay.box[0].stop > top + begin]
-        stack = np.full((3, max(len(here), 1), end - begin, columns), np.nan, dtype=np.float32)
+    box = tuple(
+        slice(min(s.start for s in along), max(s.stop for s in along)) for along in zip(*boxes, strict=True)
+    )
+    rows, columns = box
+    height, variance, count, disagreement, grey = _fused_bands(layers, (rows, columns), 5)
+    (before,) = _fused_bands(telemetry, (rows, columns), 1)
+    return Fused(
+        grid=grid.part(rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start),
+        height_m=height,
+        sigma_m=np.sqrt(variance),
+        count=count,
+        disagreement_m=disagreement,
+        grey=grey,
+        telemetry_m=before,
+    )
+
+
+def _fused_bands(layers: Sequence[Layer], box: tuple[slice, slice], bands: int) -> NDArray[np.float32]:
+    """The first bands (bands, rows, columns) of what layers are as one, in some rows and columns of the grid.
+
+    The bands are height, variance, count, disagreement, and grey. What layers have beyond is cut off.
+    """
+    (top, bottom), (left, right) = ((s.start, s.stop) for s in box)
+    fused = np.empty((bands, bottom - top, right - left), dtype=np.float32)
+    for begin in range(top, bottom, _ROWS):
+        end = min(begin + _ROWS, bottom)
+        here = [lay for lay in layers if lay.first_row < end and lay.box[0].stop > begin]
+        stack = np.full((3, max(len(here), 1), end - begin, right - left), np.nan, dtype=np.float32)
         for k, layer in enumerate(here):
             r, c = layer.box
-            first, last = max(r.start, top + begin), min(r.stop, top + end)
-            to = slice(first - top - begin, last - top - begin), slice(c.start - left, c.stop - left)
-            part = slice(first - r.start, last - r.start)
+            first, last = max(r.start, begin), min(r.stop, end)
+            west, east = max(c.start, left), min(c.stop, right)
+            if west >= east:
+                continue
+            to = slice(first - begin, last - begin), slice(west - left, east - left)
+            part = slice(first - r.start, last - r.start), slice(west - c.start, east - c.start)
             for band, values in enumerate((layer.height_m, layer.variance_m2, layer.grey)):
                 stack[(band, k, *to)] = values[part]
         flat = stack.reshape(3, stack.shape[1], -1)
         out = np.empty((5, flat.shape[2]), dtype=np.float32)
         kernel.fuse_cells(flat[0], flat[1], flat[2], out)
-        fused[:, begin:end] = out.reshape(5, end - begin, columns)
-    return Fused(
-        grid=grid.part(top, left, rows, columns),
-        height_m=fused[0],
-        sigma_m=np.sqrt(fused[1]),
-        count=fused[2],
-        disagreement_m=fused[3],
-        grey=fused[4],
-    )
+        fused[:, begin - top : end - top] = out[:bands].reshape(bands, end - begin, right - left)
+    return fused

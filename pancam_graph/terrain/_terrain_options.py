@@ -20,6 +20,9 @@ class TerrainOptions:
     most_mesh_cells: int = 250_000
     """Cells of the mesh; of more, the mesh is coarser than the grid."""
 
+    ply: bool = False
+    """Whether clouds are written as PLY beside LAZ."""
+
     def __post_init__(self) -> None:
         """Check the ranges."""
         for name in ("cell_m", "reach_m", "most_cloud_points", "most_mesh_cells"):

@@ -11,18 +11,21 @@ from numpy.typing import NDArray
 from pancam_graph.charts import Picture, encoded
 from pancam_graph.data import Site, Traverse
 from pancam_graph.io import TERRAIN_FORMAT, VERSION
-from pancam_graph.terrain._cloud import write_cloud
+from pancam_graph.terrain._cloud import write_cloud, write_ply
 from pancam_graph.terrain._extra import require_extra
 from pancam_graph.terrain._geotiff import BANDS, crs_wkt, write_dem, write_orthoimage
 from pancam_graph.terrain._make import Cloud, Fused, Terrain
 from pancam_graph.terrain._mesh import write_mesh
 from pancam_graph.terrain._pictures import hillshade_picture, slope_picture
+from pancam_graph.terrain._shown import ShownSurface, WrittenTerrain, shown_surface
 from pancam_graph.terrain._terrain_options import TerrainOptions
 
-__all__ = ["TERRAIN_INDEX", "write_terrain"]
+__all__ = ["TERRAIN_INDEX", "TERRAIN_PAGE", "write_terrain"]
 
 TERRAIN_INDEX = "terrain.json"
 """The file in a folder of terrain that lists the others."""
+TERRAIN_PAGE = "terrain.html"
+"""The page of a folder of terrain, which the index does not list: whoever writes reports writes it."""
 _FILES = {
     "dem": "dem.tif",
     "orthoimage": "orthoimage.tif",
@@ -30,6 +33,7 @@ _FILES = {
     "slope": "slope.png",
     "mesh": "mesh.glb",
     "cloud": "cloud.laz",
+    "cloud_ply": "cloud.ply",
 }
 _STRETCH = 0.005, 0.995
 _LONGEST_NAME = 60
@@ -45,10 +49,10 @@ def write_terrain(
     options: TerrainOptions = TerrainOptions(),  # noqa: B008  frozen
     *,
     progress: Progress | None = None,
-) -> None:
+) -> WrittenTerrain:
     """Write terrain into a folder, which must exist and be empty (docs/files.md).
 
-    Raises InputError where a package of the extra `terrain` is missing.
+    Returns what a report shows of it. Raises InputError where a package of the extra `terrain` is missing.
     """
     require_extra()
     site = traverse.site
@@ -58,12 +62,15 @@ def write_terrain(
         (None, "", terrain.drive, list(terrain.clouds.values()))
     ]
     sets += [(stop, names[stop], fused, [terrain.clouds[stop]]) for stop, fused in terrain.stops.items()]
-    products = []
+    products, surfaces = [], []
     for n, (stop, name, fused, clouds) in enumerate(sets):
         place = folder / name if name else folder
         place.mkdir(exist_ok=True)
         title = f"traverse {traverse.name}" if stop is None else f"stop {stop}"
-        products.append(_write_set(fused, clouds, place, name, stop, title, crs, site, options))
+        product, surface = _write_set(fused, clouds, place, name, stop, title, crs, site, options)
+        products.append(product)
+        if stop is None or len(terrain.stops) > 1:
+            surfaces.append(surface)
         if progress is not None:
             progress("writing terrain", n + 1, len(sets))
     whole = {
@@ -86,6 +93,7 @@ def write_terrain(
     }
     text = json.dumps(whole, indent=1, allow_nan=False, ensure_ascii=False)
     (folder / TERRAIN_INDEX).write_text(text + "\n", encoding="utf-8", newline="\n")
+    return WrittenTerrain(surfaces=tuple(surfaces), lines=tuple(terrain.says()), warnings=terrain.warnings)
 
 
 def _write_set(
@@ -98,8 +106,8 @@ def _write_set(
     crs: str,
     site: Site | None,
     options: TerrainOptions,
-) -> Json:
-    """Write the files of one surface; returns its entry in the index."""
+) -> tuple[Json, ShownSurface]:
+    """Write the files of one surface; returns its entry in the index, and what a report shows of it."""
     grey = _stretched(fused.grey)
     write_dem(fused, place / _FILES["dem"], crs, site)
     write_orthoimage(grey, fused.grid, place / _FILES["orthoimage"], crs, site)
@@ -107,11 +115,15 @@ def _write_set(
     _save(place / _FILES["slope"], slope_picture(fused, title))
     triangles = write_mesh(fused, grey, place / _FILES["mesh"], options.most_mesh_cells)
     points = write_cloud(clouds, place / _FILES["cloud"], crs, site)
+    if options.ply:
+        write_ply(clouds, place / _FILES["cloud_ply"], site)
+    written = {kind: file for kind, file in _FILES.items() if kind != "cloud_ply" or options.ply}
+    files = {kind: f"{name}/{file}" if name else file for kind, file in written.items()}
     seen = np.isfinite(fused.height_m)
     grid = fused.grid
-    return {
+    entry: Json = {
         "stop": stop,
-        "files": {kind: f"{name}/{file}" if name else file for kind, file in _FILES.items()},
+        "files": files,
         "bands": list(BANDS),
         "left_x_m": grid.left_m,
         "top_y_m": grid.top_m,
@@ -123,11 +135,12 @@ def _write_set(
         "triangles": triangles,
         "median_sigma_m": _number(float(np.median(fused.sigma_m[seen]))),
     }
+    return entry, shown_surface(fused, grey, title, files)
 
 
 def _folder_names(stops: Sequence[str]) -> dict[str, str]:
     """A folder for each stop: its id, or its number and what is left of an id that is no name of a file."""
-    taken = {*_FILES.values(), TERRAIN_INDEX}
+    taken = {*_FILES.values(), TERRAIN_INDEX, TERRAIN_PAGE}
     names = dict[str, str]()
     for n, stop in enumerate(stops):
         plain = re.sub(r"[^A-Za-z0-9_-]+", "-", stop).strip("-")[:_LONGEST_NAME]

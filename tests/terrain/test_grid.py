@@ -1,5 +1,7 @@
 """Grids: what one frame sees, fused with others, and how far frames differ."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -74,6 +76,16 @@ def test_frames_are_fused_by_their_variances_and_one_that_is_far_off_counts_litt
     three = fuse(GRID, [layer(0, 1.0, 0.01), layer(1, 1.004, 0.01), layer(2, 3.0, 0.01)])
     assert abs(three.height_m[4, 4] - 1.002) < 0.005  # the mean is 0.67 off
     assert three.sigma_m[4, 4] > 0.01  # and the frames say that something is wrong
+
+
+def test_telemetrys_surface_is_cut_to_where_the_refined_one_lies() -> None:
+    moved = replace(layer(0, 1.3, 0.01, first_row=0), first_column=8)
+    fused = fuse(GRID, [layer(0, 1.0, 0.01)], [moved])
+    assert fused.telemetry_m.shape == fused.height_m.shape == (15, 12)
+    np.testing.assert_allclose(fused.telemetry_m[:13, 5:], 1.3, rtol=1e-6)
+    assert np.isnan(fused.telemetry_m[13:]).all()
+    assert np.isnan(fused.telemetry_m[:, :5]).all()
+    assert np.isnan(fuse(GRID, [layer(0, 1.0, 0.01)]).telemetry_m).all()
 
 
 def test_cells_that_one_frame_sees_have_no_disagreement_and_others_are_empty() -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from pancam_graph import Solution
 from pancam_graph.base.errors import InputError
+from pancam_graph.base.geometry import FloatArray
 from pancam_graph.cli import main
 from pancam_graph.io import write_traverse
 from pancam_graph.results import check_out, read_drive, write_results
@@ -139,18 +140,32 @@ def test_the_mesh_lies_on_the_heights(results: Path, terrain: Terrain) -> None:
     assert (up > 0).all()  # triangles turn so that their outside is up
 
 
+def read_ply(path: Path) -> tuple[FloatArray, FloatArray]:
+    """Points (n, 3) and sigmas (n,) of a binary PLY file of whatever properties."""
+    head, _, body = path.read_bytes().partition(b"end_header\n")
+    words = {"double": "<f8", "float": "<f4", "uint": "<u4", "uchar": "u1"}
+    lines = [line.split() for line in head.decode("ascii").splitlines() if line.startswith("property")]
+    vertex = np.frombuffer(body, dtype=[(name, words[kind]) for _, kind, name in lines])
+    return np.stack([vertex[k] for k in "xyz"], axis=1), np.asarray(vertex["sigma_m"], dtype=float)
+
+
 def test_terrain_of_older_results_replaces_itself_and_nothing_else(
     results: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     results = Path(shutil.copytree(results, results.parent / "of older"))  # others look at the first ones
     before = (results / "solution.json").read_bytes()
-    assert main(["terrain", str(results), "--cell", "0.1", "--reach", "4"]) == 0
+    assert main(["terrain", str(results), "--cell", "0.1", "--reach", "4", "--ply"]) == 0
     said = capsys.readouterr().out
     assert "3 stereo frames of 1 stops, cells of 0.1 m" in said
     assert "surfaces of frames differ by" in said
     assert (results / "solution.json").read_bytes() == before
     index = json.loads((results / "terrain" / "terrain.json").read_text())
     assert index["cell_m"] == 0.1
+    assert "Heights along the line" in (results / "terrain" / "terrain.html").read_text()
+    xyz, sigma_m = read_ply(results / "terrain" / index["products"][0]["files"]["cloud_ply"])
+    assert len(xyz) == index["products"][0]["points"] > 10000
+    assert np.median(np.abs(xyz[:, 2])) < 0.005  # the plane
+    assert 0 < np.median(sigma_m) < 0.1
     check_out(results)  # a new refine may replace them all
     (results / "terrain" / "mine.txt").write_text("mine")
     with pytest.raises(InputError, match=r"found other things in it: terrain/mine\.txt"):
