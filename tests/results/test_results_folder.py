@@ -27,7 +27,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 @pytest.fixture(autouse=True)
 def small_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    def write_report(solution: Solution, path: Path, mosaics: None) -> None:
+    def write_report(solution: Solution, path: Path, mosaics: None, terrain: None) -> None:
         path.write_text(f"<html>{solution.model}</html>")
 
     monkeypatch.setattr(pancam_graph.report, "write_report", write_report, raising=False)
@@ -321,7 +321,7 @@ def test_an_older_folder_stays_whole_if_the_report_fails(
         write_results(io_samples.solution(), out)
     before = contents(tmp_path)
 
-    def fail(solution: Solution, path: Path, mosaics: None) -> None:
+    def fail(solution: Solution, path: Path, mosaics: None, terrain: None) -> None:
         path.write_text("half a rep")
         raise error
 
