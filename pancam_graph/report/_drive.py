@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from pancam_graph.base.ellipses import ellipse_outlines, translation_covariance_in_world
 from pancam_graph.base.geometry import FloatArray, pose_arrays
 from pancam_graph.base.whole_files import whole_file
 from pancam_graph.report._escaped import escape
 from pancam_graph.report._look import AFTER, BEFORE, REJECTED, axis, layout
-from pancam_graph.report._map import ellipse_outlines, translation_covariance_in_world
 from pancam_graph.report._numbers import Json, polyline, rounded
 from pancam_graph.report._packed import HEAD, UNPACKED, packed, packed_plotly
 from pancam_graph.report._style import STYLE

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from pancam_graph.base.ellipses import RADIUS_95, ellipse_outlines, translation_covariance_in_world
 from pancam_graph.base.geometry import FloatArray, pose_arrays
 from pancam_graph.data import Site, Solution
 from pancam_graph.report._escaped import escape
@@ -10,35 +11,11 @@ from pancam_graph.report._numbers import Json, decimals_for, polyline, round_fac
 from pancam_graph.report._scene import near_spacing
 from pancam_graph.report._shown_terrain import ShownTerrain
 
-__all__ = ["ellipse_outlines", "make_map", "place_labels", "translation_covariance_in_world"]
+__all__ = ["make_map", "place_labels"]
 
 _MAX_LANDMARKS = 4_000
-_ELLIPSE_STEPS = 48
 _WIDTH_PX = 480
 """Least width of the map's drawing area at laptop size, for the room that labels need."""
-_RADIUS_95 = float(np.sqrt(-2 * np.log(1 - 0.95)))
-"""Radius, in standard deviations, of the ellipse that holds 95 % of a plane normal distribution."""
-
-
-def translation_covariance_in_world(world_R_mast: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Covariances of positions in world axes (n, 3, 3) from those of poses in body axes (n, 6, 6).
-
-    A pose moves as `world_T_mast * Exp([w, v])`, rotation first: its position moves by
-    `world_R_mast v`, so the lower right block is turned by world_R_mast (n, 3, 3) from both sides.
-    """
-    return np.asarray(world_R_mast @ covariance[:, 3:, 3:] @ np.swapaxes(world_R_mast, 1, 2))
-
-
-def ellipse_outlines(covariance_m2: FloatArray, radius: float) -> FloatArray:
-    """Closed outlines (n, steps, 2) about zero of the ellipses of covariances (n, 2, 2).
-
-    `radius` is in standard deviations. Round-off below zero in an eigenvalue counts as zero.
-    """
-    angle = np.linspace(0, 2 * np.pi, _ELLIPSE_STEPS + 1)
-    circle = np.column_stack([np.cos(angle), np.sin(angle)])
-    value, vector = np.linalg.eigh(covariance_m2)
-    half_axes = vector * np.sqrt(np.maximum(value, 0.0))[:, None, :]
-    return np.asarray(radius * circle @ np.swapaxes(half_axes, 1, 2))
 
 
 def place_labels(at_m: FloatArray, sizes_m: list[FloatArray], *, clear_m: float) -> dict[int, FloatArray]:
@@ -127,7 +104,7 @@ def make_map(solution: Solution, terrain: ShownTerrain) -> Figure:
     covariance = translation_covariance_in_world(stops_R, solution.stop_covariance)[:, :2, :2]
     covariance = turn @ covariance @ turn.T
     uncertain = np.isfinite(covariance).all(axis=(1, 2)) & (np.trace(covariance, axis1=1, axis2=2) > 0)
-    outlines = ellipse_outlines(covariance[uncertain], _RADIUS_95)
+    outlines = ellipse_outlines(covariance[uncertain], RADIUS_95)
     largest_m = float(np.linalg.norm(outlines, axis=2).max()) if len(outlines) else 0.0
     room_m = min(0.05 * terrain.extent_m, 0.45 * near_spacing(stops_m))
     enlarged = round_factor(room_m / largest_m) if 0 < largest_m < 0.2 * room_m else 1.0

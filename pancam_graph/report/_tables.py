@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 
+from pancam_graph.base.ellipses import translation_covariance_in_world
 from pancam_graph.base.geometry import pose_arrays
 from pancam_graph.data import Solution
 from pancam_graph.report._escaped import escape
 from pancam_graph.report._images import ImageResiduals
-from pancam_graph.report._map import translation_covariance_in_world
 from pancam_graph.report._numbers import fixed
 
 __all__ = ["image_table", "observation_table", "stop_table", "table"]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from pancam_graph.results._camera_models import write_cameras as write_cameras
 from pancam_graph.results._colmap import write_colmap as write_colmap
+from pancam_graph.results._gis import write_gis as write_gis
 from pancam_graph.results._outputs import EXPORTS as EXPORTS
 from pancam_graph.results._outputs import check_exports as check_exports
 from pancam_graph.results._results import check_out as check_out

@@ -44,6 +44,12 @@ def _rig() -> OutputWriter:
     return RIG
 
 
+def _gis() -> OutputWriter:
+    from pancam_graph.results._gis import GIS
+
+    return GIS
+
+
 def _residuals() -> OutputWriter:
     from pancam_graph.results._residuals import RESIDUALS
 
@@ -101,6 +107,13 @@ OUTPUTS = (
         when="export",
         says="the refined rig with its covariance, for --use-rig of another run, and its cameras as text",
         writer=_rig,
+        older=EXPORT_FOLDER,
+    ),
+    Output(
+        name="gis",
+        when="export",
+        says="stops, ellipses, views and points for GIS programs: GeoPackage, with a site GeoJSON and KML",
+        writer=_gis,
         older=EXPORT_FOLDER,
     ),
     Output(name="residuals.npz", when="always", writer=_residuals),

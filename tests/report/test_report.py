@@ -10,12 +10,13 @@ import gtsam
 import numpy as np
 import pytest
 
+from pancam_graph.base.ellipses import ellipse_outlines, translation_covariance_in_world
 from pancam_graph.base.geometry import rz
 from pancam_graph.data import Solution
 from pancam_graph.report import write_report
 from pancam_graph.report._figures import histogram_edges, make_corrections, make_histogram
 from pancam_graph.report._images import choose_images, image_residuals, vector_panels
-from pancam_graph.report._map import ellipse_outlines, make_map, translation_covariance_in_world
+from pancam_graph.report._map import make_map
 from pancam_graph.report._page import headline, lead, make_page
 from pancam_graph.report._scene import eye_circles, make_masts, scene_figure
 from pancam_graph.report._shown_terrain import landmark_residuals, shown_terrain
