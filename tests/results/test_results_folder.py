@@ -297,9 +297,9 @@ def test_an_output_more_is_written_and_recognised(tmp_path: Path, monkeypatch: p
 
 
 def test_exports_are_what_the_registry_has() -> None:
-    assert list(EXPORTS) == ["colmap", "cahvor", "rig"]
+    assert list(EXPORTS) == ["colmap", "cahvor", "rig", "gis"]
     assert all(EXPORTS.values())
-    with pytest.raises(InputError, match="export: expected colmap or cahvor or rig, found 'ply'"):
+    with pytest.raises(InputError, match="export: expected colmap or cahvor or rig or gis, found 'ply'"):
         check_exports(io_samples.traverse(), ["colmap", "ply"])
 
 
