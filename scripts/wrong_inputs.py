@@ -1,8 +1,10 @@
 """Give drives with known truth one wrong input at a time, and print what solutions and verdicts make of it.
 
-For each fault a line: runs, how many failed their tests, how many let telemetry go; of those that passed the
-mean squared error over variance, the largest error in formal sigmas, and how many are silent failures (beyond
-6 sigma); and the tests that failed most often. The same options give the same numbers.
+For each fault a line of a Markdown table: runs that passed their tests, runs that let telemetry go; of those
+that passed the mean squared error over variance, the largest error in formal sigmas, and how many are silent
+failures (beyond 6 sigma); and the tests that failed most often. Groups are outliers, rigs that are off (held
+or estimated), telemetry, far terrain, stated noise, and unusual ways in. The same options give the same
+numbers.
 
 Exit status: 0 no silent failure, 1 some, 2 bad input.
 """
@@ -13,7 +15,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pancam_graph import Freedom, Sharing, Solution, SolveOptions, Traverse, simulate, solve
+from pancam_graph import Freedom, Observations, Sharing, Solution, SolveOptions, Traverse, simulate, solve
 from pancam_graph.base.errors import InputError, PancamGraphError
 from pancam_graph.base.geometry import FloatArray
 from pancam_graph.cli import Progress, ScriptParser, run
@@ -89,6 +91,54 @@ def _leg(sigmas: float) -> Fault:
             moved = type(pose)(pose.rotation(), pose.translation() + shift)
             stops[i] = replace(stops[i], world_T_mast=moved)
         return replace(s.traverse, stops=tuple(stops))
+
+    return fault
+
+
+def _adding_up(sigmas: float) -> Fault:
+    """Odometry of each leg is wrong by as much, in the same direction of the world."""
+
+    def fault(s: Simulation, rng: np.random.Generator) -> Traverse:
+        turn = rng.uniform(0, 2 * np.pi)
+        stops = []
+        for i, stop in enumerate(s.traverse.stops):
+            pose, size = stop.world_T_mast, i * sigmas * stop.sigma_translation_m
+            shift = size * np.array([np.cos(turn), np.sin(turn), 0.0])
+            moved = type(pose)(pose.rotation(), pose.translation() + shift)
+            stops.append(replace(stop, world_T_mast=moved))
+        return replace(s.traverse, stops=tuple(stops))
+
+    return fault
+
+
+def _far(range_m: float, n: int = 800) -> Fault:
+    """All that the stops see are n points at about this range, all around, of which each is seen by both."""
+
+    def fault(s: Simulation, rng: np.random.Generator) -> Traverse:
+        t, truth = s.traverse, s.truth
+        assert t.observations is not None  # simulated
+        azimuth, elevation = rng.uniform(-np.pi, np.pi, n), np.deg2rad(rng.uniform(-6, 8, n))
+        level = np.cos(elevation)
+        direction = np.column_stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+        ranges = range_m * np.exp(0.1 * rng.standard_normal(n))
+        points = truth.world_T_mast[0].translation() + ranges[:, None] * direction
+        R, centre = t.camera_poses(truth.world_T_mast, truth.pan_tilt_rad)
+        found = []
+        for i, eye in enumerate(t.image_eye):
+            camera = truth.rig.eyes[int(eye)].camera
+            ray = (points - centre[i]) @ R[i]
+            uv_px, valid = camera.project(ray)
+            seen = np.flatnonzero(valid & (ray[:, 2] > 0) & camera.contains(uv_px))
+            found.append((np.full(len(seen), i), seen, uv_px[seen]))
+        image, track, uv = (np.concatenate(part) for part in zip(*found, strict=True))
+        stop = t.image_stop[image]
+        shared = np.isin(track, track[stop == 0]) & np.isin(track, track[stop == 1])
+        noise_px = float(np.median(t.observations.sigma_px))
+        uv = uv[shared] + noise_px * rng.standard_normal((int(shared.sum()), 2))
+        sigma_px = np.full(len(uv), noise_px)
+        return t.with_observations(
+            Observations(image=image[shared], track=track[shared], uv_px=uv, sigma_px=sigma_px)
+        )
 
     return fault
 
@@ -291,66 +341,113 @@ _ROW = {"pans": 8}
 _DOWN = {"spacing_m": 0.5, "pans": 6, "tilts_rad": (-np.pi / 2,)}
 """Heads that look straight down, at stops so close that they see the same ground."""
 _MOUNTS = SolveOptions(sharing=Sharing(mounts=Freedom(scope="eye")))
-CASES: dict[str, Case] = {
-    "right": Case(),
-    "3 % outliers": Case(drive={"outliers": 0.03}),
-    "10 % outliers": Case(drive={"outliers": 0.1}),
-    **{f"{100 * share:.0f} % outliers": Case(drive={"outliers": share}) for share in (0.33, 0.4, 0.5, 0.6)},
-    **{f"sigmas stated {1 / f:g} times too small": Case(fault=_stated_noise(f)) for f in (0.1, 0.3)},
-    **{f"sigmas stated {f:g} times too large": Case(fault=_stated_noise(f)) for f in (3.0, 10.0)},
-    **{f"pan of a frame off by {d:g} degrees": Case(fault=_frame(pan=d)) for d in (0.5, 1.0, 3.0, 10.0)},
-    **{f"tilt of a frame off by {d:g} degrees": Case(fault=_frame(tilt=d)) for d in (0.5, 1.0, 3.0, 10.0)},
-    **{
-        f"pan off by {d:g} degrees, few links": Case(fault=_frame(pan=d), drive=_FEW_LINKS)
-        for d in (0.5, 3.0)
+_HELD = SolveOptions(rig="held")
+_ESTIMATED_NOISE = SolveOptions(rescale_noise=True)
+_SEVERAL = {"stops": 4}
+_FAR_APART = {"spacing_m": 2.0, "pans": 10, "tilts_rad": (0.0,)}
+GROUPS: dict[str, dict[str, Case]] = {
+    "outliers": {
+        "3 % outliers": Case(drive={"outliers": 0.03}),
+        "10 % outliers": Case(drive={"outliers": 0.1}),
+        **{
+            f"{100 * share:.0f} % outliers": Case(drive={"outliers": share})
+            for share in (0.33, 0.4, 0.5, 0.6)
+        },
+        "60 % outliers, one stop": Case(drive={"outliers": 0.6, "stops": 1}),
+        "60 % outliers, three views and more": Case(drive={"outliers": 0.6, "min_views": 3}),
+        "60 % outliers, noise estimated": Case(drive={"outliers": 0.6}, options=_ESTIMATED_NOISE),
+        "40 % outliers, stop by stop": Case(drive={"outliers": 0.4}, incremental=True),
+        "60 % outliers, stop by stop": Case(drive={"outliers": 0.6}, incremental=True),
     },
-    **{
-        f"tilt off by {d:g} degrees, few links": Case(fault=_frame(tilt=d), drive=_FEW_LINKS)
-        for d in (0.5, 3.0)
+    "rigs": {
+        "right": Case(),
+        "right, held": Case(options=_HELD),
+        **{
+            f"{name}{', held' * held}": Case(drive=drive, options=_HELD if held else SolveOptions())
+            for name, drive in (
+                ("focal length off by 0.2 %", {"focal_error": 2e-3}),
+                ("mounts off by 0.5 mrad", {"mount_error_rad": 5e-4}),
+            )
+            for held in (False, True)
+        },
+        "mounts 5 % farther apart": Case(fault=_apart_mounts(1.05), drive=_ROW),
+        "mounts 5 % farther apart, odometry of 1 %": Case(
+            fault=_apart_mounts(1.05), drive=_ROW | {"sigma_stop_m": 0.04}
+        ),
+        "the same, four stops": Case(
+            fault=_apart_mounts(1.05), drive=_ROW | _SEVERAL | {"sigma_stop_m": 0.04}
+        ),
+        "mounts twice as far apart": Case(fault=_apart_mounts(2.0), drive=_ROW),
+        "images mirrored": Case(fault=_mirrored, drive=_ROW),
     },
-    "pans of a stop off by 1 degree, told 0.077": Case(
-        fault=_stop_pans(1.0, 0.077), drive={"sigma_stop_rad": 1e-3}
-    ),
-    "the same, headings known to 0.6 degrees only": Case(fault=_stop_pans(1.0, 0.077)),
-    "a leg off by 5 sigma": Case(fault=_leg(5.0), drive={"stops": 4}),
-    "an image shifted by 2 px": Case(fault=_shifted_image(2.0, both_eyes=False)),
-    "an image shifted by 20 px": Case(fault=_shifted_image(20.0, both_eyes=False)),
-    "a frame shifted by 20 px": Case(fault=_shifted_image(20.0, both_eyes=True)),
-    "a tenth of the tracks on a rock 0.1 m away": Case(fault=_neighbouring_rock(0.1, 0.1)),
-    "focal length off by 0.2 %": Case(drive={"focal_error": 2e-3}),
-    "mounts off by 0.5 mrad": Case(drive={"mount_error_rad": 5e-4}),
-    "pans of the other sense": Case(fault=_pans(np.negative), drive=_ROW),
-    "each frame with its neighbour's pan": Case(fault=_pans(lambda pan: np.roll(pan, 1)), drive=_ROW),
-    "the same, one stop": Case(fault=_pans(lambda pan: np.roll(pan, 1)), drive=_ROW | {"stops": 1}),
-    "images mirrored": Case(fault=_mirrored, drive=_ROW),
-    "mounts 5 % farther apart": Case(fault=_apart_mounts(1.05), drive=_ROW),
-    "mounts 5 % farther apart, odometry of 1 %": Case(
-        fault=_apart_mounts(1.05), drive=_ROW | {"sigma_stop_m": 0.04}
-    ),
-    "mounts twice as far apart": Case(fault=_apart_mounts(2.0), drive=_ROW),
-    "all sigmas stated as 1e-6 px": Case(fault=_tiny_sigmas(1.0)),
-    "half of the sigmas stated as 1e-6 px": Case(fault=_tiny_sigmas(0.5)),
-    "half of the observations a million times better": Case(fault=_apart),
-    "error ellipses of 1e4 to 1": Case(drive={"noise_stretch": 1e4}),
-    "a start with pans in 0 to 2 pi": Case(other_turns=True),
-    **{
-        f"model {model} at tilt -90 degrees": Case(drive=_DOWN, options=SolveOptions(model=model))
-        for model in ("circle", "free")
+    "telemetry": {
+        **{f"pan of a frame off by {d:g} degrees": Case(fault=_frame(pan=d)) for d in (0.5, 1.0, 3.0, 10.0)},
+        **{
+            f"tilt of a frame off by {d:g} degrees": Case(fault=_frame(tilt=d)) for d in (0.5, 1.0, 3.0, 10.0)
+        },
+        **{
+            f"pan off by {d:g} degrees, few links": Case(fault=_frame(pan=d), drive=_FEW_LINKS)
+            for d in (0.5, 3.0)
+        },
+        **{
+            f"tilt off by {d:g} degrees, few links": Case(fault=_frame(tilt=d), drive=_FEW_LINKS)
+            for d in (0.5, 3.0)
+        },
+        "pans of a stop off by 1 degree, told 0.077": Case(
+            fault=_stop_pans(1.0, 0.077), drive={"sigma_stop_rad": 1e-3}
+        ),
+        "the same, headings known to 0.6 degrees only": Case(fault=_stop_pans(1.0, 0.077)),
+        "a leg off by 5 sigma": Case(fault=_leg(5.0), drive=_SEVERAL),
+        **{
+            f"each of 5 legs off by {k:g} sigma, the same way": Case(fault=_adding_up(k), drive={"stops": 6})
+            for k in (0.5, 1.0)
+        },
+        "legs' errors add up, 6 stops": Case(drive={"stops": 6, "odometry": True}),
+        "an image shifted by 2 px": Case(fault=_shifted_image(2.0, both_eyes=False)),
+        "an image shifted by 20 px": Case(fault=_shifted_image(20.0, both_eyes=False)),
+        "a frame shifted by 20 px": Case(fault=_shifted_image(20.0, both_eyes=True)),
+        "a tenth of the tracks on a rock 0.1 m away": Case(fault=_neighbouring_rock(0.1, 0.1)),
+        "pans of the other sense": Case(fault=_pans(np.negative), drive=_ROW),
+        "each frame with its neighbour's pan": Case(fault=_pans(lambda pan: np.roll(pan, 1)), drive=_ROW),
+        "the same, one stop": Case(fault=_pans(lambda pan: np.roll(pan, 1)), drive=_ROW | {"stops": 1}),
     },
-    "stops shuffled, stop by stop": Case(fault=_shuffled, drive={"stops": 4}, incremental=True),
-    "a stop without observations": Case(fault=_unseen_stop, drive={"stops": 3}),
-    "a stop without observations, stop by stop": Case(
-        fault=_unseen_stop, drive={"stops": 3}, incremental=True
-    ),
-    "a stop without frames": Case(fault=_no_frames),
-    "a stop without frames, stop by stop": Case(fault=_no_frames, incremental=True),
-    "all stops at sigma 1.5 m": Case(fault=_none_held(1.5)),
-    "all stops at sigma 1.5 m, stop by stop": Case(fault=_none_held(1.5), incremental=True),
-    "all stops at sigma 1000 m": Case(fault=_none_held(1000.0)),
-    "mounts free, first stop of one eye": Case(fault=_one_eye_first, drive={"stops": 3}, options=_MOUNTS),
-    "mounts free, first stop of one eye, stop by stop": Case(
-        fault=_one_eye_first, drive={"stops": 3}, options=_MOUNTS, incremental=True
-    ),
+    "far terrain": {
+        **{
+            f"all at {d:g} m, stops 2 m apart": Case(fault=_far(d), drive=_FAR_APART)
+            for d in (300.0, 1000.0, 3000.0, 10000.0)
+        },
+        "3,000 points at 1000 m": Case(fault=_far(1000.0, 3000), drive=_FAR_APART),
+        "all at 1000 m, odometry of 1 m": Case(fault=_far(1000.0), drive=_FAR_APART | {"sigma_stop_m": 1.0}),
+    },
+    "stated noise": {
+        **{f"sigmas stated {1 / f:.3g} times too small": Case(fault=_stated_noise(f)) for f in (0.1, 0.3)},
+        **{f"sigmas stated {f:g} times too large": Case(fault=_stated_noise(f)) for f in (3.0, 10.0)},
+        "all sigmas stated as 1e-6 px": Case(fault=_tiny_sigmas(1.0)),
+        "half of the sigmas stated as 1e-6 px": Case(fault=_tiny_sigmas(0.5)),
+        "half of the observations a million times better": Case(fault=_apart),
+        "error ellipses of 1e4 to 1": Case(drive={"noise_stretch": 1e4}),
+    },
+    "ways in": {
+        "a start with pans in 0 to 2 pi": Case(other_turns=True),
+        **{
+            f"model {model} at tilt -90 degrees": Case(drive=_DOWN, options=SolveOptions(model=model))
+            for model in ("circle", "free")
+        },
+        "stops shuffled, stop by stop": Case(fault=_shuffled, drive=_SEVERAL, incremental=True),
+        "a stop without observations": Case(fault=_unseen_stop, drive={"stops": 3}),
+        "a stop without observations, stop by stop": Case(
+            fault=_unseen_stop, drive={"stops": 3}, incremental=True
+        ),
+        "a stop without frames": Case(fault=_no_frames),
+        "a stop without frames, stop by stop": Case(fault=_no_frames, incremental=True),
+        "all stops at sigma 1.5 m": Case(fault=_none_held(1.5)),
+        "all stops at sigma 1.5 m, stop by stop": Case(fault=_none_held(1.5), incremental=True),
+        "all stops at sigma 1000 m": Case(fault=_none_held(1000.0)),
+        "mounts free, first stop of one eye": Case(fault=_one_eye_first, drive={"stops": 3}, options=_MOUNTS),
+        "mounts free, first stop of one eye, stop by stop": Case(
+            fault=_one_eye_first, drive={"stops": 3}, options=_MOUNTS, incremental=True
+        ),
+    },
 }
 
 
@@ -416,6 +513,7 @@ def main() -> int:
     add("--seeds", type=int, default=20, help="runs of each case and rig (%(default)s)")
     add("--first-seed", type=int, default=1000, help="(%(default)s)")
     add("--rigs", nargs="+", default=["mer-navcam", "exomars-pancam"], metavar="RIG")
+    add("--groups", nargs="+", choices=tuple(GROUPS), default=list(GROUPS), metavar="GROUP")
     add("--only", nargs="+", metavar="TEXT", help="cases whose names contain one of these")
     add("--incremental", action="store_true", help="stop by stop")
     a = parser.parse_args()
@@ -423,9 +521,10 @@ def main() -> int:
         raise InputError(f"--seeds: expected 1 or more, found {a.seeds}")
     silent = 0
     progress = Progress()
-    chosen = {n: c for n, c in CASES.items() if not a.only or any(text in n for text in a.only)}
-    heads = ("runs", 5), ("failed", 7), ("let go", 7), ("square", 7), ("worst", 6), ("silent", 7)
-    print(f"{'case':<45} {' '.join(f'{h:>{n}}' for h, n in heads)}  tests that failed")
+    cases = {name: case for group in a.groups for name, case in GROUPS[group].items()}
+    chosen = {n: c for n, c in cases.items() if not a.only or any(text in n for text in a.only)}
+    print("| input | passed | let go | squared error over variance | largest (sigmas) | silent | failed |")
+    print("| --- | ---: | ---: | ---: | ---: | ---: | --- |")
     for name, case in chosen.items():
         with progress.shown(name):
             outcomes = [
@@ -436,13 +535,13 @@ def main() -> int:
         passed = [o.errors for o in outcomes if o.passed]
         n_silent = sum(not np.max(errors) <= _SILENT for errors in passed)
         silent += n_silent
-        often = Counter(test for o in outcomes for test in o.failed).most_common(3)
-        said = ", ".join(f"{test} {n}" for test, n in often)
+        often = Counter(test for o in outcomes for test in o.failed).most_common(4)
+        said = ", ".join(f"`{test}` {n}" for test, n in often)
         every = np.concatenate([np.zeros(0), *passed])
         square, worst = (f"{np.mean(every**2):.2f}", f"{every.max():.1f}") if passed else ("-", "-")
-        counts = f"{len(outcomes):>5} {len(outcomes) - len(passed):>7} {sum(o.let_go for o in outcomes):>7}"
-        counts += f" {square:>7} {worst:>6} {n_silent:>7}"
-        print(f"{name:<45} {counts}  {said}", flush=True)
+        let_go = sum(o.let_go for o in outcomes)
+        of = f"{len(passed)} of {len(outcomes)}"
+        print(f"| {name} | {of} | {let_go} | {square} | {worst} | {n_silent} | {said} |", flush=True)
     return 1 if silent else 0
 
 

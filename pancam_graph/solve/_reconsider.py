@@ -12,6 +12,7 @@ from pancam_graph.elimination import Root
 from pancam_graph.graph import LetGo
 from pancam_graph.solve._constraint_tests import ConstraintTest
 from pancam_graph.solve._fit import Fitted, fit
+from pancam_graph.solve._growing_errors import GrowingErrors
 from pancam_graph.solve._judge import Judged, judge
 from pancam_graph.solve._let_go import letting_go, most_let_go, parts_let_go
 from pancam_graph.solve._screen import screened_again
@@ -21,6 +22,8 @@ __all__ = ["reconsidered"]
 
 _TESTS = {"pointing", "stops", "constraints"}
 """Tests of the verdict that single errors of telemetry, or of constraints, fail."""
+_PLACES = ("x", "y", "z")
+"""Entries of a stop's telemetry that are lengths."""
 _MOST_CONSTRAINTS = 1 / 3
 """Largest share of the constraints that may be let go; one may in any case."""
 _AS_LIKELY = 15.0
@@ -41,8 +44,8 @@ def reconsidered(judged: Judged) -> Judged:
     of a stop's heading and one of all its pans look alike. What is left is then judged and solved again. A
     constraint that is further off than any telemetry is let go alone; where another error explains the
     corrections as well, nothing is.
-    Where more than a few parts of telemetry would have to go, or where another rig would explain more, none
-    is: the verdict says why.
+    Where more than a few parts of telemetry would have to go, or where another rig, another scale of all
+    lengths or a drift would explain more, none is: the verdict says why.
     """
     now, traverse = judged, judged.fitted.screened.prepared.traverse
     most, n_constraints = most_let_go(traverse), len(traverse.constraints)
@@ -59,7 +62,7 @@ def reconsidered(judged: Judged) -> Judged:
                 return judged
         else:
             errors = _largest(suspected)
-            if _is_of_rig(errors[0], now):
+            if _is_of_rig(errors[0], now) or _grows(errors[0], suspected.growing):
                 return judged
             let_go = problem.template.let_go + letting_go(traverse, errors)
             if len(parts_let_go(traverse, let_go, now.state)) > most:
@@ -105,6 +108,12 @@ def _is_of_rig(error: Correction, judged: Judged) -> bool:
     is_single = error.frame is not None
     share = _OF_FRAME / len(judged.fitted.screened.prepared.traverse.frames) if is_single else 1.0
     return any(0.5 * error.sigmas**2 < share * gain for gain in gains)
+
+
+def _grows(error: Correction, growing: GrowingErrors | None) -> bool:
+    """Whether an error that grows along the drive explains more than one of a stop's place, or of a leg."""
+    is_place = error.entry in _PLACES or error.entry.startswith("leg")
+    return growing is not None and is_place and error.sigmas**2 < growing.square
 
 
 def _fitted_again(fitted: Fitted, let_go: LetGo) -> Fitted:

@@ -18,6 +18,7 @@ from pancam_graph.base.geometry import FloatArray, IntArray, pose_arrays
 from pancam_graph.elimination import Covariance, Root
 from pancam_graph.graph import FactorTemplate, Kind, index_of, kind_of
 from pancam_graph.solve._covariance import Uncertainty
+from pancam_graph.solve._growing_errors import GrowingErrors, growing_errors
 from pancam_graph.solve._problem import Problem
 
 __all__ = [
@@ -182,6 +183,8 @@ class Suspected:
     """Of pans and tilts, single and common to a stop."""
     stops: Errors
     """Of stops, and of legs."""
+    growing: GrowingErrors | None
+    """Of all lengths; None where telemetry holds the places of all stops."""
     root: Root
     """Square root of the system that the covariances are of."""
 
@@ -194,7 +197,8 @@ class Suspected:
         least = _HARDLY_SHOWN if is_far else _BLIND
         angles, stops = entry_errors(telemetry, least)
         stops += leg_errors(problem, telemetry, root, least)
-        return Suspected(telemetry=telemetry, angles=angles, stops=stops, root=root)
+        growing = growing_errors(problem, root, least)
+        return Suspected(telemetry=telemetry, angles=angles, stops=stops, growing=growing, root=root)
 
 
 def telemetry_of(problem: Problem, covariance: Covariance) -> list[StopTelemetry]:

@@ -6,6 +6,7 @@ drives; others say how far the numbers may be off before a user should not rely 
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -16,9 +17,11 @@ from pancam_graph.data import Refined, Traverse, Verdict, VerdictTest
 from pancam_graph.graph import HardTemplate
 from pancam_graph.solve._behind import points_behind
 from pancam_graph.solve._chances import CHANCE, rms_limit, two_sided_limit
+from pancam_graph.solve._common_pan import common_pans
 from pancam_graph.solve._constraint_tests import ConstraintTest, constraint_verdict
 from pancam_graph.solve._covariance import Uncertainty
 from pancam_graph.solve._fit import Fitted
+from pancam_graph.solve._growing_errors import GrowingErrors
 from pancam_graph.solve._held_sureness import held_rig
 from pancam_graph.solve._let_go import Part, most_let_go, sentence
 from pancam_graph.solve._noise_tests import Residuals
@@ -53,6 +56,8 @@ _HELD_SHARE = 0.02
 Gains of large problems are raised from a part."""
 
 
+_SCALE_CHANCE = 1e-3
+"""Chance that lengths of a right drive fail: one number, which everything in the drive hangs on."""
 _UNCONFIRMED = 2.0
 """Expected growth of a sigma, over the odds that a held rig is exact and that it is off as it says."""
 
@@ -79,6 +84,14 @@ class Optimum:
     def traverse(self) -> Traverse:
         """The input."""
         return self.fitted.screened.prepared.traverse
+
+    @cached_property
+    def suspected(self) -> Suspected | None:
+        """Errors that telemetry may have; None where covariances are unknown."""
+        u = self.uncertainty
+        if u.variables is None or u.masts is None:
+            return None
+        return Suspected.of(self.problem, u, is_far=self.fitted.expected is not None)
 
 
 def verdict(at: Optimum) -> Verdict:
@@ -246,6 +259,7 @@ def _sigmas(at: Optimum) -> VerdictTest:
                 f"; least known is the position of {t.stops[worst].id}: {1e3 * values[worst, -1] ** 0.5:.3g} "
                 f"mm along ({x:.2f}, {y:.2f}, {z:.2f}) of its mast"
             )
+        good += _if_independent(at)
     return VerdictTest.of(
         "sigmas",
         float(unknown),
@@ -256,12 +270,42 @@ def _sigmas(at: Optimum) -> VerdictTest:
     )
 
 
+def _if_independent(at: Optimum) -> str:
+    """Which sigma hangs most on telemetry's word that pans err independently, and by how much."""
+    some = [] if at.suspected is None else list(common_pans(at.suspected.telemetry))
+    if not some:
+        return ""
+    worst = max(some, key=lambda one: one.sigmas)
+    sigma, pan, pan_sigma, heading, heading_sigma, cameras, cameras_sigma = (
+        f"{abs(np.degrees(angle)):.3f}"
+        for angle in (
+            worst.sigma_rad,
+            worst.pan_rad,
+            worst.pan_sigma_rad,
+            worst.heading_rad,
+            worst.heading_sigma_rad,
+            worst.pointing_rad,
+            worst.pointing_sigma_rad,
+        )
+    )
+    says = (
+        f"; pans count as independent: an error of {sigma} degrees that all pans at "
+        f"{at.traverse.stops[worst.stop].id} share would go unseen, and turn pans by {pan} degrees (stated "
+        f"sigma {pan_sigma})"
+    )
+    if worst.heading_sigma_rad > 0:
+        says += (
+            f", heading by {heading} the other way ({heading_sigma}), and cameras, by both, by {cameras} "
+            f"({cameras_sigma})"
+        )
+    return says
+
+
 def _telemetry(at: Optimum) -> Iterator[VerdictTest]:
     """Corrections over their sigmas: all together, of angles, and of stops."""
-    u = at.uncertainty
-    if u.variables is None or u.masts is None:
+    suspected = at.suspected
+    if suspected is None:
         return
-    suspected = Suspected.of(at.problem, u, is_far=at.fitted.expected is not None)
     rms, freedom = total(suspected.telemetry)
     if freedom > 0:
         says = f"corrections of telemetry are {rms:.3g} times what its sigmas and the images allow (RMS)"
@@ -287,6 +331,42 @@ def _telemetry(at: Optimum) -> Iterator[VerdictTest]:
                 f"largest correction: {says}",
                 f"{says}: this telemetry, or what the images say of it, is wrong; {widen}, or check the rig",
             )
+    if suspected.growing is not None:
+        yield from _growing(suspected.growing)
+
+
+def _growing(found: GrowingErrors) -> Iterator[VerdictTest]:
+    """Errors of telemetry that grow along the drive: one scale of all lengths, and drifts."""
+    if found.scale is not None:
+        share, sigmas = found.scale
+        says = (
+            f"lengths between stops came out {abs(share):.2%} {'longer' if share > 0 else 'shorter'} than "
+            f"telemetry has them, {sigmas:.3g} times what sigmas allow"
+        )
+        yield VerdictTest.of(
+            "scale",
+            sigmas,
+            two_sided_limit(1, _SCALE_CHANCE),
+            says,
+            f"{says}: the distance of the eyes (baseline) or odometry is wrong, and images cannot say which; "
+            "check both, or state larger sigmas (rig: uncertainty, mount_m; sigma_translation_m)",
+        )
+    if found.drift is not None:
+        per_m, square, freedom = found.drift
+        value = float(np.sqrt(square / freedom))
+        says = (
+            f"stops drift from telemetry by {1e3 * np.linalg.norm(per_m):.3g} mm a metre driven, "
+            f"{value:.3g} times what sigmas allow (RMS)"
+        )
+        yield VerdictTest.of(
+            "drift",
+            value,
+            float(rms_limit(freedom, CHANCE)),
+            says,
+            f"{says}: errors of odometry add up, while its sigmas count them as independent; let "
+            "sigma_translation_m grow along the drive, state each leg with its own sigma (constraints: "
+            "stop-pose), or check the rig",
+        )
 
 
 def _let_go(at: Optimum) -> VerdictTest:

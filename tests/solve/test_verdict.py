@@ -13,6 +13,7 @@ from pancam_graph.rigs import TEMPLATES, RigUncertainty
 from pancam_graph.simulate import Simulation
 from pancam_graph.smoother._incremental import solve_incrementally
 from pancam_graph.solve import _rig_told, judge
+from pancam_graph.solve._growing_errors import growing_errors
 from pancam_graph.solve._held_sureness import held_rig
 from pancam_graph.solve._problem import Problem
 from pancam_graph.solve._rig_score import HeldEntry, held_entries
@@ -72,8 +73,9 @@ def test_a_wrong_baseline_is_not_odometry_that_is_wrong(rig: str) -> None:
         for e in t.rig.eyes
     ]
     solution = solve(replace(t, rig=replace(t.rig, eyes=tuple(eyes))))
-    assert "let go" in failed(solution)
-    assert "baseline" in named(solution)["let go"].says
+    assert "scale" in failed(solution)
+    assert "baseline" in named(solution)["scale"].says
+    assert not named(solution)["let go"].value
 
 
 @pytest.mark.slow
@@ -180,8 +182,9 @@ def test_iterations_that_end_early_are_no_success() -> None:
 
 @pytest.mark.slow
 def test_corrections_over_their_sigmas_are_standard_normal() -> None:
-    """Over seeds: variance 1 of single and of common corrections and of legs, and of all in sum."""
+    """Over seeds: variance 1 of single and common corrections, of legs, what grows along them, and of all."""
     single, common, legs, sums = list[float](), list[float](), list[float](), list[float]()
+    growing = list[float]()
     for seed in range(100, 140):
         fit = fitted(drive(seed, stops=3, pans=5).traverse, SolveOptions(rig="held"))
         uncertainty = judge(fit).uncertainty
@@ -192,9 +195,14 @@ def test_corrections_over_their_sigmas_are_standard_normal() -> None:
             for one in errors:
                 (common if one.is_common else single).append(one.sigmas)
         legs += leg_errors(fit.problem, telemetry, uncertainty.masts.root).sigmas.tolist()
+        found = growing_errors(fit.problem, uncertainty.masts.root, 1e-6)
+        assert found is not None
+        assert found.scale is not None
+        assert found.drift is not None
+        growing += [found.scale[1], *np.repeat(np.sqrt(found.drift[1] / found.drift[2]), found.drift[2])]
         rms, freedom = total(telemetry)
         sums.append((rms**2 - 1) * np.sqrt(freedom / 2))
-    for sizes, slack in ((single, 0.08), (common, 0.3), (legs, 0.3)):
+    for sizes, slack in ((single, 0.08), (common, 0.3), (legs, 0.3), (growing, 0.4)):
         assert np.mean(np.square(sizes)) == pytest.approx(1.0, abs=slack)
     assert np.mean(sums) == pytest.approx(0.0, abs=0.5)
     assert np.std(sums) == pytest.approx(1.0, abs=0.35)
