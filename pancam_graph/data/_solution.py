@@ -8,7 +8,8 @@ import numpy as np
 
 from pancam_graph.base.choices import expected_one_of
 from pancam_graph.base.errors import InputError
-from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, corrected_poses
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, corrected_poses, wrap_angle
+from pancam_graph.base.text import shortened
 from pancam_graph.cameras import CALIBRATION_ENTRIES, Camera, projection_matrix, with_added_field
 from pancam_graph.data._cross_validation import CrossValidation
 from pancam_graph.data._rig_treatment import RigTreatment
@@ -234,6 +235,27 @@ class Solution:
     warnings: tuple[str, ...] = ()
     seconds: Seconds = field(default_factory=Seconds)
 
+    def __repr__(self) -> str:
+        """What was adjusted and what became of it, in five lines."""
+        t, used = self.traverse, int(self.used.sum())
+        outcome = "converged" if self.converged else f"not converged ({self.stop_reason})"
+        if self.verdict is not None:
+            failed = ", ".join(test.name for test in self.verdict.failures)
+            outcome += f"; its tests {'failed: ' + failed if failed else 'passed'}"
+        moved, sigma = (
+            _medians_mrad(np.abs(wrap_angle(self.correction_rad))),
+            _medians_mrad(self.angle_sigma_rad),
+        )
+        return (
+            f"Solution of {t.name!r}: {outcome}\n"
+            f"  {len(t.stops)} stops, {len(t.frames)} frames, {len(t.images)} images, "
+            f"{len(self.landmark_track)} landmarks; model {self.model}, {self.iterations} iterations\n"
+            f"  RMS {self.rms_initial_px:.3g} -> {self.rms_final_px:.3g} px over {used} of {len(self.used)} "
+            "observations\n"
+            f"  pan and tilt moved by {moved} mrad, formal sigma {sigma} mrad (medians)\n"
+            f"  {len(self.warnings)} warnings{': ' + shortened(self.warnings[0]) if self.warnings else ''}"
+        )
+
     @property
     def passed(self) -> bool:
         """Whether the iterations converged, and no test of the verdict failed."""
@@ -362,6 +384,12 @@ class Solution:
     def with_cross_validation(self, cross_validation: CrossValidation) -> "Solution":
         """The same solution with its cross-validation."""
         return replace(self, cross_validation=cross_validation)
+
+
+def _medians_mrad(angles_rad: FloatArray) -> str:
+    """Medians of pan and tilt (frames, 2) in words; those that are not finite do not count."""
+    columns = ([v for v in column if np.isfinite(v)] for column in angles_rad.T)
+    return " and ".join(f"{1e3 * np.median(column):.3g}" if column else "unknown" for column in columns)
 
 
 def _common(corrections: FloatArray) -> FloatArray:

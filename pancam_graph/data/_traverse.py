@@ -273,6 +273,17 @@ class Traverse:
     _of_which_one: ClassVar[tuple[str, ...]] = ("stops", "frames", "images")
     """Kinds of entries of which there must be one at least."""
 
+    def __repr__(self) -> str:
+        """Its name, its rig, and how much of what it has."""
+        seen = "no observations yet"
+        if self.observations is not None:
+            tracks = len(np.unique(self.observations.track))
+            seen = f"{len(self.observations)} observations of {tracks} tracks"
+        return (
+            f"Traverse {self.name!r}: {len(self.stops)} stops, {len(self.frames)} frames and "
+            f"{len(self.images)} images of the rig {self.rig.name!r}, {seen}"
+        )
+
     def __post_init__(self) -> None:
         """Check ids, references and ranges."""
         for kind, entries in (("stops", self.stops), ("frames", self.frames), ("images", self.images)):

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from pancam_graph.base.errors import InputError
+from pancam_graph.base.options import options_of
 from pancam_graph.data import Matching, Observations, PairMatching, StopMatching, Traverse
 from pancam_graph.images._cache import Cache
 from pancam_graph.images._front_end_options import FrontEndOptions
@@ -55,6 +56,7 @@ def find_observations(
     Raises InputError if no image has a file or nothing is found, ImageError naming the file if none can be
     used, and for a mask that cannot.
     """
+    options = options_of(FrontEndOptions, options, "find_observations")
     work = Steps(traverse, options, progress, Cache(cache))
     warnings = [*work.pictures.warnings, *work.over_exposed()]
     parts: list[Links] = []
@@ -129,6 +131,7 @@ def find_masks(
     is what stands still relative to the mast between stops, in images in which an eye looks the same way at
     both. Raises as `find_observations` does.
     """
+    options = options_of(FrontEndOptions, options, "find_masks")
     return tuple(Steps(traverse, options, progress, Cache(cache)).masks)
 
 

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import BoolArray, FloatArray
+from pancam_graph.base.options import options_of
 from pancam_graph.data import Solution
 from pancam_graph.images import Evening
 from pancam_graph.io import same_pictures
@@ -113,6 +114,7 @@ def make_mosaics(
 
     Raises InputError for a stop or a camera that is not in the traverse, and where no image can be shown.
     """
+    options = options_of(MosaicOptions, options, "make_mosaics")
     traverse = solution.traverse
     stops = {s.id: row for row, s in enumerate(traverse.stops)}
     if stop not in stops:

@@ -11,6 +11,7 @@ import numpy as np
 
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, compose, pose_arrays
+from pancam_graph.base.options import options_of
 from pancam_graph.cameras import Camera, Fields
 from pancam_graph.data import Observations, Traverse
 from pancam_graph.rigs import Rig
@@ -66,7 +67,7 @@ def simulate(rig: Rig, options: SimulationOptions | None = None, *, seed: int = 
     Occlusion is not simulated, except for the image that finds a point. Raises InputError for a negative
     seed, and where no point is seen by `options.min_views` images (all rows of the panorama in the sky).
     """
-    options = options if options is not None else SimulationOptions()
+    options = options_of(SimulationOptions, options, "simulate")
     if seed < 0:
         raise InputError(f"simulation: seed: expected 0 or more, found {seed}")
     streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(11)]

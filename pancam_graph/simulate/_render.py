@@ -7,6 +7,7 @@ import numpy as np
 
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.base.options import options_of
 from pancam_graph.base.threads import in_parallel
 from pancam_graph.data import Traverse
 from pancam_graph.rigs import Rig
@@ -276,7 +277,7 @@ def render(rig: Rig, options: RenderOptions | None = None, *, seed: int = 0) -> 
     independently of each other. Every pixel is traced along the ray of the camera's own model, and all that
     is seen lies on the surface that `Rendering.points` returns. Raises InputError for a negative seed.
     """
-    options = options if options is not None else RenderOptions()
+    options = options_of(RenderOptions, options, "render")
     if seed < 0:
         raise InputError(f"simulation: seed: expected 0 or more, found {seed}")
     streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(5)]

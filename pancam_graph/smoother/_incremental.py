@@ -9,6 +9,7 @@ import numpy as np
 
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import IntArray
+from pancam_graph.base.options import options_of
 from pancam_graph.base.threads import blas_on_one_thread
 from pancam_graph.data import (
     FIXED,
@@ -76,7 +77,7 @@ def solve_incrementally(
     Raises InputError for options that the smoother lacks: another model than the rigid mast, explicit
     landmarks, and alternation. Of the robust loss only "none" counts, which turns the test for outliers off.
     """
-    options = options or SolveOptions()
+    options = options_of(SolveOptions, options, "solve_incrementally")
     for name, chosen, expected in (
         ("model", options.model, "mast"),
         ("tie", options.firm_tie, "hard"),

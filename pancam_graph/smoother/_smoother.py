@@ -8,6 +8,7 @@ import numpy as np
 
 from pancam_graph.base.errors import InputError, SolveError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.base.options import options_of
 from pancam_graph.base.threads import blas_on_one_thread
 from pancam_graph.data import DrivePart, Frame, Image, Observations, Stop, Traverse
 from pancam_graph.graph import GraphKeys, HardTemplate, UserFactors, read_variable
@@ -41,7 +42,7 @@ class TraverseSmoother:
 
     def __init__(self, rig: Rig, options: SmootherOptions | None = None) -> None:
         """Begin an empty drive of a rover with this rig."""
-        self.rig, self.options = rig, options or SmootherOptions()
+        self.rig, self.options = rig, options_of(SmootherOptions, options, "TraverseSmoother")
         self._sharing = self.options.sharing_of(rig)
         self._drive = DriveMap(rig, self._sharing, self.options.outlier_sigma)
         self._engine = Engine(self._drive, self.options)

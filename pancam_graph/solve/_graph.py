@@ -6,6 +6,7 @@ import gtsam
 
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import BoolArray
+from pancam_graph.base.options import options_of
 from pancam_graph.data import Traverse
 from pancam_graph.graph import (
     ExplicitLandmarks,
@@ -30,7 +31,7 @@ def graph_keys(traverse: Traverse, options: SolveOptions | None = None) -> Graph
     The options determine the free entries of the rig, or else the traverse. Raises InputError as
     `solve` does for these.
     """
-    options = options or SolveOptions()
+    options = options_of(SolveOptions, options, "graph_keys")
     return GraphKeys(traverse, RigVariables(traverse, free_numbers(traverse, options)))
 
 
@@ -56,7 +57,7 @@ def build_graph(
 
     Raises InputError for the model `projective`, for which GTSAM has no projection factor, and as `solve`.
     """
-    options = options or SolveOptions()
+    options = options_of(SolveOptions, options, "build_graph")
     if options.model == "projective":
         raise InputError(
             "build_graph: expected the model mast, circle or free, found projective: GTSAM has no projection "

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
+from pancam_graph.base.options import options_of
 from pancam_graph.base.threads import blas_on_one_thread
 from pancam_graph.data import Seconds, Solution, Traverse
 from pancam_graph.graph import UserFactors
@@ -51,7 +52,7 @@ def solve(
         _LOG.info(COMPILING)
     clock = _Clock()
     with blas_on_one_thread():
-        prepared = prepare(traverse, options or SolveOptions(), start, on_iteration, factors)
+        prepared = prepare(traverse, options_of(SolveOptions, options, "solve"), start, on_iteration, factors)
         clock.ended("initialise")
         screened = screen(prepared)
         fitted = fit(screened)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pancam_graph.base.errors import ImageError, InputError
 from pancam_graph.base.geometry import BoolArray, FloatArray
+from pancam_graph.base.options import options_of
 from pancam_graph.base.threads import in_order
 from pancam_graph.images import ImageMask, Small, even_out, find_masks
 from pancam_graph.terrain import kernel
@@ -111,6 +112,7 @@ def make_terrain(
     no frame has two pictures that see in stereo, for a cell that is too small for memory, and where no ground
     is found.
     """
+    options = options_of(TerrainOptions, options, "make_terrain")
     traverse = drive.traverse
     pairs, warnings = stereo_pairs(drive)
     if not pairs:

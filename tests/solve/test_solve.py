@@ -1,5 +1,6 @@
 """The adjustment: exact without noise, honest with it, deaf to outliers, clear about what is wrong."""
 
+import re
 import runpy
 import sys
 from dataclasses import replace
@@ -280,3 +281,17 @@ def test_refusals() -> None:
         SolveOptions(model="ring")  # type: ignore[arg-type]  # the mistake under test
     with pytest.raises(InputError, match=r"loss: .*found 'tukey'"):
         SolveOptions(loss="tukey")  # type: ignore[arg-type]  # the mistake under test
+
+
+def test_a_solution_says_in_five_lines_what_it_is() -> None:
+    simulation = simulate(mer_navcam(), replace(SMALL, outliers=0.02), seed=5)
+    solution = solve(simulation.traverse)
+    first, counts, residuals, moved, warned = repr(solution).splitlines()
+    assert first == f"Solution of {solution.traverse.name!r}: converged; its tests passed"
+    assert f"{len(solution.landmark_track)} landmarks; model mast" in counts
+    assert f"over {solution.used.sum()} of {len(solution.used)} observations" in residuals
+    found = [float(word) for word in re.findall(r"[\d.]+", moved)]
+    expected = 1e3 * np.median(np.abs(solution.correction_rad), axis=0)
+    np.testing.assert_allclose(found[:2], expected, rtol=5e-3)
+    assert f"{len(solution.warnings)} warnings" in warned
+    assert repr(solution.traverse).startswith(f"Traverse {solution.traverse.name!r}: 2 stops, ")

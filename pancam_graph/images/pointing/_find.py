@@ -12,6 +12,7 @@ from gtsam import Pose3
 from pancam_graph.base.choices import some_of
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray, IntArray, wrap_angle
+from pancam_graph.base.options import options_of
 from pancam_graph.base.threads import in_order
 from pancam_graph.cameras import Camera
 from pancam_graph.data import UNKNOWN_RAD, Frame, Traverse
@@ -108,6 +109,7 @@ def find_pointing(
     Raises InputError for one of several stops of which no pan is told, for a stop of which no two pictures
     share anything, for pictures that no head can have taken that pans and tilts, and as `read_pictures` does.
     """
+    options = options_of(FrontEndOptions, options, "find_pointing")
     tell = progress or (lambda stage, done, total: None)
     _require_gauge(traverse)
     pictures = read_pictures(traverse, partial(tell, "images"))

@@ -10,6 +10,7 @@ import numpy as np
 from pancam_graph.base.arrays import float_array
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray, IntArray, correction_twists, pose_arrays
+from pancam_graph.base.options import options_of
 from pancam_graph.base.threads import blas_on_one_thread
 from pancam_graph.cameras import CAHV, Camera, lens_of
 from pancam_graph.rigs._chain import Chain, PosedCameras
@@ -160,6 +161,7 @@ def fit_rig(
     held), for numbers that are not finite or do not fit in number, for an eye that the reference has not,
     and for models of one eye that differ in kind or size.
     """
+    options = options_of(RigFitOptions, options, "fit_rig")
     if reference is not None and pan_T_tilt is not None:
         raise InputError(
             "fit_rig: pan_T_tilt: expected none beside a reference rig, which has one; found one"

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pancam_graph.base.errors import InputError, SolveError
 from pancam_graph.base.geometry import BoolArray, FloatArray, wrap_angle
+from pancam_graph.base.options import options_of
 from pancam_graph.base.threads import blas_on_one_thread
 from pancam_graph.data import (
     CrossValidation,
@@ -82,7 +83,7 @@ def cross_validate(
     for name, value, least in (("halvings", halvings, 1), ("seed", seed, 0)):
         if value < least:
             raise InputError(f"cross-validation: {name}: expected {least} or more, found {value}")
-    options = options or SolveOptions()
+    options = options_of(SolveOptions, options, "cross_validate")
     if solution is None:
         solution = solve(traverse, options, factors=factors)
     else:
