@@ -12,6 +12,9 @@ from pancam_graph.landmarks import Measurements
 
 __all__ = ["Block", "Layout", "blocks_of"]
 
+_NOWHERE = int(np.iinfo(np.int32).min)
+"""First column of a group that a block does not touch: columns of its segments are then negative."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Block:
@@ -29,8 +32,10 @@ class Block:
     """(segments,) first column of each segment in the block; negative where it is of another"""
     row: IntArray
     """(columns,) place of each column of the block among those of its group; -1: it belongs to no variable"""
-    panel_column: tuple[IntArray, ...]
-    """For each of the groups, the place in its panel of each column of the block; -1: it has none"""
+    group: IntArray
+    """(groups,) `groups` as an array"""
+    panel_column: IntArray
+    """(groups, columns) for each of the groups, the place in its panel of each column of the block; -1: none"""
     source: IntArray
     """(columns,) place of each column of the block among all columns; -1: it belongs to no variable"""
     n_units: int
@@ -38,23 +43,24 @@ class Block:
     @staticmethod
     def of(link: Linkage, layout: "Layout", panels: Panels, groups: tuple[int, ...]) -> "Block":
         """The columns of a block that touches these groups; its units are not counted yet."""
-        begin = np.concatenate([[0], np.cumsum(layout.group_width[list(groups)])]).astype(np.int64)
-        shift = np.full(link.n_groups, np.iinfo(np.int32).min)
-        shift[list(groups)] = begin[:-1]
+        group = np.array(groups, dtype=np.int64)
+        width = layout.group_width[group]
+        begin = np.zeros(len(groups) + 1, dtype=np.int64)
+        np.cumsum(width, out=begin[1:])
+        shift = np.full(link.n_groups, _NOWHERE)
+        shift[group] = begin[:-1]
         row = np.concatenate([np.zeros(0, dtype=np.int64), *(layout.row[g] for g in groups)])
-        of = np.repeat(np.array(groups, dtype=np.int64), np.diff(begin))
-
-        def among(first: IntArray) -> IntArray:
-            """Columns of the block, given where (groups,) each group begins; -1 where a group is not."""
-            return np.where((row < 0) | (first[of] < 0), -1, first[of] + row)
-
+        of, is_nobodys = group.repeat(width), row < 0
+        # Where each group begins in the panel of each; -1 where it is not there.
+        first = np.array([panels.first_columns(g) for g in groups]).reshape(len(groups), link.n_groups)[:, of]
         return Block(
             groups=groups,
+            group=group,
             begin=begin,
-            segment_column=shift[link.group[link.segment_variable]] + layout.segment_column,
+            segment_column=shift[layout.segment_group] + layout.segment_column,
             row=row,
-            panel_column=tuple(among(panels.first_columns(g)) for g in groups),
-            source=among(link.group_column),
+            panel_column=np.where(is_nobodys | (first < 0), -1, first + row),
+            source=np.where(is_nobodys, -1, link.group_column[of] + row),
             n_units=0,
         )
 
@@ -83,6 +89,8 @@ class Layout:
 
     group_width: IntArray
     """(groups,) number of columns of each group"""
+    segment_group: IntArray
+    """(segments,) group of each"""
     segment_column: IntArray
     """(segments,) first column of each in its group"""
     row: tuple[IntArray, ...]
@@ -106,6 +114,7 @@ class Layout:
         row[np.repeat(place, width) + step] = np.repeat(start[one], width) + step
         return Layout(
             group_width=group_width,
+            segment_group=group,
             segment_column=place[which] - group_begin[group],
             row=tuple(row[a:b] for a, b in pairwise(group_begin)),
         )

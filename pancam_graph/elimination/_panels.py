@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 import scipy
@@ -79,10 +80,14 @@ class Panels:
 
     def __init__(self, structure: Pattern) -> None:
         self.structure = structure
-        self.panel = [
-            np.zeros((int(structure.dim[g]), int(structure.begin[g][-1]) + 1))
-            for g in range(len(structure.dim))
-        ]
+        self.width = np.array([begin[-1] + 1 for begin in structure.begin], dtype=np.int64)
+        """(groups,) columns of each panel"""
+        self.begin = np.zeros(len(structure.dim) + 1, dtype=np.int64)
+        """(groups + 1,) first of the numbers of each panel"""
+        np.cumsum(structure.dim * self.width, out=self.begin[1:])
+        self.numbers = np.zeros(int(self.begin[-1]))
+        """Of all panels, one after the other, row by row."""
+        self.panel = self._views()
         self._place = [
             dict(zip(a, b, strict=False)) for a, b in zip(structure.after, structure.begin, strict=True)
         ]
@@ -90,8 +95,12 @@ class Panels:
 
     def clear(self) -> None:
         """Set everything to 0."""
-        for panel in self.panel:
-            panel.fill(0.0)
+        self.numbers.fill(0.0)
+
+    def _views(self) -> list[FloatArray]:
+        """The panel of each group, in `numbers`."""
+        of_groups = zip(pairwise(self.begin.tolist()), self.width.tolist(), strict=True)
+        return [self.numbers[first:last].reshape(-1, width) for (first, last), width in of_groups]
 
     def sorted(self, groups: Iterable[int]) -> list[int]:
         """Groups in the order of elimination."""
@@ -140,7 +149,8 @@ class Panels:
     def copy(self) -> "Panels":
         """The same system in memory of its own."""
         twin = copy(self)
-        twin.panel = [panel.copy() for panel in self.panel]
+        twin.numbers = self.numbers.copy()
+        twin.panel = twin._views()
         return twin
 
     def hold(self, held: dict[int, IntArray]) -> None:

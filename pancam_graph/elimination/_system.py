@@ -97,7 +97,7 @@ class Room(local):
 _OfChunk = tuple[FloatArray, FloatArray, int, float, int, int, IntArray, int, kernel.Reduced]
 _Wave = list[_Chunk]
 _Systems = list[tuple[FloatArray, FloatArray]]
-"""(S, s) of each chunk of a wave, over the columns of its block; S in tiles, see kernel.add_to_panel."""
+"""(S, s) of each chunk of a wave, over the columns of its block; S in tiles, see kernel.add_to_panels."""
 
 
 class LandmarkSystem:
@@ -162,10 +162,11 @@ class LandmarkSystem:
         """Fill `sights`, `blocks` and `chunks`."""
         link = self.linkage
         n_obs, n = len(m.image), len(self.landmark_row)
-        n_segments = int(np.diff(link.segment_begin)[link.image_unit][m.image].sum())
         n_pairs = (link.segment_width + 1) // 2
-        per_unit = np.diff(np.concatenate([[0], np.cumsum(n_pairs)])[link.segment_begin])
-        most_pairs = int(per_unit[link.image_unit][m.image].sum())
+        times = np.bincount(m.image, minlength=len(link.image_unit))
+        of_unit = np.bincount(link.image_unit, times, minlength=len(link.segment_begin) - 1)
+        n_segments = int(of_unit @ np.diff(link.segment_begin))
+        most_pairs = int(of_unit @ np.diff(np.concatenate([[0], np.cumsum(n_pairs)])[link.segment_begin]))
         sights = kernel.Sights(
             image=np.empty(n_obs, dtype=np.int64),
             uv_px=np.empty((0, 2)),
@@ -278,12 +279,10 @@ class LandmarkSystem:
             def summed(first: int, last: int, wave: _Wave = wave, systems: _Systems = systems) -> None:
                 # In the order of the chunks, so that no bit depends on the number of threads.
                 for chunk, (S, s) in zip(wave, systems, strict=True):
-                    block = self.blocks[chunk.block]
-                    for i, g in enumerate(block.groups):
-                        if first <= g < last:
-                            rows = int(block.begin[i]), int(block.begin[i + 1])
-                            panel = self._panels.panel[g]
-                            kernel.add_to_panel(S, s, *rows, block.row, block.panel_column[i], panel)
+                    block, panels = self.blocks[chunk.block], self._panels
+                    of_block = block.row, block.group, block.begin, block.panel_column
+                    to = panels.begin, panels.width, panels.numbers
+                    kernel.add_to_panels(S, s, *of_block, first, last, *to)
 
             in_parallel(eliminated, len(wave), grain=1)
             n_groups = self.linkage.n_groups

@@ -10,7 +10,7 @@ from pancam_graph.base.compiled import chosen, part
 from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.landmarks.kernel._compiling import entry
 
-__all__ = ["add_to_panel", "subtract_row", "tile_entry"]
+__all__ = ["add_to_panels", "subtract_row", "tile_entry"]
 
 
 @part
@@ -43,26 +43,35 @@ def subtract_row(
 
 
 @entry
-def add_to_panel(
+def add_to_panels(
     tiles: FloatArray,
     s: FloatArray,
+    row: IntArray,
+    groups: IntArray,
+    begin: IntArray,
+    column: IntArray,
     first: int,
     last: int,
-    row: IntArray,
-    column: IntArray,
-    panel: FloatArray,
+    panel_begin: IntArray,
+    panel_width: IntArray,
+    numbers: FloatArray,
 ) -> None:
-    """Add rows first to last of a block's system, S in tiles and s, to a group's panel.
+    """Add a block's system, S in tiles and s, to the panels of those of its groups from `first` to `last`.
 
-    The panel's last column takes s. `row` and `column` say where each of the block's columns is in the panel;
-    -1: nowhere.
+    Rows begin[i] to begin[i + 1] of the system are those of groups[i]; `row` (columns,) and `column` (groups,
+    columns) say where each of the block's columns is in the panel of a group; -1: nowhere. The panel of group
+    g is `numbers` from panel_begin[g] on, row by row; its last column takes s.
     """
     n_pairs = len(s) // 2
-    for p in range(first, last):
-        r = row[p]
-        if r < 0:
+    for i in range(len(groups)):
+        g = groups[i]
+        if g < first or g >= last:
             continue
-        panel[r, panel.shape[1] - 1] += s[p]
-        for q in range(p, len(s)):
-            if column[q] >= 0:
-                panel[r, column[q]] += tiles[tile_entry(p, q, n_pairs)]
+        for p in range(begin[i], begin[i + 1]):
+            if row[p] < 0:
+                continue
+            at = panel_begin[g] + row[p] * panel_width[g]
+            numbers[at + panel_width[g] - 1] += s[p]
+            for q in range(p, len(s)):
+                if column[i, q] >= 0:
+                    numbers[at + column[i, q]] += tiles[tile_entry(p, q, n_pairs)]
