@@ -152,12 +152,17 @@ def corrected_poses(
     shift are independent of each other, unlike in the exponential of Pose3: s is how far the origin of b
     moves, however b turns. A correction of 0 changes no bit.
     """
+    if not correction.any():
+        shape = np.broadcast_shapes(a_t_b.shape, (*correction.shape[:-1], 3))
+        return np.broadcast_to(a_R_b, (*shape, 3)).copy(), np.broadcast_to(a_t_b, shape).copy()
     turn, shift = so3_exp(correction[..., :3]), correction[..., 3:]
     return compose(a_R_b, a_t_b, turn, shift)
 
 
 def correction_twists(correction: FloatArray) -> FloatArray:
     """Body-frame twists (..., 6, 6), rotation first, of a corrected pose by its correction (..., 6)."""
+    if not correction.any():
+        return np.broadcast_to(np.eye(6), (*correction.shape, 6)).copy()
     w = correction[..., :3]
     out = np.zeros((*correction.shape, 6))
     out[..., :3, :3] = so3_right_jacobian(w)

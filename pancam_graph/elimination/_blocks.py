@@ -35,7 +35,7 @@ class Block:
     group: IntArray
     """(groups,) `groups` as an array"""
     panel_column: IntArray
-    """(groups, columns) for each of the groups, the place in its panel of each column of the block; -1: none"""
+    """(groups, columns) place of each column of the block in the panel of each of the groups; -1: none"""
     source: IntArray
     """(columns,) place of each column of the block among all columns; -1: it belongs to no variable"""
     n_units: int

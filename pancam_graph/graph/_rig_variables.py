@@ -179,7 +179,7 @@ class RigVariables:
         tilt = float(np.mean(self.traverse.pan_tilt_rad[:, 1]))
         return np.array([self.traverse.rig.circle(e, tilt)[0] for e in range(len(self.traverse.rig.eyes))])
 
-    @property
+    @cached_property
     def variables(self) -> tuple[RigVariable, ...]:
         """All variables, by quantity."""
         return tuple(v for variables in self.of.values() for v in variables)
@@ -188,12 +188,12 @@ class RigVariables:
         """Variables of one stop alone; None: variables that stops share."""
         return [v for v in self.variables if v.stop == stop]
 
-    @property
+    @cached_property
     def numbers(self) -> list[RigVariable]:
         """The variables that stops share and that are numbers of a rig (`rigs.RIG_ENTRIES`)."""
         return [v for v in self.of_stop(None) if v.quantity in RIG_ENTRIES]
 
-    @property
+    @cached_property
     def keys(self) -> list[int]:
         """Keys of `numbers`."""
         return [v.key for v in self.numbers]

@@ -174,7 +174,8 @@ def _may_matter(problem: Problem) -> bool:
     A cheap test on all landmarks: 1 over the squared distance where parallax is one sigma, against the
     squared inverse range, summed over the observations of each stop.
     """
-    m, kept = problem.measurements, problem.kept
+    m = problem.measurements
+    kept = slice(None) if problem.kept.all() else np.flatnonzero(problem.kept)
     stop = problem.template.traverse.image_stop[m.image[kept]]
     landmark = m.landmark[kept]
     per_m = problem.landmarks.vector[:, 3] / problem.landmarks.length.clip(1e-300)

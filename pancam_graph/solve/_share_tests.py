@@ -120,19 +120,14 @@ def _frames_apart(problem: Problem) -> VerdictTest:
     lose all their sights in other frames.
     """
     m, frame = problem.measurements, problem.template.traverse.image_frame
-    key = m.landmark * len(problem.template.traverse.frames) + frame[m.image]
-    order = slice(None) if np.all(np.diff(key) >= 0) else np.argsort(key, kind="stable")
-    key, kept = key[order], problem.kept[order]
-    starts = np.flatnonzero(np.diff(key, prepend=-1))
-    n, used = np.diff(starts, append=len(key)), np.add.reduceat(kept.astype(np.int64), starts)
-    landmark = key[starts] // max(len(problem.template.traverse.frames), 1)
-    is_shared, in_use = np.bincount(landmark) >= 2, np.bincount(landmark, used) > 0
-    of_two = used[(n == 2) & is_shared[landmark] & in_use[landmark]]
+    pairs, n_frames = np.zeros(3, dtype=np.int64), len(problem.template.traverse.frames)
+    kernel.count_pairs(m.begin, frame[m.image], problem.kept, n_frames, pairs)
     name, what = "frames apart", "points shared by frames"
-    if len(of_two) < _SIGHTS:
+    total = int(pairs.sum())
+    if total < _SIGHTS:
         return VerdictTest.of(name, None, _APART, f"too few {what} to compare the eyes of a frame", "")
-    lost = float(np.mean(of_two == 0))
-    value = lost - (1 - float(np.mean(of_two)) / 2) ** 2
+    lost = float(pairs[0] / total)
+    value = lost - (1 - float((pairs[1] + 2 * pairs[2]) / total) / 2) ** 2
     says = f"of {what}, {lost:.0%} are lost by both eyes of a frame, {value:+.0%} more than by chance"
     return VerdictTest.of(
         name,

@@ -149,6 +149,26 @@ def test_links_are_counted_once_for_each_landmark_and_owner() -> None:
     assert 0 < used.sum() < n.sum()
 
 
+def test_pairs_are_counted_by_how_many_of_the_two_are_in_use() -> None:
+    """Against sets, for random observations of which some are out of use."""
+    rng = np.random.default_rng(6)
+    landmark = np.unique(np.sort(rng.integers(0, 80, 260)), return_inverse=True)[1]
+    owner, kept = rng.integers(0, 4, 260), rng.random(260) < 0.4
+    begin = np.searchsorted(landmark, np.arange(landmark[-1] + 2))
+    pairs, expected = np.zeros(3, dtype=np.int64), np.zeros(3, dtype=np.int64)
+    kernel.count_pairs(begin, owner, kept, 4, pairs)
+    for j in range(landmark[-1] + 1):
+        of_landmark = landmark == j
+        if len(set(owner[of_landmark])) < 2 or not kept[of_landmark].any():
+            continue
+        for one in set(owner[of_landmark]):
+            of_both = of_landmark & (owner == one)
+            if of_both.sum() == 2:
+                expected[kept[of_both].sum()] += 1
+    assert np.array_equal(pairs, expected)
+    assert (pairs > 0).all()
+
+
 def test_components_are_those_of_the_graph() -> None:
     rng = np.random.default_rng(5)
     for n_members, n_landmarks, n in ((40, 60, 70), (10, 3, 5), (25, 200, 260)):

@@ -34,5 +34,6 @@ from pancam_graph.landmarks.kernel._outliers import smallest_information as smal
 from pancam_graph.landmarks.kernel._refine import refine as refine
 from pancam_graph.landmarks.kernel._shared import connect as connect
 from pancam_graph.landmarks.kernel._shared import count_links as count_links
+from pancam_graph.landmarks.kernel._shared import count_pairs as count_pairs
 from pancam_graph.landmarks.kernel._tiles import add_to_panels as add_to_panels
 from pancam_graph.landmarks.kernel._triangulate import triangulate as triangulate

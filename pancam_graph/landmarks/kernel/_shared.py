@@ -5,7 +5,7 @@ import numpy as np
 from pancam_graph.base.geometry import BoolArray, IntArray
 from pancam_graph.landmarks.kernel._compiling import entry
 
-__all__ = ["connect", "count_links"]
+__all__ = ["connect", "count_links", "count_pairs"]
 
 
 @entry
@@ -36,6 +36,36 @@ def count_links(begin: IntArray, owner: IntArray, kept: BoolArray, n: IntArray, 
                 n[by] += 1
                 if n_used >= 2 and used_in[by] == j:
                     in_use[by] += 1
+
+
+@entry
+def count_pairs(begin: IntArray, owner: IntArray, kept: BoolArray, n_owners: int, pairs: IntArray) -> None:
+    """Count the pairs of observations of a landmark by one owner, by how many of the two are in use.
+
+    Arguments as for `count_links`. Adds to `pairs` (3,) for none, one and both in use. Only landmarks that
+    several owners see and of which an observation is in use; owners with another number of them are left out.
+    """
+    seen_in = np.full(n_owners, -1)
+    n, used = np.zeros(n_owners, dtype=np.int64), np.zeros(n_owners, dtype=np.int64)
+    for j in range(len(begin) - 1):
+        n_seen, any_used = 0, False
+        for i in range(begin[j], begin[j + 1]):
+            by = owner[i]
+            if seen_in[by] != j:
+                seen_in[by], n[by], used[by] = j, 0, 0
+                n_seen += 1
+            n[by] += 1
+            if kept[i]:
+                used[by] += 1
+                any_used = True
+        if n_seen < 2 or not any_used:
+            continue
+        for i in range(begin[j], begin[j + 1]):
+            by = owner[i]
+            if seen_in[by] == j:
+                seen_in[by] = -1
+                if n[by] == 2:
+                    pairs[used[by]] += 1
 
 
 @entry
