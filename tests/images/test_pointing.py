@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from gtsam import Pose3
 
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import (
@@ -217,6 +218,24 @@ def test_the_head_is_exact_without_noise(rng: np.random.Generator) -> None:
     assert not len(found.wrong)
     for name in ("pan_rad", "tilt_rad", "log_scale"):
         np.testing.assert_allclose(getattr(found.state, name), getattr(truth, name), atol=1e-5)
+
+
+def test_arms_and_focal_length_are_found_together(rng: np.random.Generator) -> None:
+    # Arms and depths have a common scale that only priors settle.
+    rig, truth, points, _ = head_scene(rng, 1e-4, far=False)
+    bare = replace(
+        rig,
+        eyes=tuple(
+            replace(e, head_T_camera=Pose3(e.head_T_camera.rotation(), np.zeros(3))) for e in rig.eyes
+        ),
+    )
+    arms = np.array([e.head_T_camera.translation() for e in rig.eyes])
+    start = replace(truth, log_scale=truth.log_scale + 0.006, roll_rad=np.zeros(2))
+    found = fit_head(bare, start, points, Priors(roll_rad=0.02, scale=0.5, shift_m=0.15), near=True)
+    assert not len(found.wrong)
+    np.testing.assert_allclose(found.state.log_scale, truth.log_scale, atol=1e-3)
+    shift = found.state.shift_m
+    assert np.sum(shift * arms) > 0.99 * np.linalg.norm(shift) * np.linalg.norm(arms)
 
 
 @pytest.mark.slow

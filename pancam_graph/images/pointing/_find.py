@@ -480,6 +480,6 @@ def _scaled(rig: Rig, fit: HeadFit) -> FloatArray:
         return fit.state.shift_m
     length = np.linalg.norm(fit.state.shift_m, axis=1)
     longest = int(np.argmax(length))
-    if length[longest] < _SAFETY * np.max(fit.sigma.shift_m[longest, :2]):
+    if length[longest] <= _SAFETY * np.max(fit.sigma.shift_m[longest, :2]):
         return np.zeros_like(fit.state.shift_m)
     return np.asarray(fit.state.shift_m * (_USUAL_ARM_M / length[longest]))

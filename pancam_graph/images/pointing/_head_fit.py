@@ -27,7 +27,11 @@ _WIDENINGS = (40.0, 20.0, 10.0, 5.0, 2.0, 1.0)
 """Factors of that scale, from what a ring that does not close yet leaves."""
 _NEAR_WIDENINGS = (2.0, 1.0)
 """The same from a fit of the same pictures on."""
-_STEPS = 12
+_STEPS = 30
+_DAMPING, _MOST_DAMPING = 1e-4, 1e6
+"""First and last share of the information's diagonal that is added to it."""
+_SAME_COST = 1e-5
+"""Share of the cost by which a step must lower it, for another to follow."""
 _DEPTH_STEPS = 5
 _GAUGE_RAD = 1e-6
 _AGREES = 5.0
@@ -72,6 +76,11 @@ class HeadState:
             log_scale=self.log_scale + scale,
             shift_m=self.shift_m + shift.reshape(eyes, 3),
         )
+
+    def over_the_rig(self) -> FloatArray:
+        """What each number exceeds the rig's by, in the order of `moved`; 0 for pans and tilts."""
+        angles = np.zeros(2 * len(self.pan_rad))
+        return np.concatenate([angles, self.roll_rad, self.log_scale, self.shift_m.ravel()])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -214,25 +223,33 @@ class _System:
     gradient: FloatArray
     J: FloatArray
     by_depth: FloatArray
-    depth_information: FloatArray
+    per_depth: FloatArray
+    """(n,) variance of each inverse depth by itself; 0 where it stays at the end of its range."""
     depth_gradient: FloatArray
+    cost: float
+    """Cauchy's, with that of the inverse depths."""
 
     @staticmethod
     def of(rig: Rig, state: HeadState, points: Points, inverse_depth: FloatArray, scale: float) -> "_System":
         looks = _Looks.of(rig, state, points, 1).direction
         off, J, by_depth = residuals(rig, state, points, inverse_depth, axes_across(looks))
-        weight = points.worth / (1 + np.einsum("ni,ni->n", off, off) / scale**2)
+        square = np.einsum("ni,ni->n", off, off) / scale**2
+        weight = points.worth / (1 + square)
+        cost = points.worth @ (scale**2 * np.log1p(square) + (inverse_depth / _SPREAD) ** 2)
         depth_information = weight * np.einsum("ni,ni->n", by_depth, by_depth) + points.worth / _SPREAD**2
         depth_gradient = (
             weight * np.einsum("ni,ni->n", by_depth, off) + points.worth * inverse_depth / _SPREAD**2
         )
+        held = (inverse_depth <= 0.0) & (depth_gradient > 0)
+        held |= (inverse_depth >= _NEAREST) & (depth_gradient < 0)
+        per_depth = np.where(held, 0.0, 1 / depth_information)
         # Each point's inverse depth is eliminated (Schur complement of a diagonal block).
         coupled = weight[:, None] * np.einsum("nij,ni->nj", J, by_depth)
         weighted = J * weight[:, None, None]
         flat = J.reshape(-1, J.shape[2])
         information = weighted.reshape(flat.shape).T @ flat
-        information -= (coupled / depth_information[:, None]).T @ coupled
-        gradient = np.einsum("nij,ni->j", weighted, off) - coupled.T @ (depth_gradient / depth_information)
+        information -= (coupled * per_depth[:, None]).T @ coupled
+        gradient = np.einsum("nij,ni->j", weighted, off) - coupled.T @ (depth_gradient * per_depth)
         return _System(
             off=off,
             weight=weight,
@@ -240,14 +257,15 @@ class _System:
             gradient=gradient,
             J=J,
             by_depth=by_depth,
-            depth_information=depth_information,
+            per_depth=per_depth,
             depth_gradient=depth_gradient,
+            cost=float(cost),
         )
 
     def depth_step(self, step: FloatArray) -> FloatArray:
         """Change (n,) of the inverse depths that goes with a step of the state."""
         moved = self.weight * np.einsum("ni,nij,j->n", self.by_depth, self.J, step)
-        return np.asarray(-(self.depth_gradient + moved) / self.depth_information)
+        return np.asarray(-(self.depth_gradient + moved) * self.per_depth)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -281,20 +299,7 @@ def fit_head(rig: Rig, start: HeadState, points: Points, priors: Priors, *, near
     prior = np.where(free, 1 / np.where(free, sigma, 1.0), 0.0) ** 2
     state, inverse_depth = start, np.full(len(points.pair), _INVERSE_DEPTH)
     for widening in _NEAR_WIDENINGS if near else _WIDENINGS:
-        for _ in range(_STEPS):
-            system = _System.of(rig, state, points, inverse_depth, widening * _OUTLIER)
-            told = np.concatenate(
-                [np.zeros(2 * frames), state.roll_rad, state.log_scale, state.shift_m.ravel()]
-            )
-            information = system.information + np.diag(prior)
-            step = np.zeros(len(prior))
-            step[free] = -np.linalg.solve(
-                information[np.ix_(free, free)], (system.gradient + prior * told)[free]
-            )
-            state = state.moved(step)
-            inverse_depth = np.clip(inverse_depth + system.depth_step(step), 0.0, _NEAREST)
-            if np.abs(step).max() < 1e-8:
-                break
+        state, inverse_depth = _descended(rig, state, points, inverse_depth, prior, widening * _OUTLIER)
     system = _System.of(rig, state, points, inverse_depth, _OUTLIER)
     information = system.information + np.diag(prior)
     variance = np.zeros(len(prior))
@@ -306,6 +311,39 @@ def fit_head(rig: Rig, start: HeadState, points: Points, priors: Priors, *, near
     return HeadFit(
         state=state, sigma=zero.moved(np.sqrt(variance * noise2)), wrong=np.flatnonzero(typical > _AGREES)
     )
+
+
+def _descended(
+    rig: Rig, state: HeadState, points: Points, inverse_depth: FloatArray, prior: FloatArray, scale: float
+) -> tuple[HeadState, FloatArray]:
+    """State and inverse depths at the least cost with one scale of the weights (Levenberg-Marquardt).
+
+    `prior` is the information of each number of the state about the rig as told; 0 holds it.
+    """
+    free, damping = prior > 0, _DAMPING
+    system = _System.of(rig, state, points, inverse_depth, scale)
+    told = state.over_the_rig()
+    cost = system.cost + prior @ told**2
+    for _ in range(_STEPS):
+        information = (system.information + np.diag(prior))[np.ix_(free, free)]
+        damped = information + damping * np.diag(np.diag(information))
+        step = np.zeros(len(prior))
+        step[free] = -np.linalg.solve(damped, (system.gradient + prior * told)[free])
+        moved = state.moved(step)
+        depth_moved = np.clip(inverse_depth + system.depth_step(step), 0.0, _NEAREST)
+        tried = _System.of(rig, moved, points, depth_moved, scale)
+        tried_cost = tried.cost + prior @ moved.over_the_rig() ** 2
+        if tried_cost >= cost:
+            damping *= 10.0
+            if damping > _MOST_DAMPING:
+                break
+            continue
+        done = cost - tried_cost < _SAME_COST * cost
+        state, inverse_depth, system, cost = moved, depth_moved, tried, tried_cost
+        told, damping = state.over_the_rig(), damping / 10.0
+        if done:
+            break
+    return state, inverse_depth
 
 
 def agreeing(rig: Rig, state: HeadState, points: Points) -> BoolArray:
