@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from pancam_graph.cli._check import CHECK
 from pancam_graph.cli._command import Command
 from pancam_graph.cli._completion import COMPLETION
+from pancam_graph.cli._convert import CONVERT
 from pancam_graph.cli._drive import DRIVE
 from pancam_graph.cli._init import INIT
 from pancam_graph.cli._refine import REFINE
@@ -15,5 +16,5 @@ from pancam_graph.cli._terrain import TERRAIN
 __all__ = ["COMMANDS"]
 
 COMMANDS: Mapping[str, Command] = {
-    c.name: c for c in (REFINE, INIT, CHECK, TERRAIN, SIMULATE, RENDER, DRIVE, COMPLETION)
+    c.name: c for c in (REFINE, INIT, CHECK, TERRAIN, CONVERT, SIMULATE, RENDER, DRIVE, COMPLETION)
 }

@@ -117,29 +117,29 @@ class _RefusedError(Exception):
     """What the parser meets and must not go on with, in the words of the sentence."""
 
 
-def read_xml(file: Path) -> XmlElement:
-    """The outermost element of an XML file.
+def read_xml(file: Path, what: str = "an XML label", most_bytes: int = _MAX_BYTES) -> XmlElement:
+    """The outermost element of an XML file; `what` it is, for error messages.
 
-    Raises InputError for a file that is no regular one, of more than 8 MB, not XML, with a document
-    type (and so with entities), or nested deeper than any label.
+    Raises InputError for a file that is no regular one, of more than `most_bytes` (8 MB), not XML, with a
+    document type (and so with entities), or nested deeper than any label.
     """
     other = instead_of_file(file)
     if other is not None:
-        raise InputError(f"{file}: expected an XML label, found {other}")
+        raise InputError(f"{file}: expected {what}, found {other}")
     try:
         with file.open("rb") as stream:
-            content = stream.read(_MAX_BYTES + 1)
+            content = stream.read(most_bytes + 1)
     except OSError as error:
-        raise InputError(f"{file}: expected an XML label, could not read it: {error.strerror}") from error
-    if len(content) > _MAX_BYTES:
-        raise InputError(f"{file}: expected an XML label of at most {_MAX_BYTES} bytes, found more")
+        raise InputError(f"{file}: expected {what}, could not read it: {error.strerror}") from error
+    if len(content) > most_bytes:
+        raise InputError(f"{file}: expected {what} of at most {most_bytes} bytes, found more")
     builder = _Builder(file)
     try:
         return builder.tree(content)
     except _RefusedError as error:
-        raise InputError(f"{file}: expected an XML label, found {error}") from error
+        raise InputError(f"{file}: expected {what}, found {error}") from error
     except (expat.ExpatError, ValueError, LookupError) as error:  # the last: an encoding that does not exist
-        raise InputError(f"{file}: expected an XML label, found text that is none ({error})") from error
+        raise InputError(f"{file}: expected {what}, found text that is none ({error})") from error
 
 
 class _Builder:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from pancam_graph.results._camera_models import write_cameras as write_cameras
 from pancam_graph.results._colmap import write_colmap as write_colmap
+from pancam_graph.results._doors import DOORS as DOORS
 from pancam_graph.results._gis import write_gis as write_gis
 from pancam_graph.results._outputs import EXPORTS as EXPORTS
 from pancam_graph.results._outputs import check_exports as check_exports
@@ -20,10 +21,17 @@ from pancam_graph.results._solution_json import SolutionFile as SolutionFile
 from pancam_graph.results._solution_json import read_solution_json as read_solution_json
 
 if TYPE_CHECKING:
+    from pancam_graph.results._convert import Converted as Converted
+    from pancam_graph.results._convert import convert as convert
     from pancam_graph.results._refined_drive import read_drive as read_drive
     from pancam_graph.results._terrain import write_terrain_of as write_terrain_of
 else:
-    _LATE = {"read_drive": "_refined_drive", "write_terrain_of": "_terrain"}
+    _LATE = {
+        "Converted": "_convert",
+        "convert": "_convert",
+        "read_drive": "_refined_drive",
+        "write_terrain_of": "_terrain",
+    }
 
     def __getattr__(name: str) -> object:
         if name not in _LATE:

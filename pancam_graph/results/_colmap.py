@@ -8,15 +8,12 @@ import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pancam_graph.base.geometry import FloatArray, wxyz_from_rotation
-from pancam_graph.cameras import lens_of, straightening_map, without_field
+from pancam_graph.cameras import lens_of, without_field
 from pancam_graph.data import Solution, rms_px
-from pancam_graph.io import readable_picture
 from pancam_graph.results._brightness import Brightness, brightness_of
 from pancam_graph.results._colmap_scene import (
     Placed,
@@ -28,6 +25,7 @@ from pancam_graph.results._colmap_scene import (
 )
 from pancam_graph.results._exported import file_names, whole_export, write_export_json
 from pancam_graph.results._output import OutputWriter, Written
+from pancam_graph.results._straight_images import write_straight_images
 
 __all__ = ["COLMAP", "fill_colmap", "write_colmap"]
 
@@ -86,7 +84,7 @@ def fill_colmap(solution: Solution, folder: Path, brightness: Brightness) -> Non
     ):
         text = "\n".join([f"# {name} of pancam_graph, as COLMAP 3.12 and later read them", *lines, ""])
         (sparse / f"{name}.txt").write_text(text, encoding="utf-8", newline="\n")
-    written = _write_images(solution, folder / "images", straight, numbers, brightness)
+    written = write_straight_images(solution, folder / "images", straight, numbers.name, brightness)
     _write_stereo(folder / "stereo", [numbers.name[i] for i in written])
     about = _about(solution, straight, placed, numbers, written, brightness)
     _LOG.info(
@@ -206,61 +204,6 @@ def _pose(rotation: FloatArray, translation: FloatArray) -> str:
 
 def _inverse(rotation: FloatArray, translation: FloatArray) -> str:
     return _pose(rotation.T, -rotation.T @ translation)
-
-
-# --- the images ---
-
-
-def _write_images(
-    solution: Solution,
-    folder: Path,
-    straight: list[Straight | None],
-    numbers: _Numbers,
-    brightness: Brightness,
-) -> list[int]:
-    """Write the images that have a readable file; returns their rows."""
-    import cv2  # noqa: PLC0415  late: other results do without it
-
-    folder.mkdir()
-    written = []
-    previous, lookup = None, None
-    # In the order of cameras, so that only one lookup is in memory, and each is made once.
-    for i in sorted(numbers.of_image, key=lambda i: (numbers.of_image[i], i)):
-        image, s = readable_picture(solution.traverse, i), straight[i]
-        if image is None or s is None:
-            continue
-        if s is not previous:
-            previous, lookup = s, straightening_map(s.camera, s.pinhole, s.range_m)
-        path = folder / numbers.name[i]
-        path.parent.mkdir(exist_ok=True)
-        samples = image if lookup is None else _resampled(image, lookup)
-        png = cv2.imencode(".png", brightness.to_8_bits(samples, image.dtype))[1]
-        path.write_bytes(png.tobytes())
-        written.append(i)
-    return sorted(written)
-
-
-def _resampled(image: NDArray[Any], lookup: FloatArray) -> NDArray[np.float32]:
-    """Samples of an image at pixels (height, width, 2): Lanczos over 8 x 8 pixels; 0 outside the image.
-
-    OpenCV rounds the pixels to a 32nd.
-    """
-    import cv2  # noqa: PLC0415  late: other results do without it
-
-    height, width = image.shape
-    within = np.all(
-        (lookup > -_FIRST_PIXEL) & (lookup < [width - _FIRST_PIXEL, height - _FIRST_PIXEL]), axis=-1
-    )
-    where = np.where(within[..., None], lookup, 0.0).astype(np.float32)
-    # The image is reflected at its edges, and blackened outside afterwards: a black edge would ring.
-    samples = cv2.remap(
-        image.astype(np.float32),
-        where[..., 0],
-        where[..., 1],
-        cv2.INTER_LANCZOS4,
-        borderMode=cv2.BORDER_REFLECT_101,
-    )
-    return np.where(within, np.asarray(samples, dtype=np.float32), np.float32(0))
 
 
 def _write_stereo(folder: Path, names: list[str]) -> None:
