@@ -108,12 +108,12 @@ def _fitted(start: Brown, uv: FloatArray, points: FloatArray, *, skew: bool) -> 
     def lens_of(p: FloatArray) -> Brown:
         return replace(
             start,
-            fx_px=scale * p[0],
-            fy_px=scale * p[1],
-            cx_px=scale * p[2],
-            cy_px=scale * p[3],
+            fx_px=float(scale * p[0]),
+            fy_px=float(scale * p[1]),
+            cx_px=float(scale * p[2]),
+            cy_px=float(scale * p[3]),
             distortion=(float(p[4]), float(p[5]), float(p[6]), float(p[7]), float(p[8])),
-            skew_px=scale * p[9] if skew else 0.0,
+            skew_px=float(scale * p[9]) if skew else 0.0,
         )
 
     def residual(p: FloatArray) -> FloatArray:
