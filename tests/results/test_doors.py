@@ -27,8 +27,8 @@ from support.made_solutions import fabricate
 POINTS = 1000
 
 
-def brown_rig() -> Rig:
-    """The stereo template with lenses of Brown's, unequal focal lengths and skew."""
+def brown_rig(skew_px: float = 0.0) -> Rig:
+    """The stereo template with lenses of Brown's, unequal focal lengths and a skew."""
     rig = rig_template("stereo-pan-tilt")
     eyes = []
     for eye in rig.eyes:
@@ -40,22 +40,17 @@ def brown_rig() -> Rig:
             fy_px=1.003 * p.fx_px,
             cx_px=p.cx_px + 7.3,
             cy_px=p.cy_px - 4.1,
-            skew_px=0.0,
+            skew_px=skew_px,
             distortion=(-0.11, 0.02, 4e-4, -3e-4, 0.005),
         )
         eyes.append(replace(eye, camera=lens))
     return replace(rig, eyes=tuple(eyes))
 
 
-def skewed_rig() -> Rig:
-    rig = brown_rig()
-    return replace(rig, eyes=tuple(replace(e, camera=replace(e.camera, skew_px=0.8)) for e in rig.eyes))
-
-
 RIGS: dict[str, Callable[[], Rig]] = {
     "pinhole": lambda: rig_template("mer-navcam"),
     "brown": brown_rig,
-    "skewed": skewed_rig,
+    "skewed": lambda: brown_rig(0.8),
     "cahvor": lambda: rig_template("msl-navcam"),
 }
 
