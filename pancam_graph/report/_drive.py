@@ -181,14 +181,18 @@ def _trace(name: str, position_m: FloatArray, **more: object) -> Json:
 _PAGE = (
     HEAD
     + """</header>
+<main>
 <div class="controls"><button id="play">Play</button>
 <label>Stop <input id="at" type="range" min="1" max="{n}" value="{n}"></label><span id="note"></span></div>
 <div class="pair">
-<section><h2>Map</h2><div class="plot" id="map"></div><p class="caption">{caption}</p></section>
-<section><h2>Error against truth</h2><div class="plot" id="errors"></div>
+<section><h2>Map</h2><div class="plot" id="map" role="group" aria-label="Map"></div>
+<p class="caption">{caption}</p></section>
+<section><h2>Error against truth</h2>
+<div class="plot" id="errors" role="group" aria-label="Error against truth"></div>
 <p class="caption">Of the newest stop, after its own update. Where the loop closes, odometry has drifted and
 the estimate has not.</p></section>
 </div>
+</main>
 <script type="text/plain" id="packed-plotly">{plotly}</script>
 <script type="text/plain" id="packed-figures">{figures}</script>
 <script>

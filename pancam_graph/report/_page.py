@@ -216,7 +216,7 @@ def _warnings(solution: Solution) -> str:
 def _section(head: str, figure: Figure, controls: str = "") -> str:
     return (
         f"<section>\n<h2>{escape(head)}</h2>\n{controls}"
-        f'<div class="plot" id="{figure.id}" role="img" aria-label="{escape(head)}"></div>\n'
+        f'<div class="plot" id="{figure.id}" role="group" aria-label="{escape(head)}"></div>\n'
         f'<p class="caption">{escape(figure.caption)}</p>\n</section>'
     )
 

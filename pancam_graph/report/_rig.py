@@ -88,7 +88,7 @@ def rig_section(solution: Solution) -> tuple[str, list[Figure]]:
 
 def _panels(panels: Sequence[Figure]) -> str:
     shown = "\n".join(
-        f'<div><div class="plot over-image" id="{p.id}" role="img" aria-label="{escape(p.caption)}" '
+        f'<div><div class="plot over-image" id="{p.id}" role="group" aria-label="{escape(p.caption)}" '
         f'style="aspect-ratio: {_aspect(p)}"></div>\n<p class="caption">{escape(p.caption)}</p></div>'
         for p in panels
     )

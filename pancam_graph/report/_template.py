@@ -25,6 +25,7 @@ PAGE = (
 {headline}
 </dl>
 </header>
+<main>
 {mosaics}{terrain}<div class="pair">
 {map}
 {histogram}
@@ -67,6 +68,7 @@ upwards. All conventions: <code>docs/conventions.md</code> of pancam_graph.</li>
 <li>All numbers in full: <code>solution.json</code> and <code>residuals.npz</code> beside this page.</li>
 </ul>
 </section>
+</main>
 <script type="text/plain" id="packed-plotly">{plotly}</script>
 <script type="text/plain" id="packed-figures">{figures}</script>
 <script>{script}</script>

@@ -101,7 +101,7 @@ def make_terrain_page(written: WrittenTerrain, name: str) -> str:
         style=STYLE,
         lead="Heights that stereo frames of the adjusted drive see, and what the adjustment gained.",
     )
-    return f"{head}</header>\n{terrain_section(written, '')}</body>\n</html>\n"
+    return f"{head}</header>\n<main>\n{terrain_section(written, '')}</main>\n</body>\n</html>\n"
 
 
 def _within_budget(surfaces: tuple[ShownSurface, ...]) -> tuple[list[ShownSurface], int]:
