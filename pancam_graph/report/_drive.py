@@ -11,7 +11,7 @@ from pancam_graph.base.ellipses import ellipse_outlines, translation_covariance_
 from pancam_graph.base.geometry import FloatArray, pose_arrays
 from pancam_graph.base.whole_files import whole_file
 from pancam_graph.report._escaped import escape
-from pancam_graph.report._look import AFTER, BEFORE, REJECTED, axis, layout
+from pancam_graph.report._look import AFTER, BEFORE, REJECTED, axis, layout, logarithmic
 from pancam_graph.report._numbers import Json, polyline, rounded
 from pancam_graph.report._packed import HEAD, UNPACKED, packed, packed_plotly
 from pancam_graph.report._style import STYLE
@@ -116,7 +116,10 @@ def _page(steps: Sequence[DriveStep], simulation: Simulation) -> str:
         ],
         "layout": layout(
             xaxis=axis("stops driven"),
-            yaxis=axis("error of the newest stop, m", type="log"),
+            yaxis=axis(
+                "error of the newest stop, m",
+                **logarithmic([e for s in steps[1:] for e in (s.odometry_error_m, s.error_m)]),
+            ),
             legend={"orientation": "h", "x": 0, "y": 1.08},
             margin={"l": 70, "r": 20, "t": 46, "b": 50},
         ),

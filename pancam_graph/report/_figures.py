@@ -5,7 +5,7 @@ import numpy as np
 from pancam_graph.base.geometry import FloatArray, wrap_angle
 from pancam_graph.data import Solution
 from pancam_graph.report._escaped import escape
-from pancam_graph.report._look import AFTER, BEFORE, GRID, INK, MUTED, Figure, axis, layout
+from pancam_graph.report._look import AFTER, BEFORE, GRID, INK, MUTED, Figure, axis, layout, logarithmic
 from pancam_graph.report._numbers import Json, fixed, lengths, rounded, short
 
 __all__ = ["histogram_edges", "make_corrections", "make_histogram"]
@@ -61,11 +61,7 @@ def make_histogram(solution: Solution) -> Figure:
                 "hovertemplate": f"{name}: %{{y}} around %{{x:.3g}} px<extra></extra>",
             }
         )
-    scale: Json = (
-        {"type": "log", "dtick": 1, "tickformat": "~g", "minor": {"ticks": "outside"}}
-        if geometric
-        else {"rangemode": "tozero"}
-    )
+    scale: Json = logarithmic(edges) if geometric else {"rangemode": "tozero"}
     caption = "Nothing was used, so there is nothing to show."
     if len(after):
         beyond = np.mean(before > edges[-1]) if len(before) else 0.0

@@ -2,6 +2,9 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from pancam_graph.report._numbers import Json
 
 __all__ = [
@@ -16,7 +19,11 @@ __all__ = [
     "Figure",
     "axis",
     "layout",
+    "logarithmic",
 ]
+
+_MANY_DECADES = 2.5
+"""Decades above which an axis has a tick at each power of ten only."""
 
 INK = "#1f2933"
 MUTED = "#667380"
@@ -59,6 +66,20 @@ def axis(title: str, **more: object) -> Json:
         "automargin": True,
         **more,
     }
+
+
+def logarithmic(values: ArrayLike) -> Json:
+    """What makes an axis logarithmic, with ticks at 1, 2 and 5 of each decade that some values (n,) span.
+
+    Plotly's own ticks between decades are single digits, which readers take for values.
+    """
+    positive = np.asarray(values, dtype=float)
+    positive = positive[np.isfinite(positive) & (positive > 0)]
+    low, high = np.log10([positive.min(), positive.max()]) if len(positive) else (-1.0, 1.0)
+    steps = (1,) if high - low > _MANY_DECADES else (1, 2, 5)
+    decades = range(int(np.floor(low)) - 1, int(np.ceil(high)) + 2)
+    ticks = [float(f"{step}e{decade}") for decade in decades for step in steps]
+    return {"type": "log", "tickmode": "array", "tickvals": ticks, "ticktext": [f"{t:g}" for t in ticks]}
 
 
 def layout(**more: object) -> Json:

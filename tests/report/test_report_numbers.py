@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from pancam_graph.report._images import magnification
+from pancam_graph.report._look import logarithmic
 from pancam_graph.report._map import place_labels
 from pancam_graph.report._numbers import round_factor, rounded, short, thinned
 from pancam_graph.report._scene import label_stops
@@ -65,3 +66,12 @@ def test_rounded_has_no_nan_and_no_negative_zero() -> None:
 def test_thinned_is_even_and_whole_when_few() -> None:
     assert thinned(5, 10).tolist() == [0, 1, 2, 3, 4]
     assert thinned(100, 4).tolist() == [0, 33, 66, 99]
+
+
+def test_ticks_of_logarithmic_axes_are_values_and_lie_where_the_values_are() -> None:
+    few = logarithmic([0.009, 1.4])
+    assert [t for t in few["tickvals"] if 0.009 <= t <= 1.4] == [0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0]
+    assert few["ticktext"][few["tickvals"].index(0.05)] == "0.05"
+    many = logarithmic([1e-4, np.nan, 0.0, 30.0])
+    assert [t for t in many["tickvals"] if 1e-4 <= t <= 30] == [1e-4, 1e-3, 1e-2, 0.1, 1.0, 10.0]
+    assert len(logarithmic([])["tickvals"]) > 3
