@@ -91,7 +91,7 @@ class Site:
         return _SHAPES[self.body]
 
     @cached_property
-    def _frame(self) -> tuple[FloatArray, FloatArray]:
+    def body_frame(self) -> tuple[FloatArray, FloatArray]:
         """Rotation (3, 3) and origin (3,) of the world in the body's own frame, metres."""
         centre, normal = self._fixed(
             np.array([self.latitude_deg]), np.array([self.longitude_deg]), np.array([self.height_m])
@@ -130,7 +130,7 @@ class Site:
 
         Longitudes are within 180 degrees of the site's. NaN stays NaN.
         """
-        rotation, origin = self._frame
+        rotation, origin = self.body_frame
         shape, place = self.shape, points_m @ rotation.T + origin
         across = np.hypot(place[:, 0], place[:, 1])
         latitude = np.arctan2(place[:, 2], across * (1 - shape.e2))
@@ -147,7 +147,7 @@ class Site:
 
     def points_m(self, geographic: FloatArray) -> FloatArray:
         """Points (n, 3) of the world at latitudes, longitudes and heights (n, 3); inverse of `geographic`."""
-        rotation, origin = self._frame
+        rotation, origin = self.body_frame
         place, _ = self._fixed(geographic[:, 0], geographic[:, 1], geographic[:, 2])
         return np.asarray((place - origin) @ rotation)
 
@@ -165,4 +165,4 @@ class Site:
         """Metres of the world over metres on the sphere of the body's maps, at the site."""
         if self.shape.is_geodetic:
             return 1.0 + self.height_m / self.shape.equator_m
-        return float(np.linalg.norm(self._frame[1])) / self.shape.map_radius_m
+        return float(np.linalg.norm(self.body_frame[1])) / self.shape.map_radius_m

@@ -5,6 +5,9 @@ from pancam_graph.io._cahvor import read_cahvor as read_cahvor
 from pancam_graph.io._camera_entry import AnyCamera as AnyCamera
 from pancam_graph.io._camera_entry import CameraEntry as CameraEntry
 from pancam_graph.io._camera_entry import camera_entry as camera_entry
+from pancam_graph.io._control_network import NETWORK_COLUMNS as NETWORK_COLUMNS
+from pancam_graph.io._control_network import network_csv as network_csv
+from pancam_graph.io._control_network import with_network as with_network
 from pancam_graph.io._entries import MOSAIC_FORMAT as MOSAIC_FORMAT
 from pancam_graph.io._entries import SOLUTION_FORMAT as SOLUTION_FORMAT
 from pancam_graph.io._entries import TERRAIN_FORMAT as TERRAIN_FORMAT

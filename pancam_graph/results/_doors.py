@@ -74,13 +74,94 @@ def _nvm() -> Writer:
     return write_nvm
 
 
+def _tpt() -> Writer:
+    from pancam_graph.results.formats._tpt import write_tpt
+
+    return write_tpt
+
+
+def _tpt_text() -> Writer:
+    from pancam_graph.results.formats._tpt import write_tpt_text
+
+    return write_tpt_text
+
+
+def _nav() -> Writer:
+    from pancam_graph.results.formats._nav import write_nav
+
+    return write_nav
+
+
+def _nav_text() -> Writer:
+    from pancam_graph.results.formats._nav import write_nav_text
+
+    return write_nav_text
+
+
+def _rvf() -> Writer:
+    from pancam_graph.results.formats._rvf import write_rvf
+
+    return write_rvf
+
+
+def _vector() -> Writer:
+    from pancam_graph.results.formats._vector import write_vector
+
+    return write_vector
+
+
+def _network() -> Writer:
+    from pancam_graph.results.formats._network import write_network
+
+    return write_network
+
+
+def _tables() -> Writer:
+    from pancam_graph.results.formats._tables import write_tables
+
+    return write_tables
+
+
+def _traverse() -> Writer:
+    from pancam_graph.results.formats._traverse import write_drive
+
+    return write_drive
+
+
 _ALL = (
+    Door(
+        name="nav",
+        says="pointing corrections of marsnav, XML",
+        writer=_nav,
+        is_folder=False,
+        endings=(".nav",),
+    ),
+    Door(name="nav-text", says="the same as text", writer=_nav_text, is_folder=False),
+    Door(name="tpt", says="tie points of marsnav, XML", writer=_tpt, is_folder=False, endings=(".tpt",)),
+    Door(name="tpt-text", says="the same as the older text", writer=_tpt_text, is_folder=False),
+    Door(
+        name="rvf",
+        says="poses of the rover in its site, XML of VICAR",
+        writer=_rvf,
+        is_folder=False,
+        endings=(".rvf",),
+    ),
+    Door(name="vector", says="tracks and cameras for VECTOR", writer=_vector),
     Door(name="colmap", says="COLMAP model with undistorted images", writer=_colmap),
     Door(name="cahvor", says="camera of each image as JPL's tools print it", writer=_cahvor),
     Door(name="tsai", says="pinhole of each image for the Ames Stereo Pipeline", writer=_tsai),
     Door(name="csm", says="CSM Frame state of each image for ISIS and the Ames Stereo Pipeline", writer=_csm),
     Door(name="bundler", says="bundle.out with undistorted images", writer=_bundler),
     Door(name="nvm", says="scene.nvm of VisualSFM with undistorted images", writer=_nvm),
+    Door(
+        name="control-network",
+        says="ISIS control network as CSV",
+        writer=_network,
+        is_folder=False,
+        endings=(".csv",),
+    ),
+    Door(name="tables", says="tables of all results with sigmas, CSV", writer=_tables),
+    Door(name="traverse", says="a drive that refine reads", writer=_traverse),
 )
 DOORS = {door.name: door for door in _ALL}
 """The formats by name, in the order of help."""

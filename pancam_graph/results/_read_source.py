@@ -1,5 +1,6 @@
 """What files for other programs are made from, read: a folder of results, a traverse, or one camera."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray, pose_arrays, so3_log
+from pancam_graph.base.regular_files import instead_of_file
 from pancam_graph.cameras import FIELD_SHAPE, Camera, FieldCamera
 from pancam_graph.data import (
     ENTRIES,
@@ -20,15 +22,15 @@ from pancam_graph.data import (
     Stop,
     Traverse,
 )
-from pancam_graph.io import NpzFile, prefixed, read_cahvor, read_input
-from pancam_graph.io.vicar import picture_identities
+from pancam_graph.io import NpzFile, prefixed, read_cahvor, read_input, with_network
+from pancam_graph.io.vicar import picture_identities, read_nav, read_ties, with_pointing, with_ties
 from pancam_graph.results._ply import read_points
 from pancam_graph.results._solution_json import SolutionFile
 from pancam_graph.results._solved_folder import SOLUTION_JSON, camera_poses, read_solved
 from pancam_graph.results.formats import Source
 from pancam_graph.rigs import Eye, Rig
 
-__all__ = ["camera_source", "read_any", "results_source", "traverse_source"]
+__all__ = ["TAKEN_IN", "camera_source", "read_any", "results_source", "traverse_source"]
 
 _RESIDUALS = "residuals.npz"
 _POINTS = "points.ply"
@@ -236,12 +238,41 @@ def _pair(first: float | None, second: float | None) -> list[float]:
 
 
 def read_any(path: Path, images: Path | None) -> Source:
-    """The source of a path: a folder of results, a folder of a drive, or a `.cahvor` file.
+    """The source of a path: a folder of results, a folder of a drive, or a file.
 
-    Raises InputError for anything else, and as its reader does.
+    A file of ties, pointings or a control network is taken into the drive of the folder `images`; any other
+    is read as a `.cahvor` file. Raises InputError as the reader does.
     """
     if path.is_dir():
         if (path / SOLUTION_JSON).exists():
             return results_source(path, images)
         return traverse_source(read_input(path))
-    return camera_source(path)
+    take = TAKEN_IN.get(path.suffix.lower())
+    if take is None:
+        return camera_source(path)
+    other = instead_of_file(path)
+    if other is not None:
+        raise InputError(f"{path}: expected a file, found {other}")
+    if images is None:
+        raise InputError(f"{path}: expected the folder of its pictures (--images), found none told")
+    given = read_input(images)
+    traverse = take(given, path)
+    source = traverse_source(traverse)
+    source.warnings.extend(traverse.warnings[len(given.warnings) :])
+    return source
+
+
+def _with_ties(traverse: Traverse, path: Path) -> Traverse:
+    return with_ties(traverse, read_ties(path), path)
+
+
+def _with_pointing(traverse: Traverse, path: Path) -> Traverse:
+    return with_pointing(traverse, read_nav(path), path)
+
+
+TAKEN_IN: Mapping[str, Callable[[Traverse, Path], Traverse]] = {
+    ".tpt": _with_ties,
+    ".nav": _with_pointing,
+    ".csv": with_network,
+}
+"""What takes a file of another program into a drive, by the file's ending."""

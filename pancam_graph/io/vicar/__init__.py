@@ -16,3 +16,9 @@ from pancam_graph.io.vicar._tie_file import TieFile as TieFile
 from pancam_graph.io.vicar._tie_file import read_ties as read_ties
 from pancam_graph.io.vicar._tie_file import tie_text as tie_text
 from pancam_graph.io.vicar._tie_file import tie_xml as tie_xml
+from pancam_graph.io.vicar._traverse_of_files import Mark as Mark
+from pancam_graph.io.vicar._traverse_of_files import TieSigmas as TieSigmas
+from pancam_graph.io.vicar._traverse_of_files import image_rows as image_rows
+from pancam_graph.io.vicar._traverse_of_files import joined as joined
+from pancam_graph.io.vicar._traverse_of_files import with_pointing as with_pointing
+from pancam_graph.io.vicar._traverse_of_files import with_ties as with_ties

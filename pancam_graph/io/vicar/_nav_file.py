@@ -171,10 +171,17 @@ def nav_text(entries: Iterable[NavEntry]) -> str:
     return "\n".join([*lines, ""])
 
 
-def nav_xml(entries: Iterable[NavEntry], *, mission: str, solution_id: str, ground: FloatArray) -> str:
+def nav_xml(
+    entries: Iterable[NavEntry],
+    *,
+    mission: str,
+    solution_id: str,
+    ground: FloatArray | None,
+    ground_in: ReferenceFrame,
+) -> str:
     """The content of a `.nav` as XML, numbers with all their digits.
 
-    `ground` (2, 3) is a point of the ground and its normal, in the site frame, z down.
+    `ground` (2, 3) is a point of the ground and its normal, in the frame `ground_in`; None: not known.
     """
     named = quoteattr(solution_id)
     lines = [
@@ -187,11 +194,9 @@ def nav_xml(entries: Iterable[NavEntry], *, mission: str, solution_id: str, grou
         f"    <entry solution_id={named}/>",
         "  </priority>",
     ]
-    site = 0
     for entry in entries:
         who = entry.identity
-        assert who is not None and entry.models is not None and entry.models_in is not None
-        site = who.place[0]
+        assert who is not None  # a writer knows
         names = (*who.pointing_names, "Twist")
         lines.append(f'  <solution index1="{who.place[0]}" index2="{who.place[1]}" solution_id={named}>')
         lines.append(
@@ -199,18 +204,20 @@ def nav_xml(entries: Iterable[NavEntry], *, mission: str, solution_id: str, grou
             f"instrument={quoteattr(who.instrument)} unique_id={quoteattr(who.unique_id)}>"
         )
         lines += _parameters("original_parameters", who.pointing_type, names, entry.original_deg, "      ")
-        lines += _model("original_camera_model", entry.models[0], entry.models_in, "      ")
+        if entry.models is not None and entry.models_in is not None:
+            lines += _model("original_camera_model", entry.models[0], entry.models_in, "      ")
         lines.append("    </image>")
         lines += _parameters("pointing_parameters", who.pointing_type, names, entry.pointing_deg, "    ")
-        lines += _model("camera_model", entry.models[1], entry.models_in, "    ")
+        if entry.models is not None and entry.models_in is not None:
+            lines += _model("camera_model", entry.models[1], entry.models_in, "    ")
         lines.append("  </solution>")
-    keys = ("X", "Y", "Z", "Normal_X", "Normal_Y", "Normal_Z")
-    lines.append(f'  <surface_model type="TiltedPlane" solution_id={named}>')
-    lines += [
-        f'    <parameter id="{k}" value="{v!r}"/>' for k, v in zip(keys, ground.ravel().tolist(), strict=True)
-    ]
-    lines.append(f"    <reference_frame{ReferenceFrame(name='SITE_FRAME', index=(site,)).attributes()}/>")
-    return "\n".join([*lines, "  </surface_model>", "</pointing_correction>", ""])
+    if ground is not None:
+        keys = ("X", "Y", "Z", "Normal_X", "Normal_Y", "Normal_Z")
+        lines.append(f'  <surface_model type="TiltedPlane" solution_id={named}>')
+        for key, value in zip(keys, ground.ravel().tolist(), strict=True):
+            lines.append(f'    <parameter id="{key}" value="{value!r}"/>')
+        lines += [f"    <reference_frame{ground_in.attributes()}/>", "  </surface_model>"]
+    return "\n".join([*lines, "</pointing_correction>", ""])
 
 
 def _parameters(

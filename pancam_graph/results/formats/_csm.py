@@ -32,12 +32,12 @@ def write_csm(source: Source, folder: Path) -> None:
 
 
 def _state(source: Source, image: int, lens: Brown) -> str:
-    pose = source.world_T_camera(image)
+    pose = source.body_T_camera(image)
     w, x, y, z = wxyz_from_rotation(pose.rotation().matrix()).tolist()
     f = lens.fx_px
     to_pixel = np.array([[1.0, lens.skew_px / f], [0.0, lens.fy_px / f]])
     to_plane = np.linalg.inv(to_pixel)
-    identity = source.identities[image]
+    identity, site = source.identities[image], source.solution.traverse.site
     state = {
         "m_modelName": _MODEL,
         "m_sensorName": identity.instrument,
@@ -49,15 +49,15 @@ def _state(source: Source, image: int, lens: Brown) -> str:
         "m_transX": [0.0, float(to_plane[0, 1]), float(to_plane[0, 0])],
         "m_transY": [0.0, float(to_plane[1, 1]), float(to_plane[1, 0])],
         "m_boresight": [0.0, 0.0, 1.0],
-        "m_majorAxis": _NO_PLANET_M,
-        "m_minorAxis": _NO_PLANET_M,
+        "m_majorAxis": _NO_PLANET_M if site is None else site.shape.equator_m,
+        "m_minorAxis": _NO_PLANET_M if site is None else site.shape.pole_m,
         "m_spacecraftVelocity": [0.0, 0.0, 0.0],
         "m_sunPosition": [0.0, 0.0, 0.0],
         "m_startingDetectorSample": 0.0,
         "m_startingDetectorLine": 0.0,
         "m_detectorSampleSumming": 1.0,
         "m_detectorLineSumming": 1.0,
-        "m_targetName": "",
+        "m_targetName": "" if site is None else site.body,
         "m_ifov": 0.0,
         "m_instrumentID": identity.instrument,
         "m_focalLengthEpsilon": 0.0,

@@ -54,7 +54,7 @@ def write_brown_cameras(
         each = "; ".join(f"{n}: up to {b.max_px:.2g} px, RMS {b.rms_px:.2g} px" for n, b in worst.items())
         source.warnings.append(f"{kind}: files hold Brown's distortion alone, which misses {each}")
     about = {
-        "frame": "world",
+        "frame": "world" if solution.traverse.site is None else "body",
         "cameras": [
             {"camera": name, "max_px": lens.max_px, "rms_px": lens.rms_px, "range_m": lens.range_m}
             for name, lens in missed.items()

@@ -40,10 +40,17 @@ class Source:
         )
         return np.flatnonzero(good).tolist()
 
-    def world_T_camera(self, image: int) -> gtsam.Pose3:
-        """The pose of an image's camera."""
-        final = self.solution.final
-        return gtsam.Pose3(gtsam.Rot3(final.world_R_camera[image]), final.world_t_camera[image])
+    def body_T_camera(self, image: int) -> gtsam.Pose3:
+        """The pose of an image's camera in the body's own frame, where the drive has a place on one.
+
+        Else in the world.
+        """
+        final, site = self.solution.final, self.solution.traverse.site
+        pose = gtsam.Pose3(gtsam.Rot3(final.world_R_camera[image]), final.world_t_camera[image])
+        if site is None:
+            return pose
+        rotation, origin = site.body_frame
+        return gtsam.Pose3(gtsam.Rot3(rotation), origin) * pose
 
     def range_m(self, image: int) -> float:
         """Median range of the landmarks that an image's camera sees in all its images; 10 m without any."""

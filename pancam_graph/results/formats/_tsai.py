@@ -20,7 +20,7 @@ def write_tsai(source: Source, folder: Path) -> None:
 
 
 def _text(source: Source, image: int, lens: Brown) -> str:
-    pose = source.world_T_camera(image)
+    pose = source.body_T_camera(image)
     lines = [
         "VERSION_4",
         "PINHOLE",
