@@ -54,6 +54,7 @@ from pancam_graph.data._solution import Seconds as Seconds
 from pancam_graph.data._solution import Solution as Solution
 from pancam_graph.data._solution import State as State
 from pancam_graph.data._solution import rms_px as rms_px
+from pancam_graph.data._surface import MapImage as MapImage
 from pancam_graph.data._surface import Surface as Surface
 from pancam_graph.data._traverse import UNKNOWN_RAD as UNKNOWN_RAD
 from pancam_graph.data._traverse import VAGUE_RAD as VAGUE_RAD

@@ -9,7 +9,7 @@ from pancam_graph.base.arrays import float_array
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import BoolArray, FloatArray
 
-__all__ = ["Surface"]
+__all__ = ["MapImage", "Surface"]
 
 _LEAST_NODES = 4
 """Nodes along an axis that an interpolated height depends on."""
@@ -69,3 +69,15 @@ class Surface:
             first_m=self.first_m + begin * self.step_m,
             height_m=self.height_m[begin[1] : end[1], begin[0] : end[0]],
         )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MapImage:
+    """A picture of the ground from above, as from orbit, on a grid along the world's axes."""
+
+    first_m: FloatArray
+    """(2,) x and y in the world of the middle of the pixel of row 0 and column 0"""
+    step_m: FloatArray
+    """(2,) x from column to column, y from row to row: negative where the first row is the northernmost"""
+    grey: FloatArray
+    """(rows, columns) brightness; NaN where there is none"""

@@ -46,6 +46,7 @@ from pancam_graph.io._schema import SharingEntry as SharingEntry
 from pancam_graph.io._schema import SiteEntry as SiteEntry
 from pancam_graph.io._schema import TraverseFile as TraverseFile
 from pancam_graph.io._seen_pictures import picture_digests as picture_digests
+from pancam_graph.io._surfaces import read_map_image as read_map_image
 from pancam_graph.io._surfaces import read_surface as read_surface
 from pancam_graph.io._traverse_json import read_traverse as read_traverse
 from pancam_graph.io._traverse_json import traverse_entries as traverse_entries

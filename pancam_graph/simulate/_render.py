@@ -208,23 +208,38 @@ class Rendering:
         width leaves them out. NaN beyond the world's edge. Raises InputError for a footprint that is not
         above 0.
         """
+        above, distance, _ = self._from_above(xy_m, footprint_m, lit=False)
+        return np.where(np.isfinite(distance), above - distance, np.nan)
+
+    def light_from_above(self, xy_m: FloatArray, footprint_m: float) -> FloatArray:
+        """Radiance (n,) that goes up from x and y (n, 2), as an orbiter sees it; see `heights_m`.
+
+        Shadows are those of the drive's images. Detail finer than the footprint is left out, not averaged.
+        """
+        _, distance, light = self._from_above(xy_m, footprint_m, lit=True)
+        return np.where(np.isfinite(distance), light, np.nan)
+
+    def _from_above(
+        self, xy_m: FloatArray, footprint_m: float, *, lit: bool
+    ) -> tuple[float, FloatArray, FloatArray]:
+        """A height above all, and the distances down from there (n,) and the light (n,) at x and y (n, 2)."""
         if not footprint_m > 0:
             raise InputError(f"rendering: footprint_m: expected a number above 0, found {footprint_m}")
         places = np.asarray(xy_m, dtype=float).reshape(-1, 2)
         above = max(self._scene.top_m, self._scene.rock_top_m) + 1.0
         down, deck = np.array([0.0, 0.0, -1.0]), self._deck(0, seen=False)
-        heights = np.empty(len(places))
+        distance, light = np.empty(len(places)), np.empty(len(places))
 
         def some(begin: int, end: int) -> None:
             n = end - begin
             ground = _rays.heights(self._scene, places[begin:end])
             from_m = np.column_stack([places[begin:end], np.full(n, above)])
             width = footprint_m / np.maximum(above - ground, 1e-3)
-            distance = _trace(self._scene, deck, from_m, np.tile(down, (n, 1)), width, lit=False).distance_m
-            heights[begin:end] = np.where(np.isfinite(distance), above - distance, np.nan)
+            traced = _trace(self._scene, deck, from_m, np.tile(down, (n, 1)), width, lit=lit)
+            distance[begin:end], light[begin:end] = traced.distance_m, traced.light
 
         in_parallel(some, len(places), grain=_BAND_PX * _BAND_PX)
-        return heights
+        return above, distance, light
 
     def _camera(self, row: int) -> tuple[FloatArray, FloatArray]:
         """world_R_camera and the camera's place, in truth."""

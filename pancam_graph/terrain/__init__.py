@@ -8,6 +8,8 @@ from pancam_graph.terrain._extra import require_extra as require_extra
 from pancam_graph.terrain._make import Fused as Fused
 from pancam_graph.terrain._make import Terrain as Terrain
 from pancam_graph.terrain._make import make_terrain as make_terrain
+from pancam_graph.terrain._registration import Registration as Registration
+from pancam_graph.terrain._registration import register_stop as register_stop
 from pancam_graph.terrain._shown import Relief as Relief
 from pancam_graph.terrain._shown import ShownSurface as ShownSurface
 from pancam_graph.terrain._shown import WrittenTerrain as WrittenTerrain

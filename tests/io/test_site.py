@@ -140,9 +140,7 @@ def test_a_map_needs_a_site_and_the_sites_body(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected a map with planetocentric latitudes, on a sphere, found"):
         read_surface(flat, np.zeros((1, 2)), GALE)
     aside = replace(GALE, longitude_deg=137.9)
-    with pytest.raises(
-        InputError, match=r"dem.tif: expected heights within 1000 m of the stops, found them at"
-    ):
+    with pytest.raises(InputError, match=r"dem.tif: expected data within 1000 m of the stops, found it at"):
         read_surface(mapped(path, GALE, PLATE.format(3396190)), np.zeros((1, 2)), aside)
 
 

@@ -52,14 +52,14 @@ def test_only_what_is_near_the_stops_is_read(tmp_path: Path) -> None:
 
 
 WRONG: dict[str, tuple[dict[str, Any], str]] = {
-    "a map projection": ({"crs": MARS}, "expected heights in the world frame of the traverse .*Mars plate"),
+    "a map projection": ({"crs": MARS}, "expected it in the world frame of the traverse .*Mars plate"),
     "turned": (
         {"transform": rasterio.Affine(2.0, 0.1, 0.0, 0.1, -2.0, 0.0)},
         "expected columns along x and rows along y, found a turned raster",
     ),
     "elsewhere": (
         {"transform": rasterio.Affine(2.0, 0.0, 9e5, 0.0, -2.0, 0.0)},
-        "expected heights within 1000 m of the stops, found them at x 900001 to 900019 m, y -11 to -1 m",
+        "expected data within 1000 m of the stops, found it at x 900001 to 900019 m, y -11 to -1 m",
     ),
 }
 
