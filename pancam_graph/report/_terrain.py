@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pancam_graph.report._escaped import escape
 from pancam_graph.report._numbers import Json
 from pancam_graph.report._packed import HEAD, packed
+from pancam_graph.report._section import section_figures
 from pancam_graph.report._style import STYLE
 from pancam_graph.report._terrain_script import TERRAIN_SCRIPT, UNKNOWN
 from pancam_graph.terrain import Relief, ShownSurface, WrittenTerrain
@@ -50,6 +51,12 @@ _STYLE = """
 #terrain-profile .band { fill: var(--after); opacity: 0.25; stroke: none; }
 #terrain-profile .refined { fill: none; stroke: var(--after); stroke-width: 2; }
 #terrain-profile .telemetry { fill: none; stroke: #d55e00; stroke-width: 1.5; stroke-dasharray: 5 4; }
+.section { width: 100%; height: auto; display: block; border: 1px solid var(--line); border-radius: 6px; }
+.section text { fill: var(--ink); font-size: 15px; }
+.section .grid { stroke: var(--line); }
+.section path { fill: none; stroke-width: 2; }
+.section .first { stroke: var(--after); }
+.section .second { stroke: #d55e00; }
 #terrain a { color: var(--after); }
 .controls button { font: inherit; padding: 3px 14px; min-width: 6em; cursor: pointer; }
 .controls button[aria-pressed=true] { background: var(--after); color: #ffffff; border-style: inset; }
@@ -88,6 +95,7 @@ def terrain_section(written: WrittenTerrain, folder: str) -> str:
         'aria-label="Heights along the line"></svg>\n'
         '<p class="caption" id="terrain-readout" aria-live="polite"></p></div></div>\n'
         f'<p class="caption">{escape(_CAPTION + more)}</p>\n'
+        f"{section_figures(written.section, written.frame_ids) if written.section is not None else ''}"
         f'<script type="application/json" id="terrain-surfaces">{text}</script>\n'
         f'<script type="text/plain" id="packed-terrain">{packed(numbers)}</script>\n'
         f"<script>{TERRAIN_SCRIPT}</script>\n</section>\n"

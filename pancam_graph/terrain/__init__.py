@@ -10,6 +10,7 @@ from pancam_graph.terrain._make import Terrain as Terrain
 from pancam_graph.terrain._make import make_terrain as make_terrain
 from pancam_graph.terrain._registration import Registration as Registration
 from pancam_graph.terrain._registration import register_stop as register_stop
+from pancam_graph.terrain._section import Section as Section
 from pancam_graph.terrain._shown import Relief as Relief
 from pancam_graph.terrain._shown import ShownSurface as ShownSurface
 from pancam_graph.terrain._shown import WrittenTerrain as WrittenTerrain

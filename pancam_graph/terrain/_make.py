@@ -16,6 +16,7 @@ from pancam_graph.terrain import kernel
 from pancam_graph.terrain._agreement import Agreement, agreement_of
 from pancam_graph.terrain._drive import Drive, Pair, stereo_pairs
 from pancam_graph.terrain._grid import Grid, Layer, grid_around
+from pancam_graph.terrain._section import Section, section_of
 from pancam_graph.terrain._surface import Points, ground_spacing_m, surface_of
 from pancam_graph.terrain._terrain_options import TerrainOptions
 
@@ -68,6 +69,8 @@ class Terrain:
     clouds: dict[str, Cloud]
     """By stop."""
     agreement: Agreement
+    section: Section | None
+    """Two frames that telemetry puts far apart, in section; None where no two see the same ground."""
     pairs: tuple[Pair, ...]
     warnings: tuple[str, ...]
 
@@ -168,11 +171,13 @@ def make_terrain(
         for stop in traverse.stops
         if stop.id in stop_of
     }
+    agreement = agreement_of(layers, before, traverse.frame_stop)
     return Terrain(
         drive=fuse(grid, layers, before),
         stops={n: fuse(grid, [e.refined for e in of], _telemetry_layers(of)) for n, of in of_stop.items()},
         clouds={n: _cloud(of) for n, of in of_stop.items()},
-        agreement=agreement_of(layers, before, traverse.frame_stop),
+        agreement=agreement,
+        section=section_of(agreement, layers, before, grid),
         pairs=tuple(e.pair for e in frames),
         warnings=tuple(warnings),
     )

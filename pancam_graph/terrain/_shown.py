@@ -12,6 +12,7 @@ from pancam_graph.charts import Picture, encoded
 from pancam_graph.terrain._grid import Grid
 from pancam_graph.terrain._make import Fused
 from pancam_graph.terrain._pictures import hillshade_grey
+from pancam_graph.terrain._section import Section
 
 __all__ = ["Relief", "ShownSurface", "WrittenTerrain", "shown_surface"]
 
@@ -56,6 +57,9 @@ class WrittenTerrain:
     """The drive, then its stops; of a drive of one stop the drive alone."""
     lines: tuple[str, ...]
     """What was found, in words."""
+    section: Section | None
+    frame_ids: tuple[str, ...]
+    """Id of each frame of the traverse."""
     warnings: tuple[str, ...]
 
 

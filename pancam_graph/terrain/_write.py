@@ -93,7 +93,13 @@ def write_terrain(
     }
     text = json.dumps(whole, indent=1, allow_nan=False, ensure_ascii=False)
     (folder / TERRAIN_INDEX).write_text(text + "\n", encoding="utf-8", newline="\n")
-    return WrittenTerrain(surfaces=tuple(surfaces), lines=tuple(terrain.says()), warnings=terrain.warnings)
+    return WrittenTerrain(
+        surfaces=tuple(surfaces),
+        lines=tuple(terrain.says()),
+        section=terrain.section,
+        frame_ids=tuple(frame.id for frame in traverse.frames),
+        warnings=terrain.warnings,
+    )
 
 
 def _write_set(

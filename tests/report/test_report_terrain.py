@@ -12,7 +12,7 @@ import pytest
 from pancam_graph.base.geometry import FloatArray
 from pancam_graph.report._terrain import make_terrain_page, terrain_section
 from pancam_graph.report._terrain_script import UNKNOWN
-from pancam_graph.terrain import Fused, ShownSurface, WrittenTerrain
+from pancam_graph.terrain import Fused, Section, ShownSurface, WrittenTerrain
 from pancam_graph.terrain._grid import Grid
 from pancam_graph.terrain._shown import shown_surface
 
@@ -36,7 +36,21 @@ def surface(title: str = "stop A", size: int = 90, *, telemetry: bool = True) ->
 
 
 def written(*surfaces: ShownSurface) -> WrittenTerrain:
-    return WrittenTerrain(surfaces=surfaces, lines=("3 stereo frames",), warnings=())
+    along = np.linspace(0.0, 3.0, 61)
+    section = Section(
+        frames=(0, 2),
+        ends_m=((1.0, 2.0), (4.0, 2.0)),
+        along_m=along,
+        refined_m=np.array([0.1 * along, np.where(along > 2, np.nan, 0.1 * along)], dtype=np.float32),
+        telemetry_m=np.array([0.1 * along, 0.1 * along + 0.2], dtype=np.float32),
+    )
+    return WrittenTerrain(
+        surfaces=surfaces,
+        lines=("3 stereo frames",),
+        section=section,
+        frame_ids=("f0", "f1", "<f2>"),
+        warnings=(),
+    )
 
 
 def described(page: str) -> list[dict[str, Any]]:
@@ -96,3 +110,24 @@ def test_names_cannot_leave_their_place() -> None:
     page = terrain_section(written(surface("</script><script>alert(1)")), "terrain/")
     assert "<script>alert(1)" not in page
     assert 'href="terrain/A/mesh.glb"' in page
+
+
+def drawn(panel: str, name: str) -> FloatArray:
+    """Corners (n, 2) of the longest line of a class in a panel."""
+    paths = re.findall(rf'<path class="{name}" d="([^"]*)"', panel)
+    corners = re.findall(r"[ML]([\d.-]+) ([\d.-]+)", max(paths, key=len))
+    return np.array(corners, dtype=float)
+
+
+def test_two_frames_in_section_part_with_telemetry_and_meet_refined() -> None:
+    page = terrain_section(written(surface()), "")
+    before, after = re.findall(r'<svg class="section".*?</svg>', page, flags=re.DOTALL)
+    a, b = drawn(before, "first"), drawn(before, "second")
+    np.testing.assert_allclose(a[:, 0], b[:, 0])
+    gap = (a - b)[:, 1]
+    assert gap.min() > 50  # pixels: the second frame lies higher
+    np.testing.assert_allclose(gap, gap[0], atol=0.2)
+    a, b = drawn(after, "first"), drawn(after, "second")
+    assert len(b) == 41  # what the second frame does not see is a gap
+    np.testing.assert_allclose(a[: len(b)], b, atol=0.2)
+    assert "f0 and &lt;f2&gt; see of the same ground, in section from (1.0, 2.0) to (4.0, 2.0) m" in page
