@@ -31,7 +31,7 @@ class Section:
 def section_of(
     agreement: Agreement, refined: Sequence[Layer], telemetry: Sequence[Layer], grid: Grid
 ) -> Section | None:
-    """The section of the pair of frames that telemetry puts farthest apart, where most can be compared.
+    """A section of the two frames that share most cells, of those that telemetry puts apart by the median.
 
     It runs along the row or the column of the grid in which both frames see most cells with either pointing.
     None where no two frames do.
@@ -39,7 +39,8 @@ def section_of(
     pairs = [p for p in agreement.pairs if np.isfinite(p.telemetry_m) and np.isfinite(p.refined_m)]
     if not pairs:
         return None
-    pair = max(pairs, key=lambda p: p.telemetry_m)
+    middle = agreement.median_m("telemetry")
+    pair = max((p for p in pairs if p.telemetry_m >= middle), key=lambda p: p.cells)
     of = [{layer.frame: layer for layer in layers} for layers in (refined, telemetry)]
     layers = [each[frame] for each in of for frame in pair.frames]
     top, left = (min(layer.box[k].start for layer in layers) for k in (0, 1))

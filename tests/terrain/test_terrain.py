@@ -75,11 +75,11 @@ def test_refined_surfaces_agree_and_those_of_telemetry_do_not(terrain: Terrain) 
     assert terrain.agreement.median_m("refined", same_stop=True) < 0.003
 
 
-def test_the_section_shows_the_pair_that_telemetry_puts_farthest_apart(terrain: Terrain) -> None:
+def test_the_section_shows_two_frames_that_telemetry_puts_apart(terrain: Terrain) -> None:
     section = terrain.section
     assert section is not None
-    worst = max(terrain.agreement.pairs, key=lambda p: p.telemetry_m)
-    assert section.frames == worst.frames
+    apart_m = {p.frames: p.telemetry_m for p in terrain.agreement.pairs}
+    assert apart_m[section.frames] >= terrain.agreement.median_m("telemetry")
     assert len(section.along_m) == section.refined_m.shape[1] > 10
     assert np.linalg.norm(np.subtract(*section.ends_m)) == pytest.approx(section.along_m[-1])
     apart = [np.nanmedian(np.abs(np.diff(h, axis=0))) for h in (section.telemetry_m, section.refined_m)]
