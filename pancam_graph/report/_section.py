@@ -29,8 +29,9 @@ def section_figures(section: Section, frame_ids: tuple[str, ...]) -> str:
     (ax, ay), (bx, by) = section.ends_m
     caption = (
         f"What the frames {names[0]} and {names[1]} see of the same ground, in section from "
-        f"({ax:.1f}, {ay:.1f}) to ({bx:.1f}, {by:.1f}) m: of the pairs that telemetry "
-        "puts farther apart than most, the one that shares most ground. Heights are enlarged against lengths; gaps are ground that the frame does not see."
+        f"({ax:.1f}, {ay:.1f}) to ({bx:.1f}, {by:.1f}) m: of the pairs that telemetry puts farther apart "
+        "than most, the one that shares most ground. Heights are enlarged against lengths; gaps are ground "
+        "that the frame does not see."
     )
     return (
         f'<h3>Two frames in section</h3>\n<div class="pair">{panels}</div>\n'
