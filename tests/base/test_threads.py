@@ -12,6 +12,7 @@ import pytest
 
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.threads import each, in_order, in_parallel, n_workers
+from support.parameters import slow_but_for
 
 
 def wait_at(barrier: threading.Barrier) -> None:
@@ -172,7 +173,7 @@ def test_after_an_interrupt_ranges_are_for_all_threads_again(monkeypatch: pytest
         pytest.param("pass", marks=pytest.mark.slow),
         pytest.param("import scipy.linalg", marks=pytest.mark.slow),
         "with blas_on_one_thread(): pass\nimport cv2",
-        "from pancam_graph import solve, find_observations",
+        pytest.param("from pancam_graph import solve, find_observations", marks=pytest.mark.slow),
     ],
 )
 def test_every_blas_that_is_loaded_within_has_one_thread(before: str) -> None:
@@ -235,7 +236,7 @@ all_done.set()
 
 
 @pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="BLAS has one thread anyway")
-@pytest.mark.parametrize("enters_first", [True, False])
+@pytest.mark.parametrize("enters_first", slow_but_for([True], [True, False]))
 def test_blas_has_its_threads_again_when_the_last_of_several_contexts_ends(enters_first: bool) -> None:
     """Contexts of two threads that overlap: the first that leaves has set the limit, or found it set."""
     environment = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}

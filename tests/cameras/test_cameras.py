@@ -263,7 +263,7 @@ def test_pinhole_of_a_cahv_is_the_same_camera() -> None:
 finite = st.floats(-1, 1)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     w=st.tuples(finite, finite, finite),
     c=st.tuples(finite, finite, finite),

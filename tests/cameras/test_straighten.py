@@ -16,19 +16,20 @@ from pancam_graph.cameras import (
     straightening_map,
 )
 from support.lenses import ALL, BROWN, CAHVORE_CAMERA, PINHOLE, pixels
-from support.parameters import slow_but_for
 
 RANGE_M = 6.0
 DISTORTED = {name: camera for name, camera in ALL.items() if name != "pinhole"}
 
 
-@pytest.mark.parametrize("name", slow_but_for("cahvor", DISTORTED))
-def test_all_pixels_of_the_image_are_within_and_the_frame_is_tight(name: str) -> None:
+@pytest.mark.parametrize("name", DISTORTED)
+def test_the_image_is_within_and_the_frame_is_tight(name: str) -> None:
     camera = DISTORTED[name]
     straight = straightened(camera, RANGE_M)
     assert straight.skew_px == 0
     assert (straight.fx_px, straight.fy_px) == (camera.pinhole.fx_px, camera.pinhole.fy_px)
     uv = np.stack(np.meshgrid(np.arange(640.0), np.arange(480.0)), -1).reshape(-1, 2)
+    at_the_edge = ((uv == 0) | (uv == [639, 479])).any(axis=1)
+    uv = uv[at_the_edge | (uv % 8 == 0).all(axis=1)]
     seen, _, valid = straight_pixels(camera, straight, uv, np.full(len(uv), RANGE_M))
     assert valid.all()
     assert (seen > -1e-5).all()

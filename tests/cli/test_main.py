@@ -26,6 +26,7 @@ from pancam_graph.cli._progress import Event, JsonLines, PlainLines
 from pancam_graph.cli._registry import COMMANDS
 from pancam_graph.io import rig_json
 from support import io_samples
+from support.parameters import slow_but_for
 
 Captured = pytest.CaptureFixture[str]
 
@@ -203,6 +204,7 @@ def test_a_fault_without_a_place_for_its_report(
     assert "no report of it could be written" in err
 
 
+@pytest.mark.slow
 def test_a_fault_in_a_subcommand_is_no_traceback_on_the_terminal(tmp_path: Path) -> None:
     code = (
         "import pancam_graph.simulate as _, sys\n"
@@ -280,7 +282,7 @@ def test_a_hangup_that_nohup_ignores_stays_ignored() -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals and pipes are another thing there")
-@pytest.mark.parametrize("words", ["--help", "completion bash"])
+@pytest.mark.parametrize("words", slow_but_for("--help", ["--help", "completion bash"]))
 def test_a_reader_who_leaves_early_is_no_error(words: str) -> None:
     command = f"{sys.executable} -m pancam_graph {words} | true"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from support.parameters import slow_but_for
+
 ROOT = Path(__file__).resolve().parents[2]
 TOOLS = ("bash", "cat", "cksum", "cp", "dirname", "grep", "head", "mkdir", "rm", "sed", "sort", "tail", "tee")
 
@@ -233,7 +235,9 @@ def test_tests_are_installed_with_the_locked_versions_and_serve_the_demo_too(che
     assert checkout.installations == 1
 
 
-@pytest.mark.parametrize("broken", ["interpreter gone", "does not start", "empty folder"])
+@pytest.mark.parametrize(
+    "broken", slow_but_for("does not start", ["interpreter gone", "does not start", "empty folder"])
+)
 def test_a_broken_environment_is_made_anew(checkout: Checkout, broken: str) -> None:
     checkout.stub("python3", "3.11.7")
     assert checkout.run().returncode == 0

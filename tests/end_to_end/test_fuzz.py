@@ -54,7 +54,7 @@ from support.rover_labels import (
 Case = Callable[[np.random.Generator], str]
 """Writes a mutated file, reads it, and says what it was refused with; "" for a result."""
 
-_FAST, _SLOW = 15, 300
+_FAST, _SLOW = 8, 300
 """Cases of each kind."""
 
 CASES: dict[str, Callable[[Path], Case]] = {}

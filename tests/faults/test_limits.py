@@ -72,7 +72,7 @@ def test_a_file_is_whole_old_or_whole_new_wherever_the_disk_is_full(tmp_path: Pa
 def test_results_that_are_too_large_leave_the_older_ones(tmp_path: Path) -> None:
     """Sizes at which each of the files is the one that does not fit; under the last all fit."""
     out = tmp_path / "out"
-    *short, enough = results_under("RLIMIT_FSIZE", [0, 100, 1000, 3000, 10_000, 100_000, 10**8], out)
+    *short, enough = results_under("RLIMIT_FSIZE", [0, 1000, 10_000, 10**8], out)
     for run in short:
         assert str(run["said"]).startswith(f"{out}: expected a place where results can be written, found: ")
         assert "File too large" in str(run["said"])

@@ -23,14 +23,14 @@ def traverse(rig: Rig) -> Traverse:
 
 @pytest.mark.parametrize("rig", slow_but_for([mer_navcam], [mer_navcam, exomars_pancam]))
 def test_pixels_are_left_out_at_once_only_where_they_have_no_window(rig: Callable[[], Rig]) -> None:
-    t = traverse(rig())
+    t = simulate(rig(), SimulationOptions(stops=2, pans=3, points_per_image=1), seed=0).traverse
     pairs = overlapping_pairs(t, OPTIONS, stops=np.ones((2, 2), dtype=bool))
     turned = [replace(p, a=p.b, b=p.a) for p in pairs]
     rng = np.random.default_rng(0)
     quick = 0
     for pair in rng.permutation(np.array([*pairs, *turned], dtype=object))[:12]:
         assert isinstance(pair, PairGeometry)
-        uv = rng.uniform(0, 1, (3000, 2)) * [pair.camera_a.width_px - 1, pair.camera_a.height_px - 1]
+        uv = rng.uniform(0, 1, (1000, 2)) * [pair.camera_a.width_px - 1, pair.camera_a.height_px - 1]
         window = pair.no_correction, np.diag(pair.sigma), OPTIONS.search_slack_px, OPTIONS
         found, whole = pair.segments(uv, *window), pair._segments(uv, *window)
         assert np.array_equal(found.valid, whole.valid)

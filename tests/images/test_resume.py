@@ -50,10 +50,15 @@ def results(out: Path) -> dict[str, object]:
     return {**content, "residuals": (out / "residuals.npz").read_bytes()}
 
 
-def test_an_interrupt_is_one_line_and_the_same_command_goes_on(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls: list[int] = []
+@pytest.fixture
+def calls() -> list[int]:
+    """One for each pair of images that was matched."""
+    return []
+
+
+@pytest.fixture
+def gone_on(run: Run, calls: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The results of a command that was interrupted at the third pair and given again."""
     monkeypatch.setenv("PANCAM_GRAPH_THREADS", "1")  # which pairs are done by then is counted
 
     def interrupted(*arguments: Any) -> PairMatches:
@@ -82,12 +87,22 @@ def test_an_interrupt_is_one_line_and_the_same_command_goes_on(
         "residuals.npz",
         "solution.json",
     ]
-    # The cache outlives the next results, which are the same; so are those of a run without it.
-    first = results(tmp_path / "out")
+    return tmp_path / "out"
+
+
+def test_an_interrupt_is_one_line_and_the_same_command_goes_on(gone_on: Path) -> None:
+    assert json.loads((gone_on / "solution.json").read_text())["converged"]
+
+
+@pytest.mark.slow
+def test_the_cache_outlives_results_which_are_those_without_it(
+    run: Run, gone_on: Path, calls: list[int], tmp_path: Path
+) -> None:
+    first = results(gone_on)
     before = len(calls)
     assert run(*ARGUMENTS)[0] == 0
     assert len(calls) == before
-    assert results(tmp_path / "out") == first
+    assert results(gone_on) == first
     assert run("traverse", "--out", "fresh", "--no-report")[0] == 0
     assert results(tmp_path / "fresh") == first
 

@@ -168,7 +168,7 @@ SHARINGS = st.builds(
 
 
 @settings(
-    max_examples=30,
+    max_examples=15,
     derandomize=True,
     database=None,
     deadline=None,

@@ -156,11 +156,11 @@ def near_the_first_axis(rng: np.random.Generator) -> FloatArray:
 PointsOf = Callable[[np.random.Generator], FloatArray]
 
 STATES: dict[str, PointsOf] = {
-    "random": lambda rng: random_points(rng, 40),
+    "random": lambda rng: random_points(rng, 16),
     "near identity": near_the_first_axis,
-    "far": lambda rng: random_points(rng, 40, 1e4, 1e7),
-    "near and far": lambda rng: random_points(rng, 40, 4, 1e5),
-    "beyond infinity": lambda rng: random_points(rng, 20, 50, 500) * [1, 1, 1, -1],
+    "far": lambda rng: random_points(rng, 16, 1e4, 1e7),
+    "near and far": lambda rng: random_points(rng, 16, 4, 1e5),
+    "beyond infinity": lambda rng: random_points(rng, 10, 50, 500) * [1, 1, 1, -1],
 }
 states = pytest.mark.parametrize("points_of", STATES.values(), ids=STATES)
 

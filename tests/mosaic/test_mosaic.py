@@ -24,7 +24,7 @@ from pancam_graph.mosaic import (
     make_mosaics,
     write_mosaics,
 )
-from pancam_graph.mosaic._make import stop_ground
+from pancam_graph.mosaic._make import StopGround, stop_ground
 from pancam_graph.mosaic._phase import WINDOW_PX, displacements
 from pancam_graph.mosaic._surface import directions
 from pancam_graph.mosaic._warp import largest_gap
@@ -49,6 +49,11 @@ def truth_made(truth: Solution) -> StopMosaics:
     return make_mosaics(truth, "A/1", "left", NEAR)
 
 
+@pytest.fixture(scope="module")
+def truth_ground(truth: Solution) -> StopGround:
+    return stop_ground(truth, 0)
+
+
 def shifted(noise: float, shift: FloatArray, n: int = 40) -> tuple[NDArray[Any], NDArray[Any]]:
     """Windows of a smooth random texture, and of the same displaced, cut from something larger."""
     rng = np.random.default_rng(0)
@@ -68,7 +73,7 @@ def test_displacements_of_windows_are_found(shift: tuple[float, float]) -> None:
 
 
 def test_displacements_know_how_sure_they_are() -> None:
-    found = displacements(*shifted(0.3, np.array([0.2, -0.1]), n=200))
+    found = displacements(*shifted(0.3, np.array([0.2, -0.1]), n=80))
     error = np.abs(found.shift_px - [0.2, -0.1]).max(axis=1) / found.sigma_px
     assert 0.6 < np.median(error) < 1.6
     plain = displacements(*(np.random.default_rng(k).normal(0, 1, (50, 64, 64)) for k in (1, 2)))
@@ -85,8 +90,8 @@ def test_runs_that_are_not_covered_go_round() -> None:
     assert largest_gap(np.zeros(5, dtype=bool)) == (0, 5)
 
 
-def test_the_surface_is_the_plane_and_fades_to_a_far_sky(truth: Solution) -> None:
-    ground = stop_ground(truth, 0)
+def test_the_surface_is_the_plane_and_fades_to_a_far_sky(truth_ground: StopGround) -> None:
+    ground = truth_ground
     surface = ground.surfaces["refined"]
     places = np.array([[1.0, 0.3], [2.0, 1.0], [5.0, 0.0], [8.0, -3.0]])
     points = surface.ground_m(places)
@@ -198,8 +203,8 @@ def test_a_known_point_is_at_the_pixel_that_the_index_says(truth: Solution, tmp_
         assert (np.mean(u_found), np.mean(v_found)) == pytest.approx((column, row), abs=0.7)
 
 
-def test_projections_go_to_points_and_back(truth: Solution) -> None:
-    surface = stop_ground(truth, 0).surfaces["refined"]
+def test_projections_go_to_points_and_back(truth_ground: StopGround) -> None:
+    surface = truth_ground.surfaces["refined"]
     u, v = np.array([3.0, 40.5, 90.0]), np.array([60.0, 33.25, 80.0])
     cylinder = Cylinder(
         origin_m=surface.origin_m, width_px=100, height_px=90, px_per_degree=1.5, left_deg=40.0, top_deg=-5.0
@@ -209,6 +214,7 @@ def test_projections_go_to_points_and_back(truth: Solution) -> None:
         assert projection.pixels(points) == pytest.approx(np.column_stack([u, v]), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_exposures_are_evened_out(truth_made: StopMosaics, tmp_path: Path) -> None:
     uneven = made(Scene(exposure=(1.5, 1.0, 0.7)), tmp_path)
     same, other = (m.cylinder.pictures["refined"].astype(float) for m in (truth_made, uneven))

@@ -29,6 +29,7 @@ from pancam_graph.data._sharing import parse_sharing
 from pancam_graph.io import read_traverse
 from pancam_graph.results import check_out, write_results
 from pancam_graph.rigs import Rig, rig_template
+from support.parameters import slow_for
 from support.pictures import read_picture
 
 SMALL = SimulationOptions(stops=2, pans=2, sweep_rad=0.8, points_per_image=30, outliers=0.02)
@@ -157,7 +158,7 @@ def test_colmap_adjusts_and_undistorts_it(solved: Callable[..., Solution], tmp_p
     assert 0.6 * summary.initial_cost < summary.final_cost <= summary.initial_cost
 
 
-@pytest.mark.parametrize("rig", RIGS)
+@pytest.mark.parametrize("rig", slow_for("mars2020-navcam", RIGS))
 def test_frames_times_rigs_are_the_images(solved: Callable[..., Solution], tmp_path: Path, rig: str) -> None:
     solution = solved(rig)
     write_colmap(solution, tmp_path / "colmap")
@@ -292,7 +293,7 @@ def test_an_undistorted_image_shows_what_its_pinhole_sees(
     assert dtype is np.uint8 or 3000 < white < 3700  # waves reach 0.9 of 4000
     entries = about(tmp_path / "colmap")["images"]
     assert [e["written"] for e in entries] == [True] * (len(entries) - 1) + [False]
-    for entry in entries[:4]:
+    for entry in entries[:2]:
         i = entry["image_id"] - 1
         head = next(w for w in table(tmp_path / "colmap" / "sparse" / "images.txt") if w[-1] == entry["name"])
         _, _, width, height, fx, fy, cx, cy = words[head[8]]

@@ -83,6 +83,7 @@ def test_the_estimate_is_that_of_a_batch_with_the_factors() -> None:
     )
 
 
+@pytest.mark.slow
 def test_stops_added_later_hang_on_the_factors() -> None:
     """Factors on the first three stops, then the fourth stop: the same as all at once."""
     some = factors_of(drive())[1:]

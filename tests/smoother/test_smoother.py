@@ -21,7 +21,7 @@ from pancam_graph.smoother import Update
 from pancam_graph.smoother._incremental import solve_incrementally, stops_of
 
 _SMALL = SimulationOptions(
-    stops=4, spacing_m=3.0, pans=5, tilts_rad=(-0.2,), sweep_rad=2.5, points_per_image=25, noise_px=0.3
+    stops=4, spacing_m=3.0, pans=4, tilts_rad=(-0.2,), sweep_rad=2.0, points_per_image=20, noise_px=0.3
 )
 _LOOP = SimulationOptions(
     stops=12,
@@ -180,6 +180,7 @@ def test_where_steps_do_not_settle_all_is_solved_anew(small: Simulation, batch: 
     require_batch(smoother, batch)
 
 
+@pytest.mark.slow
 def test_without_screening_all_that_is_seen_is_used() -> None:
     # Points beside the way, placed by a stereo base far off, come to lie behind the stops that pass them.
     passing = SimulationOptions(

@@ -72,7 +72,8 @@ def require_alike(a: Solution, b: Solution, sigmas: float) -> None:
     assert np.all(off <= sigmas * b.angle_sigma_rad + 1e-12)
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
 def test_a_shuffled_file_is_the_same_drive(seed: int) -> None:
     """Added in the order of the file, stops that see nothing of what is there lost their links."""
     simulation = simulated(DRIVE)

@@ -114,7 +114,8 @@ def test_the_cost_never_rises_and_is_the_true_one(name: str) -> None:
     assert turns.cost_final == pytest.approx(turns.cost_history[-1], rel=1e-9)
 
 
-@pytest.mark.parametrize("name", slow_but_for("axis, focal length", SHARED))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SHARED)
 def test_without_noise_the_truth_comes_back(name: str) -> None:
     simulation = simulate(mer_navcam(), replace(SMALL, noise_px=0.0, prior="truth"), seed=3)
     telemetry = simulation.telemetry_start

@@ -142,6 +142,7 @@ def relative_square(seed: int) -> float:
     return float(error @ np.linalg.solve(solution.relative_covariance(t.stops[1].id, t.stops[2].id), error))
 
 
+@pytest.mark.slow
 def test_errors_between_stops_are_as_large_as_their_covariance_says() -> None:
     squares = [relative_square(seed) for seed in range(40, 44)]
     assert 0.4 < np.sum(squares) / (6 * len(squares)) < 1.8  # 24 degrees of freedom: 1 +- 0.29

@@ -264,7 +264,7 @@ OPTIONS = {
 }
 
 
-@pytest.mark.parametrize("name", slow_but_for(["circle", "soft tie"], OPTIONS))
+@pytest.mark.parametrize("name", slow_but_for(["soft tie"], OPTIONS))
 def test_models_ties_and_landmarks(traverse: Traverse, found: CrossValidation, name: str) -> None:
     other = cross_validate(traverse, OPTIONS[name], halvings=1)
     assert other.warnings == ()

@@ -99,6 +99,7 @@ def test_the_graph_has_the_same_cost() -> None:
     assert graph.error(values) == pytest.approx(ours.cost_final, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_scale_that_is_considered_is_in_the_sigmas() -> None:
     """By as much as a scale of one sigma, solved again, moves each angle."""
     t = drive(noise_px=0.0, prior="truth").traverse

@@ -16,6 +16,7 @@ from pancam_graph.solve._far_terrain import far_terrain
 from pancam_graph.solve._problem import Problem
 from pancam_graph.solve._range_prior import RangePrior
 from support.far_scenes import FarScene, far_scene
+from support.parameters import slow_but_for
 from support.solving import fitted
 
 PLAIN = SolveOptions(rig="held", loss="none")
@@ -58,7 +59,7 @@ def chi2(solution: Solution, truth: FarScene) -> float:
     return float(e @ np.linalg.solve(solution.stop_covariance[1], e))
 
 
-@pytest.mark.parametrize("incremental", [False, True])
+@pytest.mark.parametrize("incremental", slow_but_for([False], [False, True]))
 def test_second_stop_is_within_its_sigmas(incremental: bool) -> None:
     by = solve_incrementally if incremental else solve
     solution = by(kilometre().traverse, PLAIN)

@@ -258,6 +258,7 @@ def normalised_square(seed: int, options: SolveOptions) -> float:
     return float(error @ np.linalg.solve(solution.stop_covariance[1], error))
 
 
+@pytest.mark.slow
 def test_errors_are_as_large_as_covariances_say() -> None:
     squares = [normalised_square(seed, HARD) for seed in range(30, 34)]
     assert 0.4 < np.sum(squares) / (6 * len(squares)) < 1.8  # 24 degrees of freedom: 1 +- 0.29

@@ -18,7 +18,7 @@ from pancam_graph.rigs import mer_navcam
 from pancam_graph.solve import Problem, prepare
 from pancam_graph.solve._joint import JointSystem, OnLastGroup
 from pancam_graph.solve._problem import system_of
-from support.parameters import slow_for
+from support.parameters import slow_but_for, slow_for
 from support.solving import fitted
 
 OPTIONS = SimulationOptions(stops=3, spacing_m=4.0, pans=3, sweep_rad=0.9, points_per_image=15)
@@ -86,7 +86,7 @@ def test_a_step_is_that_of_the_whole_system_damped_alike(model: Model, shared: b
     assert step == pytest.approx(expected, rel=1e-5, abs=1e-7 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", slow_but_for("circle", MODELS))
 def test_its_cost_is_the_true_one_wherever_it_stands(model: Model) -> None:
     problem = problem_of(model)
     system, rows = system_of(problem)

@@ -16,8 +16,9 @@ DRIVE = SimulationOptions(stops=2)
 CUTOFF_PX = 4.0 * 0.3
 
 
-@pytest.mark.parametrize("share", [pytest.param(0.4, marks=pytest.mark.slow), 0.6])
-@pytest.mark.parametrize("min_views", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.4, 0.6])
+@pytest.mark.parametrize("min_views", [2, 3])
 def test_a_drive_with_given_sigmas_is_solved(share: float, min_views: int) -> None:
     options = replace(DRIVE, outliers=share, min_views=min_views)
     simulation = simulate(TEMPLATES["mer-navcam"](), options, seed=11)

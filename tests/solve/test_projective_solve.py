@@ -153,6 +153,7 @@ def elsewhere(simulation: Simulation, offset_m: FloatArray) -> Simulation:
     )
 
 
+@pytest.mark.slow
 def test_conditioned_or_not_the_optimum_is_the_same() -> None:
     ours, raw = (solve(small().traverse, replace(TO_THE_END, normalise=n)) for n in (True, False))
     assert ours.converged
@@ -273,7 +274,8 @@ def test_errors_are_as_large_as_the_sigmas_say() -> None:
     assert np.mean(stops) == pytest.approx(6, abs=1.7)  # 3 of its sigmas
 
 
-@pytest.mark.parametrize("loss", ["none", pytest.param("huber", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("loss", ["none", "huber"])
 def test_the_number_of_threads_changes_no_bit(monkeypatch: pytest.MonkeyPatch, loss: str) -> None:
     outliers = 0.01 if loss == "huber" else 0.0
     simulation = simulate(

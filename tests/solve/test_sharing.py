@@ -220,7 +220,7 @@ def distorted() -> Rig:
     return Rig(name="distorted", pan_T_tilt=base.pan_T_tilt, eyes=tuple(eyes))
 
 
-@pytest.mark.parametrize("scope", ["eye", "stop"])
+@pytest.mark.parametrize("scope", slow_but_for("eye", ["eye", "stop"]))
 def test_a_distorted_camera_keeps_its_distortion_as_its_calibration_moves(scope: Scope) -> None:
     options = replace(TWO_TILTS, noise_px=0.0, prior="truth", focal_error=3e-3)
     simulation = simulate(distorted(), options, seed=1)
@@ -314,13 +314,8 @@ HARD_TIES = {
 }
 
 
-@pytest.mark.parametrize(
-    "sharing",
-    [
-        pytest.param(s, id=n, marks=[pytest.mark.slow] * (n != "all that flexes"))
-        for n, s in HARD_TIES.items()
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("sharing", HARD_TIES.values(), ids=HARD_TIES)
 def test_a_hard_tie_has_the_explicit_optimum_too(sharing: Sharing | None) -> None:
     ours, theirs = (
         solve(

@@ -139,6 +139,7 @@ def test_errors_have_the_variance_that_the_covariance_says(name: str, model: str
     assert abs(np.sum(stops) - 6 * seeds) < 1.96 * np.sqrt(2 * 6 * seeds)
 
 
+@pytest.mark.slow
 def test_covariances_agree_with_gtsam_marginals() -> None:
     """Landmarks marginalised by blocks here, by GTSAM's Bayes tree there (which refuses far landmarks)."""
     simulation = simulate(mer_navcam(), SMALL, seed=2)
@@ -178,6 +179,7 @@ def test_a_firm_tie_makes_all_models_agree() -> None:
     assert free.rms_final_px < circle.rms_final_px < mast.rms_final_px
 
 
+@pytest.mark.slow
 def test_same_input_same_output() -> None:
     simulation = simulate(mer_navcam(), replace(SMALL, outliers=0.03), seed=1)
     first, second = solve(simulation.traverse), solve(simulation.traverse)

@@ -76,7 +76,9 @@ CRITERIA = {
 
 @pytest.mark.parametrize(
     ("solver", "name"),
-    slow_for([("explicit", "residual_sigmas"), ("explicit", "max_gradient")], product(SOLVERS, CRITERIA)),
+    slow_for(
+        [("explicit", name) for name in CRITERIA if name != "relative_decrease"], product(SOLVERS, CRITERIA)
+    ),
 )
 def test_each_criterion_alone_ends_a_solve_and_says_so(solver: str, name: str) -> None:
     bound, reason = CRITERIA[name]
@@ -94,7 +96,7 @@ def test_the_iteration_limit_ends_a_solve_and_is_not_convergence(solver: str) ->
     assert outcome.reason == "iteration limit of 2"
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", slow_for("explicit", SOLVERS))
 def test_without_any_criterion_only_the_lack_of_a_better_step_ends_it(solver: str) -> None:
     outcome = ended(SOLVERS[solver]).outcome
     assert outcome.converged
@@ -149,6 +151,7 @@ def test_the_gradient_is_that_of_the_cost_where_landmarks_fit_best(solver: str) 
     assert profile_gradient(shortened(options).problem) > 90
 
 
+@pytest.mark.slow
 def test_the_gradient_of_explicit_landmarks_is_that_of_gtsams_error() -> None:
     """Landmarks are among the components. Held ones are not: forces push there."""
     t = traverse()
