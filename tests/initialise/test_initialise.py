@@ -21,6 +21,7 @@ from pancam_graph.initialise import (
 )
 from pancam_graph.rigs import Rig, rig_template
 from pancam_graph.simulate import Simulation, SimulationOptions, simulate
+from support.parameters import slow_but_for
 
 CENTRE = np.array([3.0, -2.0, 1.0])
 TILTED = Rotation.from_rotvec([0.3, -0.4, 0.2]).as_matrix()
@@ -185,9 +186,10 @@ def true_cameras(sim: Simulation) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 RIGS = [("mer-navcam", False), ("mer-pancam", False), ("exomars-pancam", False), ("mer-navcam", True)]
+QUICK = [("exomars-pancam", False), ("mer-navcam", True)]
 
 
-@pytest.mark.parametrize(("name", "askew"), RIGS, ids=["navcam", "pancam", "exomars", "askew"])
+@pytest.mark.parametrize(("name", "askew"), slow_but_for(QUICK, RIGS))
 def test_masts_and_angles_are_recovered_from_true_cameras(name: str, askew: bool) -> None:
     sim = simulation(name, askew=askew, prior="truth")
     start = start_from_cameras(sim.traverse, true_cameras(sim)[0])
@@ -197,7 +199,7 @@ def test_masts_and_angles_are_recovered_from_true_cameras(name: str, askew: bool
     assert start.pan_tilt_rad == pytest.approx(sim.truth.pan_tilt_rad, abs=1e-9)
 
 
-@pytest.mark.parametrize(("name", "askew"), RIGS, ids=["navcam", "pancam", "exomars", "askew"])
+@pytest.mark.parametrize(("name", "askew"), slow_but_for(QUICK, RIGS))
 def test_errors_of_telemetry_do_not_reach_the_cameras(name: str, askew: bool) -> None:
     """Only the zero of the pan is telemetry's: mast and angles turn against each other, cameras stay true."""
     sim = simulation(name, askew=askew, sigma_stop_m=2.0, sigma_stop_rad=0.05)

@@ -85,7 +85,7 @@ def shifts(rendering: Rendering, images: dict[int, FloatArray], a: int, b: int, 
     image, other = images[a], images[b]
     rng, size, out = np.random.default_rng(0), image.shape[0], []
     near = np.stack(np.meshgrid(np.arange(-half, half + 1), np.arange(-half, half + 1)), axis=-1)
-    for at in rng.integers(half, size - half, (220, 2)):
+    for at in rng.integers(half, size - half, (400, 2)):
         points, hit = rendering.points(a, (at + near).reshape(-1, 2).astype(float))
         if not hit.all():
             continue
@@ -119,7 +119,7 @@ def test_images_show_each_point_where_the_truth_has_it(
     stereo: Rendering, stereo_images: dict[int, FloatArray], a: int, b: int
 ) -> None:
     found = shifts(stereo, stereo_images, a, b)
-    assert len(found) > 40
+    assert len(found) > 80
     assert np.abs(np.median(found, axis=0)).max() < 0.02
     assert np.median(np.abs(found)) < 0.1
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 
 import gtsam
 import numpy as np
@@ -27,6 +28,7 @@ LONELY = replace(DRIVE, stops=1, pans=7, points_per_image=15)
 Solve = Callable[[Traverse, SolveOptions], Solution]
 
 
+@cache
 def drive(seed: int = 3, options: SimulationOptions = DRIVE, rig: str = "mer-navcam") -> Simulation:
     return simulate(TEMPLATES[rig](), options, seed=seed)
 

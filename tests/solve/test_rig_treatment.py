@@ -22,7 +22,7 @@ TO_THE_END = SolveOptions(loss="none", relative_decrease=1e-12)
 
 @cache
 def drive(seed: int = 3, **options: object) -> Simulation:
-    small = SimulationOptions(stops=2, pans=9, points_per_image=20)
+    small = SimulationOptions(stops=2, pans=9, points_per_image=14)
     return simulate(mer_navcam(), replace(small, **options), seed=seed)  # type: ignore[arg-type]  # by name
 
 

@@ -166,6 +166,7 @@ def test_covariances_agree_with_gtsam_marginals() -> None:
         assert solution.angle_sigma_rad[f] == pytest.approx(sigma, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_a_firm_tie_makes_all_models_agree() -> None:
     """Free cameras on a tie as firm as the mast's are the mast; looser, they fit better, never worse."""
     simulation = simulate(mer_navcam(), SMALL, seed=7)

@@ -123,7 +123,7 @@ def test_a_drive_that_was_solved_stop_by_stop_has_a_verdict() -> None:
 
 @pytest.mark.parametrize("factor", slow_but_for([0.3], [0.1, 0.3]))
 def test_sigmas_that_are_too_small_are_said_with_the_factor(factor: float) -> None:
-    solution = solve(with_sigmas(drive().traverse, factor))
+    solution = solve(with_sigmas(drive(points_per_image=20).traverse, factor))
     noise = named(solution)["noise"]
     assert not noise.passed
     assert noise.value == pytest.approx(1 / factor, rel=0.1)
@@ -131,7 +131,7 @@ def test_sigmas_that_are_too_small_are_said_with_the_factor(factor: float) -> No
 
 
 def test_sigmas_that_are_too_large_are_said_with_the_factor_and_pass() -> None:
-    solution = solve(with_sigmas(drive().traverse, 10.0))
+    solution = solve(with_sigmas(drive(points_per_image=20).traverse, 10.0))
     note = named(solution)["noise overstated"]
     assert solution.passed
     assert note.is_note
