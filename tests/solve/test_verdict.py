@@ -83,7 +83,7 @@ def test_a_wrong_baseline_is_not_odometry_that_is_wrong(rig: str) -> None:
 @pytest.mark.slow
 def test_pans_off_in_common_are_not_the_only_leg_that_is_wrong() -> None:
     """Each frame has its neighbour's pan: around a whole turn all of a stop are off by the same step."""
-    t = drive(pans=8).traverse
+    t = drive(pans=8, points_per_image=20).traverse
     pan = t.pan_tilt_rad[:, 0].copy()
     for stop in range(2):
         pan[t.frame_stop == stop] = np.roll(pan[t.frame_stop == stop], 1)
