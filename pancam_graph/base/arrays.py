@@ -34,7 +34,10 @@ def int_array(name: str, values: Any, error: type[PancamGraphError] = InputError
 
 
 def _plain_array(name: str, values: Any, expected: str, error: type[PancamGraphError]) -> NDArray[Any]:
-    if isinstance(values, np.ma.MaskedArray) and (masked := int(np.sum(np.ma.getmaskarray(values)))):
+    # NumPy imports its masked arrays when they are first asked for.
+    is_special = isinstance(values, np.ndarray) and type(values) is not np.ndarray
+    is_masked = is_special and isinstance(values, np.ma.MaskedArray)
+    if is_masked and (masked := int(np.sum(np.ma.getmaskarray(values)))):
         raise error(f"{name}: expected {expected}, found {masked} masked entries")
     try:
         return np.asarray(values)

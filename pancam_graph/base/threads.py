@@ -144,7 +144,7 @@ def blas_on_one_thread() -> Iterator[None]:
     the whole process: while several threads of it are in such a context, the last that leaves restores it.
     """
     # A controller limits the libraries that are loaded when it is made. SciPy's own BLAS may not be yet.
-    import scipy.linalg  # noqa: F401, PLC0415  loaded for the controller
+    import pancam_graph.base.lapack  # noqa: F401, PLC0415  loaded for the controller
 
     with_opencv = "cv2" in sys.modules
     _LIMIT.enter(with_opencv)

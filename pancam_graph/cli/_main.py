@@ -1,5 +1,6 @@
 """The command `pancam-graph`: its parser, and the call of a subcommand."""
 
+import os
 import sys
 from argparse import Namespace
 from collections.abc import Sequence
@@ -26,6 +27,9 @@ _DESCRIPTION = (
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `pancam-graph` with the arguments of the process, or with those given; returns the exit status."""
+    if argv is None:
+        # Pydantic would look through all installed packages for plugins of its own.
+        os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     words = list(sys.argv[1:] if argv is None else argv)
     status = status_of(lambda: _dispatched(words))
     if argv is None:

@@ -1,7 +1,6 @@
 """The export for GIS programs: GeoPackage, and of a drive on a planet GeoJSON and KML."""
 
 from pathlib import Path
-from xml.sax.saxutils import escape
 
 from pancam_graph.base.text import visible
 from pancam_graph.data import Site, Solution
@@ -40,6 +39,8 @@ def _fill(solution: Solution, folder: Path) -> None:
 
 def _kml(name: str, layers: tuple[Layer, ...], site: Site) -> str:
     """Stops and the way between them as KML."""
+    from xml.sax.saxutils import escape  # noqa: PLC0415  late: it imports what opens addresses
+
     of = {layer.name: layer.features for layer in layers}
 
     def places(at: list[list[float]]) -> str:

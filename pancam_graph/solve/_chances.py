@@ -1,9 +1,9 @@
 """Limits that right solutions exceed only by a small chance."""
 
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike
 
+from pancam_graph.base.chances import chi_square_limit, normal_limit
 from pancam_graph.base.geometry import FloatArray
 
 __all__ = ["CHANCE", "rms_limit", "two_sided_limit"]
@@ -14,10 +14,10 @@ CHANCE = 2e-4
 
 def two_sided_limit(n: int, chance: float) -> float:
     """Size that the largest of n standard normal numbers exceeds with at most this chance, either side."""
-    return float(scipy.special.ndtri(1 - chance / (2 * max(n, 1))))
+    return normal_limit(chance / (2 * max(n, 1)))
 
 
 def rms_limit(freedom: ArrayLike, chance: float) -> FloatArray:
     """RMS that the root of chi-square over its degrees of freedom (n,) exceeds with this chance (n,)."""
     n = np.maximum(freedom, 1e-3)
-    return np.asarray(np.sqrt(scipy.special.chdtri(n, chance) / n), dtype=float)
+    return np.asarray(np.sqrt(chi_square_limit(n, chance) / n))

@@ -13,7 +13,6 @@ solve that estimates the rig, or more.
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 
 from pancam_graph.base.errors import SolveError
 from pancam_graph.base.geometry import FloatArray
@@ -93,7 +92,7 @@ def _log_odds(information: FloatArray, gradient: FloatArray, rig: RigVariables) 
     except np.linalg.LinAlgError as error:
         raise SolveError("nothing holds a number of the rig") from error
     gained = 2 * np.log(np.diag(root)).sum() - np.linalg.slogdet(unit * _prior(rig))[1]
-    pull = scipy.linalg.solve_triangular(root, sigma * gradient, lower=True)
+    pull = np.linalg.solve(root, sigma * gradient)
     return float(0.5 * gained - 0.5 * pull @ pull)
 
 

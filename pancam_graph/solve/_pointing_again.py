@@ -73,7 +73,12 @@ def _suspects(problem: Problem) -> IntArray:
     if np.array_equal(n, used):
         return np.zeros(0, dtype=np.int64)
     is_free = np.array([(f.sigmas_rad > 0).all() for f in t.frames], dtype=bool)
-    lost = is_free & (n >= _LEAST) & (used < _LOST * links.usual * n) & (links.chance < _BY_CHANCE)
+    lost = (
+        is_free
+        & (n >= _LEAST)
+        & (used < _LOST * links.usual * n)
+        & (links.chance(np.arange(len(n))) < _BY_CHANCE)
+    )
     rows = np.flatnonzero(lost)
     return np.asarray(rows[np.argsort(used[rows] / n[rows], kind="stable")])
 

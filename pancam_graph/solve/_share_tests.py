@@ -72,13 +72,16 @@ class InUse:
         n = int(self.n.sum())
         return float(self.used.sum() / n) if n else 1.0
 
-    @property
-    def chance(self) -> FloatArray:
-        """(owners,) Chance of no more in use, if an owner's things were as good as all others.
+    def chance(self, of: IntArray) -> FloatArray:
+        """Chance (n,) of no more in use, if things of owners `of` (n,) were as good as all others.
 
         A few are out of use by chance too, where few are owned.
         """
-        return np.asarray(scipy.special.bdtr(self.used.astype(float), self.n, self.usual), dtype=float)
+        if not len(of):
+            return np.zeros(0)  # SciPy's part for it takes longer to import than a small solve takes
+        return np.asarray(
+            scipy.special.bdtr(self.used[of].astype(float), self.n[of], self.usual), dtype=float
+        )
 
 
 def shares_in_use(problem: Problem) -> Iterator[VerdictTest]:
@@ -180,8 +183,9 @@ class _Fairness:
             is_tested = np.isin(np.arange(len(self.ids)), among)
         n, used, usual = things.n, things.used, things.usual
         share, limit = used / n.clip(1), 1 - self.fair * usual
-        is_sure = things.chance < CHANCE / len(self.ids)
-        suspect = is_tested & (n >= self.least) & is_sure & (share < self.fair * usual)
+        suspect = is_tested & (n >= self.least) & (share < self.fair * usual)
+        few = np.flatnonzero(suspect)
+        suspect[few] = things.chance(few) < CHANCE / len(self.ids)
         tested = np.flatnonzero(suspect if suspect.any() else is_tested & (n >= self.least))
         if not len(tested):
             good = f"too few {self.what} to test a {self.owner} alone"

@@ -14,7 +14,7 @@ from pancam_graph.solve._problem import Problem
 __all__ = ["Groups", "neighbours", "random_half", "upper_half"]
 
 
-def random_half(traverse: Traverse, measurements: Measurements, lots: np.random.Generator) -> BoolArray:
+def random_half(traverse: Traverse, measurements: Measurements, lots: "np.random.Generator") -> BoolArray:
     """(landmarks,) True for one half, drawn by lot: one of every two landmarks that connect the same frames.
 
     Both halves are then equally strong everywhere, and no frame is lost without need.
