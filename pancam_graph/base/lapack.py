@@ -5,14 +5,46 @@ are loaded here without the package around them; from the package, where it keep
 """
 
 import sys
+from collections.abc import Callable
+from functools import cache
 from importlib.machinery import PathFinder
 from importlib.util import module_from_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import scipy
 
-__all__ = ["dgerqf", "dpstrf", "dtrmm", "dtrsm", "dtzrzf"]
+__all__ = ["Lapack", "lapack"]
+
+_Function = Callable[..., Any]
+
+
+class Lapack(NamedTuple):
+    """The functions, as `scipy.linalg.lapack` and `scipy.linalg.blas` document them."""
+
+    dpstrf: _Function
+    """Cholesky factorisation with pivots."""
+    dgerqf: _Function
+    """RQ factorisation."""
+    dtzrzf: _Function
+    """Trapezoid to triangle."""
+    dtrsm: _Function
+    """Solution of a triangular system."""
+    dtrmm: _Function
+    """Product with a triangular matrix."""
+
+
+@cache
+def lapack() -> Lapack:
+    """The functions; their libraries are loaded by the first call."""
+    of_lapack, of_blas = _extension("_flapack", "lapack"), _extension("_fblas", "blas")
+    return Lapack(
+        dpstrf=of_lapack.dpstrf,
+        dgerqf=of_lapack.dgerqf,
+        dtzrzf=of_lapack.dtzrzf,
+        dtrsm=of_blas.dtrsm,
+        dtrmm=of_blas.dtrmm,
+    )
 
 
 def _extension(name: str, usual: str) -> Any:
@@ -32,8 +64,3 @@ def _extension(name: str, usual: str) -> Any:
         del sys.modules[full]
         return getattr(scipy.linalg, usual)
     return module
-
-
-_LAPACK, _BLAS = _extension("_flapack", "lapack"), _extension("_fblas", "blas")
-dpstrf, dgerqf, dtzrzf = _LAPACK.dpstrf, _LAPACK.dgerqf, _LAPACK.dtzrzf
-dtrsm, dtrmm = _BLAS.dtrsm, _BLAS.dtrmm

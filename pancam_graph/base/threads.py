@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 from threadpoolctl import ThreadpoolController
 
 from pancam_graph.base.errors import InputError
+from pancam_graph.base.lapack import lapack
 
 __all__ = ["blas_on_one_thread", "each", "in_order", "in_parallel", "n_workers"]
 
@@ -144,7 +145,7 @@ def blas_on_one_thread() -> Iterator[None]:
     the whole process: while several threads of it are in such a context, the last that leaves restores it.
     """
     # A controller limits the libraries that are loaded when it is made. SciPy's own BLAS may not be yet.
-    import pancam_graph.base.lapack  # noqa: F401, PLC0415  loaded for the controller
+    lapack()
 
     with_opencv = "cv2" in sys.modules
     _LIMIT.enter(with_opencv)

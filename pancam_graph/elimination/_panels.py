@@ -8,9 +8,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from pancam_graph.base import lapack
 from pancam_graph.base.errors import SolveError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.base.lapack import lapack
 
 __all__ = ["Covariance", "FreeDirectionError", "Panels", "Pattern", "Root", "pattern"]
 
@@ -243,7 +243,7 @@ def _root_of_panel(panel: FloatArray, summed: FloatArray) -> tuple[FloatArray, f
     if not np.isfinite(panel).all():
         raise SolveError("the linearised system is not finite: a camera or a landmark has left the domain")
     scaled = panel[:, :n] * scale[:, None] * scale
-    upper, pivot, rank, _ = lapack.dpstrf(scaled, tol=_RANK_TOLERANCE)
+    upper, pivot, rank, _ = lapack().dpstrf(scaled, tol=_RANK_TOLERANCE)
     pivot -= 1  # LAPACK counts from 1, and never rejects the first pivot
     if scaled.diagonal().max(initial=0.0) <= _RANK_TOLERANCE:
         rank = 0
@@ -253,7 +253,7 @@ def _root_of_panel(panel: FloatArray, summed: FloatArray) -> tuple[FloatArray, f
         rows[:, pivot] = upper * unit[pivot]
         right = panel[pivot[:rank], n:] * scale[pivot[:rank], None]
         # U'^-1 right, transposed: BLAS gets columns in its own order, and no large copy is made.
-        rows[:, n:] = lapack.dtrsm(1.0, upper[:, :rank], right.T, side=1, overwrite_b=1).T
+        rows[:, n:] = lapack().dtrsm(1.0, upper[:, :rank], right.T, side=1, overwrite_b=1).T
     return rows, float(upper.diagonal()[:rank].min(initial=1.0)) ** 2
 
 
@@ -385,18 +385,18 @@ class Root:
             half = np.linalg.inv(rows[:, :n])
             factor = np.zeros((int(st.begin[g][-1]),) * 2, order="F")
             if n:
-                factor[:n, :n] = np.triu(lapack.dgerqf(half)[0])
+                factor[:n, :n] = np.triu(lapack().dgerqf(half)[0])
             if rest:
                 parent = rest[0]
                 around = _factor_of_some(factors[parent], st.begin[parent], np.isin(st.after[parent], rest))
                 factor[n:, n:] = around
-                factor[:n, n:] = lapack.dtrmm(-1.0, around, half @ rows[:, n:-1], side=1)
+                factor[:n, n:] = lapack().dtrmm(-1.0, around, half @ rows[:, n:-1], side=1)
                 children[parent] -= 1
                 if not children[parent]:
                     del factors[parent]
             if children[g]:
                 factors[g] = factor
-            own = lapack.dtrmm(1.0, factor, factor[:n], side=1, trans_a=1)
+            own = lapack().dtrmm(1.0, factor, factor[:n], side=1, trans_a=1)
             for h, first, last in zip(st.after[g], st.begin[g], st.begin[g][1:], strict=False):
                 blocks[g, h] = own[:, first:last]
         return Covariance(blocks)
@@ -415,7 +415,7 @@ def _factor_of_some(factor: FloatArray, begin: IntArray, wanted: BoolArray) -> F
         kept = np.r_[:first, last : len(factor)]
         factor = np.asfortranarray(factor[:, kept][kept])
         if first > 0:
-            triangle, _, _ = lapack.dtzrzf(above)
+            triangle, _, _ = lapack().dtzrzf(above)
             factor[:first, :first] = np.triu(triangle[:, :first])
     return factor
 
