@@ -59,8 +59,8 @@ def test_python_m_is_the_command() -> None:
     [
         (
             [],
-            "expected a subcommand (refine, init, check, terrain, simulate, render, drive, completion), "
-            "found none",
+            "expected a subcommand (refine, init, check, terrain, convert, simulate, render, drive, "
+            "completion), found none",
         ),
         (["refin"], "found 'refin'; is 'refine' meant?"),
         (["--versoin"], "expected one of its options, found --versoin; is '--version' meant?"),
@@ -68,7 +68,7 @@ def test_python_m_is_the_command() -> None:
         (["refine", "F", "--out", "o", "more"], "expected no more arguments, found 'more'"),
         (["refine", "--out", "o"], "FOLDER"),
         (["refine", "F", "--out", "o", "--model", "ring"], "'ring'"),
-        (["refine", "F", "--out", "o", "--export", "colmop"], "expected one of colmap, cahvor, rig; found 'colmop'; is 'colmap' meant?"),  # noqa: E501  the whole sentence
+        (["refine", "F", "--out", "o", "--export", "colmop"], "expected one of colmap, cahvor, rig, gis; found 'colmop'; is 'colmap' meant?"),  # noqa: E501  the whole sentence
         (["drive", "page.html", "--rig", "mer-navcan"], "found 'mer-navcan'; is 'mer-navcam' meant?"),
         (["refine", "F", "--out", "o", "--quiet", "--verbose"], "expected --verbose or --quiet, found both"),
     ],
