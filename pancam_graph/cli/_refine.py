@@ -4,11 +4,15 @@ import time
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pancam_graph.cli._collector import loading
 from pancam_graph.cli._command import Command, Invocation
 from pancam_graph.cli._parser import Assignment, CommandParser, Flag, LateChoice, Several
+
+if TYPE_CHECKING:
+    from pancam_graph.data import Traverse
+    from pancam_graph.initialise import Start
 
 __all__ = ["REFINE"]
 
@@ -102,6 +106,13 @@ def _add_options(parser: CommandParser) -> None:
         "the place of the rig of FOLDER, and its covariance is the prior",
     )
     add(
+        "--start",
+        type=Path,
+        metavar="FOLDER",
+        help="begin at the cameras of another program: a COLMAP model, Bundler's bundle.out, or CAHVOR "
+        "files, in any world and scale; priors stay those of the traverse",
+    )
+    add(
         "--field",
         choices=("auto", "estimated", "held"),
         default="auto",
@@ -179,6 +190,9 @@ def _work(call: Invocation) -> int:
         traverse = read_input(arguments.folder)
         if arguments.use_rig is not None:
             traverse = use_rig(traverse, arguments.use_rig)
+        start = None
+        if arguments.start is not None:
+            traverse, start = _started(traverse, arguments.start, incremental=arguments.incremental)
         check_exports(traverse, arguments.export)
         options = replace(options, sharing=parse_sharing(arguments.sharing, traverse.sharing))
         if traverse.observations is None:
@@ -199,7 +213,7 @@ def _work(call: Invocation) -> int:
                 traverse, options, on_stop=lambda update: progress.stop(update, n_stops)
             )
         else:
-            solution = solve(traverse, options, on_iteration=progress.iteration)
+            solution = solve(traverse, options, start=start, on_iteration=progress.iteration)
         solution = solution.with_seconds(read=read_s)
         if arguments.cross_validate:
             from pancam_graph import cross_validate
@@ -223,6 +237,25 @@ def _work(call: Invocation) -> int:
         solution = write_results(solution, arguments.out, **results, progress=progress.counted)
     print_summary(solution, str(arguments.out), quiet=arguments.quiet)
     return 0 if solution.passed else 1
+
+
+def _started(traverse: "Traverse", folder: Path, *, incremental: bool) -> "tuple[Traverse, Start]":
+    """The start that cameras of another program give, and the traverse with a warning of what was left out.
+
+    Raises InputError for cameras of other pictures, and with --incremental, which has starts of its own.
+    """
+    from pancam_graph.base.errors import InputError
+    from pancam_graph.initialise import start_from_poses
+    from pancam_graph.io import prefixed
+    from pancam_graph.io.posed import images_of, read_posed
+
+    if incremental:
+        raise InputError("--start: expected without --incremental, which begins each stop by odometry")
+    cameras = read_posed(folder)
+    with prefixed(folder):
+        known, warnings = images_of(traverse, cameras)
+        start = start_from_poses(traverse, {row: camera.world_T_camera for row, camera in known.items()})
+    return traverse.with_warnings(warnings), start
 
 
 REFINE = Command(

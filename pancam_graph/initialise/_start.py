@@ -16,6 +16,7 @@ from pancam_graph.initialise._extract import FreeCameras, extract_free, head_til
 __all__ = [
     "Start",
     "in_turns_of_telemetry",
+    "mast_by_chain",
     "start_from_cameras",
     "start_from_odometry",
     "start_from_telemetry",
@@ -105,7 +106,7 @@ def start_from_cameras(traverse: Traverse, projections: FloatArray) -> Start:
         if len(rows) == 0:
             masts.append(stop.world_T_mast)
             continue
-        by_chain = _mast_by_chain(traverse, rows, world_R_camera, centres)
+        by_chain = mast_by_chain(traverse, rows, world_R_camera, centres)
         try:
             masts.append(_mast_by_circles(traverse, rows, world_R_camera, centres, by_chain))
         except GeometryError as error:
@@ -127,7 +128,7 @@ def start_from_cameras(traverse: Traverse, projections: FloatArray) -> Start:
     return Start(world_T_mast=tuple(masts), pan_tilt_rad=angles, cameras=cameras, warnings=tuple(warnings))
 
 
-def _mast_by_chain(
+def mast_by_chain(
     traverse: Traverse, rows: np.ndarray, world_R_camera: FloatArray, centres: FloatArray
 ) -> gtsam.Pose3:
     """Mean of the mast poses that each camera gives through the rig at telemetry's angles."""

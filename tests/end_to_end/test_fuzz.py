@@ -5,6 +5,7 @@ has a place here. What this does not prove: that a result which was read is solv
 """
 
 import json
+import struct
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -20,9 +21,19 @@ from pancam_graph import SimulationOptions, Traverse, TraverseSmoother, simulate
 from pancam_graph.cameras import CAHVORE
 from pancam_graph.data import Freedom, Sharing
 from pancam_graph.images._cache import Cache
-from pancam_graph.io import read_image, read_input, read_mask, read_pds, read_traverse, rig_json, use_rig
+from pancam_graph.io import (
+    cahvor_text,
+    read_image,
+    read_input,
+    read_mask,
+    read_pds,
+    read_traverse,
+    rig_json,
+    use_rig,
+)
 from pancam_graph.io._site_files import site_poses
 from pancam_graph.io.plain import PlainOptions, plain_traverse, write_plain
+from pancam_graph.io.posed import read_posed
 from pancam_graph.rigs import mer_navcam
 from pancam_graph.smoother import SmootherOptions
 from pancam_graph.smoother._incremental import stops_of
@@ -497,6 +508,53 @@ def smoothers(folder: Path, change: Callable[[np.random.Generator, Any, bytes], 
     def case(rng: np.random.Generator) -> str:
         path.write_bytes(change(rng, arrays, good))
         return outcome(lambda: TraverseSmoother.load(path), folder)
+
+    return case
+
+
+@kind_of_case
+def colmap_text(folder: Path) -> Case:
+    (folder / "cameras.txt").write_text("# a\n7 OPENCV 64 48 50 51 32 24 -0.1 0.02 0.001 -0.002\n")
+    image = "1 0.9 0.1 -0.2 0.3 1.5 -2 0.25 7 a b.png\n1.5 2.5 -1 3 4 5\n"
+    (folder / "images.txt").write_text(f"# b\n{image}{image.replace('1 0.9', '2 0.8')}")
+    return posed(folder, ("cameras.txt", "images.txt"))
+
+
+@kind_of_case
+def colmap_binary(folder: Path) -> Case:
+    lens = (50.0, 51.0, 32.0, 24.0, -0.1, 0.02, 0.001, -0.002)
+    (folder / "cameras.bin").write_bytes(struct.pack("<QIiQQ8d", 1, 7, 4, 64, 48, *lens))
+    pose = (0.9, 0.1, -0.2, 0.3, 1.5, -2.0, 0.25)
+    image = struct.pack("<I7dI", 1, *pose, 7) + b"a.png\0" + struct.pack("<Qddq", 1, 1.5, 2.5, -1)
+    (folder / "images.bin").write_bytes(struct.pack("<Q", 2) + 2 * image)
+    return posed(folder, ("cameras.bin", "images.bin"))
+
+
+@kind_of_case
+def bundler(folder: Path) -> Case:
+    camera = "500 -0.1 0.02\n1 0 0\n0 1 0\n0 0 1\n0.5 1 -4\n"
+    (folder / "bundle.out").write_text(f"# Bundle file v0.3\n2 1\n{camera}{camera}1 2 3\n1 2 3\n1 0 0 1 1\n")
+    (folder / "list.txt").write_text("a.jpg\nb.jpg 0 500\n")
+    return posed(folder, ("bundle.out", "list.txt"))
+
+
+@kind_of_case
+def cahvor_folder(folder: Path) -> Case:
+    (folder / "a.cahvor").write_text(cahvor_text(MARS2020_NAVCAM))
+    return posed(folder, ("a.cahvor",))
+
+
+def posed(folder: Path, names: tuple[str, ...]) -> Case:
+    good = {name: (folder / name).read_bytes() for name in names}
+
+    def case(rng: np.random.Generator) -> str:
+        for name, content in good.items():
+            (folder / name).write_bytes(content)
+        name = names[rng.integers(len(names))]
+        as_text = not name.endswith(".bin") and rng.random() < 0.6
+        text = mutated_text(rng, good[name].decode()).encode(errors="replace") if as_text else None
+        (folder / name).write_bytes(mutated_bytes(rng, good[name]) if text is None else text)
+        return outcome(lambda: read_posed(folder), folder)
 
     return case
 
