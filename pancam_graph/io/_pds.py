@@ -25,6 +25,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
+from pancam_graph.base.choices import some_of
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray, IntArray, wrap_angle
 from pancam_graph.base.text import visible
@@ -192,6 +193,16 @@ def _remarks(images: Sequence[LabelledImage]) -> list[str]:
     """What is true of images, once for all of which it is true."""
     count = Counter(image.remark for image in images if image.remark)
     said = [f"{number} of {counted(len(images))}: {remark}" for remark, number in count.items()]
+    of_serial: dict[str, set[str]] = {}
+    for image in images:
+        if image.serial:
+            of_serial.setdefault(image.serial, set()).add(image.instrument)
+    said += [
+        f"{some_of(sorted(cameras))} have one serial number in their labels, {serial}; they are taken for "
+        "cameras of their own"
+        for serial, cameras in of_serial.items()
+        if len(cameras) > 1
+    ]
     unlevel = sorted({_stop_id(image.stop) for image in images if not image.levelled})
     if unlevel:
         said.append(

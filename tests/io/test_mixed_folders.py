@@ -181,3 +181,17 @@ def test_what_is_wrong_with_a_label_of_exomars_is_said(
     with pytest.raises(InputError) as caught:
         read_input(tmp_path)
     assert said in str(caught.value)
+
+
+def test_two_cameras_with_one_serial_number_are_two_and_named(tmp_path: Path) -> None:
+    for k, name in enumerate(("NAV_RIGHT_B", "NAV_LEFT_B")):
+        seen = Shot(head=navcam_b_head(), joints=POINTINGS[k], instrument=name, counter=(4, 2100, k))
+        text = label_text(seen, msl_mast())
+        text = text.replace("INSTRUMENT_ID", "INSTRUMENT_SERIAL_NUMBER = 215\r\nINSTRUMENT_ID", 1)
+        write(tmp_path, f"{name}_{k}", text)
+    traverse = read_input(tmp_path)
+    assert len(traverse.rig.eyes) == 2
+    assert traverse.warnings == (
+        "NAV_LEFT_B, NAV_RIGHT_B have one serial number in their labels, 215; they are taken for cameras of "
+        "their own",
+    )

@@ -274,6 +274,19 @@ def test_pictures_are_of_one_eye_by_size_camera_and_focal_length(tmp_path: Path)
     assert "in line 2: give them two names" in says
 
 
+def test_two_cameras_with_one_serial_number_are_two_and_named(tmp_path: Path) -> None:
+    folder = pictures(tmp_path / "F", ["a.jpg"], tiff({**PHONE, SERIAL: "77"}))
+    pictures(folder, ["b.jpg"], tiff({**PHONE, MODEL: "other", SERIAL: "77"}))
+    pictures(folder, ["c.jpg"], tiff({**PHONE, FOCAL_35MM: 52, SERIAL: "77"}))  # another zoom of the first
+    found = made(folder, HEADER, "a.jpg,0,0", "b.jpg,1,0", "c.jpg,2,0").traverse
+    assert [i.camera for i in found.images] == ["camera1", "camera2", "camera3"]
+    said = [warning for warning in found.warnings if "serial" in warning]
+    assert said == [
+        "EXIF of cameras camera1, camera2 says one serial number, 77, and different models; they are taken "
+        "for cameras of their own"
+    ]
+
+
 def test_no_focal_length_is_a_sentence_that_names_the_options(folder: Path) -> None:
     assert refused(folder, field_rad=None) == (
         f"{folder}/a.png: expected EXIF that tells the focal length, found none; --focal-px or --field-deg "

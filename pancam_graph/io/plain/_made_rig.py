@@ -93,6 +93,7 @@ def made_rig(
         pictures=tuple((row, eye_of[row.line]) for row in pointed if row.line in eye_of),
         warnings=(
             *left_out,
+            *_shared_serials(groups),
             *(warning for one in made for warning in one.warnings),
         ),
         sources=(*(one.source for one in made), arms),
@@ -211,6 +212,21 @@ def _require_one_camera(name: str, rows: _Group) -> None:
                 f"found by EXIF {_described(other)}, and {_described(first)} in line {told[0].line}: give "
                 "them two names"
             )
+
+
+def _shared_serials(groups: dict[str, _Group]) -> list[str]:
+    """A warning for each serial number that EXIF of two makes or models has."""
+    of_serial: dict[str, dict[tuple[str, str], str]] = {}
+    for name, rows in groups.items():
+        for exif in (row.picture.exif for row in rows):
+            if exif.serial:
+                of_serial.setdefault(exif.serial, {}).setdefault((exif.make, exif.model), name)
+    return [
+        f"EXIF of cameras {some_of(list(models.values()))} says one serial number, {serial}, and different "
+        "models; they are taken for cameras of their own"
+        for serial, models in of_serial.items()
+        if len(models) > 1
+    ]
 
 
 def _described(camera: tuple[object, ...]) -> str:
