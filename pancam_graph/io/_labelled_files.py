@@ -15,6 +15,7 @@ from pancam_graph.io._pds4_image import rover_image_of_xml
 from pancam_graph.io._pds_image import read_labelled_image
 from pancam_graph.io._pds_label import may_have_label
 from pancam_graph.io._picture_size import looks_like_picture
+from pancam_graph.io._places import is_places
 from pancam_graph.io._site_files import SITE_FILE, site_poses
 from pancam_graph.io._xml import read_xml
 
@@ -37,6 +38,8 @@ class LabelledFiles:
     """What is said of files with many records."""
     site_poses: dict[int, gtsam.Pose3] = field(default_factory=dict)
     """`before_T_site`, z up, by site, of .svf files."""
+    places: Path | None = None
+    """The table of localisation, where there is one."""
     unread: list[Path] = field(default_factory=list)
     """Files that have no label, and are none."""
 
@@ -80,6 +83,7 @@ def labelled_files(folder: Path) -> LabelledFiles:
             found.site_poses |= site_poses([file])
         except InputError as error:
             found.unusable[file.name] = error
+    found.places = next((file for file in files if is_places(file)), None)
     found.images.sort(key=lambda image: image.file.name)
     if not found.images:
         found.unusable = {**foreign, **found.unusable}
@@ -89,7 +93,8 @@ def labelled_files(folder: Path) -> LabelledFiles:
     found.unread = [
         f
         for f in files
-        if f not in used and not {f.stem, f.name} & said and f.suffix.lower() != SITE_FILE and f.is_file()
+        if f not in used and not {f.stem, f.name} & said and f.suffix.lower() != SITE_FILE
+        if f != found.places and f.is_file()
     ]
     return found
 

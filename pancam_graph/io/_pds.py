@@ -29,7 +29,7 @@ from pancam_graph.base.choices import some_of
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray, IntArray, wrap_angle
 from pancam_graph.base.text import visible
-from pancam_graph.data import Frame, Image, Stop, Traverse
+from pancam_graph.data import Frame, Image, Site, Stop, Traverse
 from pancam_graph.io._detectors import SAME_PRINCIPAL_POINT_PX, on_detectors, same_focal_lengths
 from pancam_graph.io._input_format import InputFormat
 from pancam_graph.io._labelled_files import LABEL_SUFFIXES, labelled_files
@@ -38,6 +38,7 @@ from pancam_graph.io._one_group import counted, named_files, one_group
 from pancam_graph.io._pds_exposures import one_of_each_exposure
 from pancam_graph.io._picture_size import looks_like_picture
 from pancam_graph.io._pictures import left_out
+from pancam_graph.io._places import site_by_places
 from pancam_graph.rigs import MastKinematics, ReferenceSigma, RigFit, RigFitOptions, fit_rig
 
 __all__ = ["LOCALISATION_SIGMA", "PDS3", "SAME_POINTING_RAD", "LocalisationSigma", "read_pds"]
@@ -119,6 +120,7 @@ def read_pds(folder: Path | str) -> Traverse:
     if found.unread and (unusable or group.warnings):  # all is accounted for where something is left out
         names = named_files([file.name for file in found.unread])
         warnings.append(f"not read, for they are no labels and no labelled pictures: {names}")
+    site = _site(found.places, images, warnings)
     eye_of, eye_names = _sort_eyes(images)
     stop_ids, stops = _sort_stops(images, kinematics, warnings)
     frame_of, frames_first = _sort_frames(images, eye_of)
@@ -172,6 +174,7 @@ def read_pds(folder: Path | str) -> Traverse:
         ),
         folder=folder,
         warnings=tuple(warnings),
+        site=site,
     )
 
 
@@ -180,6 +183,26 @@ PDS3 = InputFormat(
     matches=lambda names: any(Path(name).suffix.lower() in LABEL_SUFFIXES for name in names),
     read=read_pds,
 )
+
+
+def _site(places: Path | None, images: Sequence[LabelledImage], warnings: list[str]) -> Site | None:
+    """Where the world is by the folder's table of localisation; adds to `warnings`."""
+    if places is None:
+        return None
+    if not all(image.levelled and image.placed for image in images):
+        warnings.append(f"{places.name}: not used: labels do not say where north is")
+        return None
+    rovers = {image.stop: image.world_T_rover.translation() for image in reversed(images)}
+    try:
+        localised = site_by_places(places, min(site for site, _ in rovers), rovers)
+    except InputError as error:
+        warnings.append(f"not used: {error}")
+        return None
+    if localised is None:
+        warnings.append(f"{places.name}: not used: it has none of these sites and drives")
+        return None
+    warnings += localised.warnings
+    return localised.site
 
 
 def _left_out(unusable: Mapping[str, InputError]) -> list[str]:

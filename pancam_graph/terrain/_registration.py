@@ -37,6 +37,9 @@ _HIGH_PASS_PX = 8.0
 _REACH_PX = 10
 """Pixels over which residuals are taken to hang together."""
 _ROUNDS = 30
+_SHAPE_PX = 0.05
+"""Sigma, pixels, of what shapes seen from the side and from above differ by, which no residual's covariance
+knows: measured on two rendered stops, whose squared errors without it are 4 times the variances."""
 _FINE = 4
 _LOOSE_RAD, _LOOSE_M = 1.0, 100.0
 """Sigmas of what a map from above does not tell: roll and pitch, and height without a surface."""
@@ -312,8 +315,10 @@ def _refined(
         state = state + step
         if np.abs(step / [1 / max(middle, 1.0), 1.0, 1.0]).max() < 1e-4:
             break
+    shape = np.diag([1 / np.sqrt(np.mean(u * u + v * v)), 1.0, 1.0]) * _SHAPE_PX
     normal = np.linalg.inv(both.T @ both)
-    return float(state[0]), state[1:], (normal @ _meat(both, residual, inner) @ normal)[:3, :3]
+    covariance = normal @ _meat(both, residual, inner) @ normal
+    return float(state[0]), state[1:], covariance[:3, :3] + shape @ shape
 
 
 def _high_pass(grey: FloatArray, seen: BoolArray) -> FloatArray:

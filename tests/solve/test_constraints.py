@@ -120,6 +120,17 @@ def test_stop_by_stop_ends_where_batch_does_and_the_graph_has_the_cost() -> None
     assert graph.size() == without.size() + 4
 
 
+def test_stop_by_stop_ends_where_batch_does_with_ties_of_points() -> None:
+    simulation = simulated(2, 3)
+    traverse = replace(simulation.traverse, constraints=landmark_ties(simulation, sigma=5e-3))
+    batch, incremental = solve(traverse, HARD), solve_incrementally(traverse, HARD)
+    for stop in (1, 2):
+        apart = batch.final.world_T_mast[stop].localCoordinates(incremental.final.world_T_mast[stop])
+        assert np.abs(apart / np.sqrt(np.diag(batch.stop_covariance[stop]))).max() < 1e-2
+    assert incremental.verdict is not None
+    assert {t.name for t in incremental.verdict.tests} >= {"constraints"}
+
+
 def test_a_stop_that_telemetry_holds_cannot_be_tied() -> None:
     traverse = near_part(simulated(2, 2))
     with pytest.raises(InputError, match="found stop0000 held by sigma 0"):

@@ -110,7 +110,9 @@ def test_another_places_map_is_refused_and_so_is_one_that_ends_too_near() -> Non
 
 
 @pytest.mark.slow
-def test_the_spread_is_that_of_the_covariance() -> None:
+def test_the_spread_is_that_of_the_covariance(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On flat ground, where shapes look alike from the side and from above."""
+    monkeypatch.setattr("pancam_graph.terrain._registration._SHAPE_PX", 0.0)
     squares = []
     for seed in range(40, 60):
         view, chart = made_up(seed, noise=0.5)
@@ -175,3 +177,4 @@ def test_a_rendered_stop_is_moved_onto_a_rendered_orbital_map(tmp_path: Path) ->
     found = register_stop("s0", terrain.stops[t.stops[0].id], told.translation()[:2], chart, search_m=12.0)
     assert np.abs(off(found)[1:]).max() < PIXEL_M / 4
     assert abs(off(found)[0]) < 5e-3
+    assert off(found) @ np.linalg.solve(found.covariance, off(found)) < 16.3  # 3 numbers: 0.1 % exceed it
