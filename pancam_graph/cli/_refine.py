@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from pancam_graph.data import Traverse
     from pancam_graph.initialise import Start
 
-__all__ = ["REFINE"]
+__all__ = ["REFINE", "started"]
 
 _DESCRIPTION = """\
 Refine a rover traverse: mast poses, pointing and terrain points from images taken by a camera mast.
@@ -108,9 +108,9 @@ def _add_options(parser: CommandParser) -> None:
     add(
         "--start",
         type=Path,
-        metavar="FOLDER",
-        help="begin at the cameras of another program: a COLMAP model, Bundler's bundle.out, or CAHVOR "
-        "files, in any world and scale; priors stay those of the traverse",
+        metavar="PATH",
+        help="begin at what another program found: a folder with a COLMAP model, Bundler's bundle.out, or "
+        "CAHVOR files, in any world and scale, or a .nav of marsnav; priors stay those of the traverse",
     )
     add(
         "--field",
@@ -192,7 +192,7 @@ def _work(call: Invocation) -> int:
             traverse = use_rig(traverse, arguments.use_rig)
         start = None
         if arguments.start is not None:
-            traverse, start = _started(traverse, arguments.start, incremental=arguments.incremental)
+            traverse, start = started(traverse, arguments.start, incremental=arguments.incremental)
         check_exports(traverse, arguments.export)
         options = replace(options, sharing=parse_sharing(arguments.sharing, traverse.sharing))
         if traverse.observations is None:
@@ -239,20 +239,25 @@ def _work(call: Invocation) -> int:
     return 0 if solution.passed else 1
 
 
-def _started(traverse: "Traverse", folder: Path, *, incremental: bool) -> "tuple[Traverse, Start]":
-    """The start that cameras of another program give, and the traverse with a warning of what was left out.
+def started(traverse: "Traverse", path: Path, *, incremental: bool) -> "tuple[Traverse, Start]":
+    """The start that another program's cameras or pointings give, and the traverse with warnings of them.
 
-    Raises InputError for cameras of other pictures, and with --incremental, which has starts of its own.
+    Raises InputError for those of other pictures, and with --incremental, which has starts of its own.
     """
     from pancam_graph.base.errors import InputError
-    from pancam_graph.initialise import start_from_poses
+    from pancam_graph.initialise import start_from_poses, start_from_telemetry
     from pancam_graph.io import prefixed
     from pancam_graph.io.posed import images_of, read_posed
+    from pancam_graph.io.vicar import read_nav, with_pointing
 
     if incremental:
         raise InputError("--start: expected without --incremental, which begins each stop by odometry")
-    cameras = read_posed(folder)
-    with prefixed(folder):
+    if path.suffix.lower() == ".nav":
+        pointed = with_pointing(traverse, read_nav(path), path)
+        said = [sentence for sentence in pointed.warnings if sentence not in traverse.warnings]
+        return traverse.with_warnings(said), start_from_telemetry(pointed)
+    cameras = read_posed(path)
+    with prefixed(path):
         known, warnings = images_of(traverse, cameras)
         start = start_from_poses(traverse, {row: camera.world_T_camera for row, camera in known.items()})
     return traverse.with_warnings(warnings), start

@@ -17,10 +17,12 @@ from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray, so3_exp, wrap_angle, wxyz_from_rotation
 from pancam_graph.cameras import as_cahv
 from pancam_graph.cli import main
+from pancam_graph.cli._refine import started
 from pancam_graph.data import Traverse
 from pancam_graph.initialise import start_from_poses
 from pancam_graph.io import cahvor_text, write_traverse
 from pancam_graph.io.posed import PosedCamera, images_of, read_posed
+from pancam_graph.io.vicar import NavEntry, nav_text
 from pancam_graph.rigs import mer_navcam
 from pancam_graph.simulate import Simulation
 
@@ -276,3 +278,18 @@ def test_refine_begins_at_the_cameras_of_a_folder(
     assert "cameras of no picture" in capsys.readouterr().err
     assert main([*command, "--start", str(tmp_path / "bundle"), "--incremental"]) == 2
     assert "--start: expected without --incremental" in capsys.readouterr().err
+
+
+def test_pointings_of_marsnav_are_a_start(drive: Simulation, tmp_path: Path) -> None:
+    traverse = drive.traverse
+    entries = []
+    for frame in traverse.image_frame:
+        pan, tilt = np.rad2deg(drive.truth.pan_tilt_rad[frame])
+        entries.append(
+            NavEntry(unique_id=None, original_deg=(0.0, 0.0), pointing_deg=(-pan % 360.0, float(tilt)))
+        )
+    (tmp_path / "a.nav").write_text(nav_text(entries))
+    same, start = started(traverse, tmp_path / "a.nav", incremental=False)
+    np.testing.assert_allclose(wrap_angle(start.pan_tilt_rad - drive.truth.pan_tilt_rad), 0, atol=1e-10)
+    np.testing.assert_array_equal(same.pan_tilt_rad, traverse.pan_tilt_rad)
+    assert all(a.equals(s.world_T_mast, 0) for a, s in zip(start.world_T_mast, traverse.stops, strict=True))
