@@ -1,6 +1,7 @@
 """Mosaics of what the images of a stop show, with telemetry's and with the refined pointing."""
 
 from pancam_graph.mosaic._files import MOSAIC_INDEX as MOSAIC_INDEX
+from pancam_graph.mosaic._files import MOSAIC_PAGE as MOSAIC_PAGE
 from pancam_graph.mosaic._files import Blink as Blink
 from pancam_graph.mosaic._files import WrittenMosaics as WrittenMosaics
 from pancam_graph.mosaic._files import write_mosaics as write_mosaics

@@ -21,10 +21,12 @@ from pancam_graph.mosaic._placed import POINTINGS, Pointing
 from pancam_graph.mosaic._projections import Cylinder
 from pancam_graph.mosaic._seam_error import CASES, Case
 
-__all__ = ["MOSAIC_INDEX", "Blink", "WrittenMosaics", "write_mosaics"]
+__all__ = ["MOSAIC_INDEX", "MOSAIC_PAGE", "Blink", "WrittenMosaics", "write_mosaics"]
 
 MOSAIC_INDEX = "mosaics.json"
 """The file in a folder of mosaics that lists the others."""
+MOSAIC_PAGE = "mosaics.html"
+"""The page of a folder of mosaics, which the index does not list: whoever writes reports writes it."""
 _MAX_NAME = 40
 _QUALITY = 88
 _BLINK_BUDGET = 6_000_000
@@ -60,6 +62,10 @@ class WrittenMosaics:
     lines: tuple[str, ...]
     """The seam error of each panorama, in words."""
     warnings: tuple[str, ...]
+    entries: tuple[Json, ...]
+    """What the index says of each mosaic."""
+    north_deg: float | None
+    """Azimuth of north, anticlockwise from the world's x axis; None: not known."""
 
 
 def write_mosaics(
@@ -106,7 +112,13 @@ def write_mosaics(
     index = {"format": MOSAIC_FORMAT, "version": VERSION, "mosaics": entries}
     text = json.dumps(index, indent=1, allow_nan=False, ensure_ascii=False)
     (folder / MOSAIC_INDEX).write_text(text + "\n", encoding="utf-8", newline="\n")
-    return WrittenMosaics(blinks=tuple(blinks), lines=tuple(lines), warnings=tuple(warnings))
+    return WrittenMosaics(
+        blinks=tuple(blinks),
+        lines=tuple(lines),
+        warnings=tuple(warnings),
+        entries=tuple(entries),
+        north_deg=north_deg,
+    )
 
 
 def _plain(name: str) -> str:

@@ -73,7 +73,7 @@ _CAPTION = (
     "and contrast: only the pointing differs. Overlaps are four times enlarged, the first image in red and "
     "the second in green and blue: grey where they agree. The seam error is the median displacement of "
     "windows of 64 pixels, by phase correlation, in pixels of the images at their centre. Pictures in full, "
-    "and where their pixels are in the world: folder mosaics beside this page."
+    "and where their pixels are in the world: folder mosaics beside this page; mosaics.html there zooms."
 )
 
 

@@ -5,11 +5,12 @@ from pathlib import Path
 from pancam_graph.base.whole_files import whole_file
 from pancam_graph.data import Solution
 from pancam_graph.mosaic import WrittenMosaics
+from pancam_graph.report._mosaic_page import make_mosaic_page
 from pancam_graph.report._page import make_page
 from pancam_graph.report._terrain import make_terrain_page
 from pancam_graph.terrain import WrittenTerrain
 
-__all__ = ["write_report", "write_terrain_page"]
+__all__ = ["write_mosaic_page", "write_report", "write_terrain_page"]
 
 
 def write_report(
@@ -32,3 +33,8 @@ def write_report(
 def write_terrain_page(terrain: WrittenTerrain, name: str, path: Path | str) -> None:
     """Write the page of the terrain of a traverse, by its name, into the folder of the terrain."""
     whole_file(Path(path).resolve(), make_terrain_page(terrain, name).encode())
+
+
+def write_mosaic_page(mosaics: WrittenMosaics, name: str, path: Path | str) -> None:
+    """Write the page of the mosaics of a traverse, by its name, into the folder of the mosaics."""
+    whole_file(Path(path).resolve(), make_mosaic_page(mosaics.entries, mosaics.north_deg, name).encode())

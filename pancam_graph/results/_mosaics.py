@@ -3,7 +3,8 @@
 from dataclasses import replace
 from pathlib import Path
 
-from pancam_graph.mosaic import write_mosaics
+from pancam_graph import report
+from pancam_graph.mosaic import MOSAIC_PAGE, write_mosaics
 from pancam_graph.results._output import OutputWriter, Written
 
 __all__ = ["MOSAICS"]
@@ -13,6 +14,8 @@ def _write(written: Written, folder: Path) -> Written:
     options, solution = written.mosaic_options, written.solution
     assert options is not None  # without options nobody asked for mosaics
     mosaics = write_mosaics(solution, folder, options, progress=written.progress)
+    if mosaics.entries:
+        report.write_mosaic_page(mosaics, solution.traverse.name, folder / MOSAIC_PAGE)
     warned = replace(solution, warnings=(*solution.warnings, *mosaics.warnings))
     return replace(written, solution=warned, mosaics=mosaics)
 

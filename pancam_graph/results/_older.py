@@ -56,7 +56,7 @@ def _require_solution(path: Path, expected: str) -> None:
 
 def _no_mosaics(folder: Path) -> list[str]:
     """Names in a folder that its index does not know as mosaics; all where there is no index."""
-    from pancam_graph.mosaic import MOSAIC_INDEX  # noqa: PLC0415  it imports OpenCV
+    from pancam_graph.mosaic import MOSAIC_INDEX, MOSAIC_PAGE  # noqa: PLC0415  it imports OpenCV
 
     names = sorted(p.name for p in folder.iterdir()) if folder.is_dir() and not folder.is_symlink() else [""]
     try:
@@ -64,7 +64,7 @@ def _no_mosaics(folder: Path) -> list[str]:
     except InputError:
         known = set[str]()
     else:
-        known = {MOSAIC_INDEX}
+        known = {MOSAIC_INDEX, MOSAIC_PAGE}
         for entry in index["mosaics"] if isinstance(index.get("mosaics"), list) else []:
             files = entry.get("files") if isinstance(entry, dict) else None
             known |= {f for f in files.values() if isinstance(f, str)} if isinstance(files, dict) else set()
