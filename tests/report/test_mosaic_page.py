@@ -13,10 +13,7 @@ CYLINDER: dict[str, Any] = {
     "camera": "left",
     "kind": "cylinder",
     "images": ["a", "b"],
-    "files": {
-        "telemetry": "001-1_s_left_cylinder_telemetry.png",
-        "refined": "001-1_s_left_cylinder_refined.png",
-    },
+    "files": {"telemetry": "001-1_s_left_telemetry.png", "refined": "001-1_s_left_refined.png"},
     "width_px": 7712,
     "height_px": 1196,
     "px_per_degree": 21.4,
