@@ -51,13 +51,14 @@ def require_constraints(traverse: Traverse, options: SolveOptions, problem: Prob
                 raise InputError(f"{where}: expected a point that two or more images see, found it in fewer")
     given = list(stop_constraints(traverse, template.keys))
     check_given(given, template.seats(given), problem.values)
-    made = ties_of(traverse, seen)
-    if made is not None:
-        _require_surfaces(problem, made[0], problem.points_m()[made[1].landmark])
 
 
-def constrained(problem: Problem) -> Problem:
-    """The problem with the constraints of its traverse; the same object where there are none."""
+def constrained(problem: Problem, *, placed: bool = True) -> Problem:
+    """The problem with the constraints of its traverse; the same object where there are none.
+
+    Raises InputError for a surface that does not cover its point, where points are `placed` as well as
+    pictures can.
+    """
     template = problem.template
     traverse = template.traverse
     if not traverse.constraints:
@@ -72,7 +73,8 @@ def constrained(problem: Problem) -> Problem:
     near = [s.kind in {Sensor.COORDINATES, Sensor.SURFACE} for s in sights]
     problem = replace(problem, ties=ties, landmarks=_in_front(problem.landmarks, ties.landmark[near]))
     place_m = problem.points_m()[ties.landmark]
-    _require_surfaces(problem, sights, place_m)
+    if placed:
+        _require_surfaces(problem, sights, place_m)
     sensors = Sensors.of(sights, place_m)
     template, values = template.sensing(sensors), gtsam.Values(problem.values)
     sensors.insert(values)

@@ -148,7 +148,7 @@ def _uncertainty(
 def _first(fitted: Fitted) -> Problem:
     """`Judged.first` of a fit."""
     prepared, problem = fitted.screened.prepared, fitted.problem
-    first, m = constrained(prepared.problem), problem.measurements
+    first, m = constrained(prepared.problem, placed=False), problem.measurements
     if problem.template.let_go:
         first = first.letting_go(problem.template.let_go)
     if m is first.measurements and problem.accepted.all():

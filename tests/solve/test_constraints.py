@@ -228,7 +228,8 @@ def test_a_stops_pose_with_its_covariance_is_as_theory_says() -> None:
 def test_a_surface_that_does_not_cover_its_point_is_refused_in_one_sentence() -> None:
     simulation = simulated(2, 3)
     tie = next(one for one in landmark_ties(simulation) if isinstance(one, LandmarkSurface))
-    holed = np.where(np.eye(81, dtype=bool), np.nan, tie.surface.height_m)
+    holed = np.where(np.eye(33, dtype=bool), np.nan, tie.surface.height_m)
+    assert not tie.surface.covers(np.zeros((1, 2)))[0]  # it is not where the world's origin is
     for changed in ({"first_m": tie.surface.first_m + 100.0}, {"height_m": holed}):
         tied = replace(tie, surface=replace(tie.surface, **changed))
         with pytest.raises(

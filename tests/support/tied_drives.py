@@ -34,7 +34,7 @@ def seen_often(simulation: Simulation, n: int, least: int = 4) -> list[int]:
     return [int(i) for i in np.argsort(distance) if counts[i] >= least][:n]
 
 
-def ground_through(point_m: FloatArray, step_m: float = 0.25, nodes: int = 81) -> Surface:
+def ground_through(point_m: FloatArray, step_m: float = 0.25, nodes: int = 33) -> Surface:
     """Curved ground (a quadratic, which cubic convolution has exactly) through a point near its middle."""
     half = step_m * (nodes // 2)
     first = np.array([point_m[0] - half + 0.3 * step_m, point_m[1] + half - 0.4 * step_m])
