@@ -270,7 +270,7 @@ def _of_stop(
 ) -> StopTelemetry:
     """All priors of a stop, without the `held` columns of its variables; `shared` is the last group."""
     column, sigma = (np.concatenate([getattr(p, name) for p in priors]) for name in ("column", "sigma"))
-    free = np.flatnonzero(~np.isin(column, held))
+    free = np.flatnonzero(~np.isin(column, held)) if len(held) else np.arange(len(column))
     whitening = None
     if any(p.whitening is not None for p in priors):
         # A held entry has no correlation with others.
@@ -316,9 +316,9 @@ def entry_errors(telemetry: Sequence[StopTelemetry], least: float = _BLIND) -> t
     """
     angles, stops = [], []
     for one in telemetry:
-        is_angle = np.isin(one.entry, ("pan", "tilt"))
-        single = np.eye(len(one.entry))
-        common = [(np.array(one.entry) == name).astype(float) for name in ("pan", "tilt")]
+        is_angle, names = one.frame >= 0, np.array(one.entry)
+        single = np.eye(len(names))
+        common = [(names == name).astype(float) for name in ("pan", "tilt")]
         of_angles = np.vstack([single[is_angle], *(shape for shape in common if shape.sum() > 1)])
         z, K = one.pull(), one.shown()
         angles.append(_entry_errors(one, of_angles, z, K, least))
