@@ -1,6 +1,7 @@
 """The smoother of a drive: an estimate that is updated after every stop."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import gtsam
@@ -10,8 +11,8 @@ from pancam_graph.base.errors import InputError, SolveError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.base.options import options_of
 from pancam_graph.base.threads import blas_on_one_thread
-from pancam_graph.data import DrivePart, Frame, Image, Observations, Stop, Traverse
-from pancam_graph.graph import GraphKeys, HardTemplate, UserFactors, read_variable
+from pancam_graph.data import Constraint, DrivePart, Frame, Image, Observations, Stop, Traverse
+from pancam_graph.graph import GraphKeys, HardTemplate, UserFactors, read_variable, stop_constraints
 from pancam_graph.io import prefixed
 from pancam_graph.landmarks import CameraViews, Landmarks, lines_of_sight
 from pancam_graph.rigs import Rig
@@ -258,6 +259,21 @@ class TraverseSmoother:
         Raises InputError, and changes nothing, for a factor that cannot be evaluated where the drive is.
         """
         return self.add_factors_of(self._template, factors)
+
+    def add_constraints(self, constraints: Sequence[Constraint]) -> Update:
+        """Add ties on stops; they take part from now on, as factors of the caller's do, and are never let go.
+
+        Raises InputError, and changes nothing, for a tie on a stop that was not added or that telemetry
+        holds, and for one on terrain points: these are eliminated at places that move with their stops
+        (`solve_incrementally` has them in its last step).
+        """
+        for i, one in enumerate(constraints):
+            if one.landmarks:
+                raise InputError(
+                    f"constraints[{i}] ({one.about}): expected a tie on stops, found one on terrain points"
+                )
+        tied = replace(self._template.traverse, constraints=tuple(constraints))
+        return self.add_factors([one.factor for one in stop_constraints(tied, self.keys)])
 
     def add_factors_of(self, template: HardTemplate, factors: UserFactors) -> Update:
         """The same on the keys of a template of the whole drive, which may be in another order."""

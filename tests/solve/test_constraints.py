@@ -25,7 +25,7 @@ from pancam_graph.data import (
 )
 from pancam_graph.factors import Key, stop_heading_factor
 from pancam_graph.simulate import Simulation
-from pancam_graph.smoother import solve_incrementally
+from pancam_graph.smoother import SmootherOptions, TraverseSmoother, solve_incrementally, stops_of
 from pancam_graph.solve import Problem, constrained, prepare
 from pancam_graph.solve._reduced import panels_of
 from support.gtsam_factors import distance_factor
@@ -118,6 +118,31 @@ def test_stop_by_stop_ends_where_batch_does_and_the_graph_has_the_cost() -> None
     graph, _ = build_graph(traverse, HARD)
     without, _ = build_graph(replace(traverse, constraints=()), HARD)
     assert graph.size() == without.size() + 4
+
+
+def test_a_smoother_with_ties_on_stops_is_where_batch_is() -> None:
+    simulation = simulated(2, 2)
+    traverse = near_part(simulation)
+    ties = stop_ties(traverse, simulation.truth.world_T_mast)
+    smoother = TraverseSmoother(traverse.rig, SmootherOptions(rig="held", outlier_sigma=None))
+    for part in stops_of(traverse):
+        smoother.add_stop(*part)
+    before = smoother.estimate().world_T_mast[1]
+    smoother.add_constraints(ties)
+    batch = solve(replace(traverse, constraints=ties), HARD)
+    sigma = np.sqrt(np.diag(batch.stop_covariance[1]))
+    apart = batch.final.world_T_mast[1].localCoordinates(smoother.estimate().world_T_mast[1])
+    assert np.abs(apart / sigma).max() < 1e-2
+    assert np.abs(batch.final.world_T_mast[1].localCoordinates(before) / sigma).max() > 0.3
+    assert smoother.covariance(traverse.stops[1].id) == pytest.approx(
+        batch.stop_covariance[1], rel=1e-2, abs=1e-12
+    )
+    with pytest.raises(
+        InputError, match=r"constraints\[0\] .*: expected a tie on stops, found one on terrain"
+    ):
+        smoother.add_constraints(landmark_ties(simulated(2, 3))[:1])
+    with pytest.raises(InputError, match="found stop0000 held by sigma 0"):
+        smoother.add_constraints([StopHeading(stop="stop0000", heading_rad=0.0, sigma_rad=0.1)])
 
 
 def test_stop_by_stop_ends_where_batch_does_with_ties_of_points() -> None:
