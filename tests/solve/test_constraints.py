@@ -134,9 +134,8 @@ def test_a_smoother_with_ties_on_stops_is_where_batch_is() -> None:
     apart = batch.final.world_T_mast[1].localCoordinates(smoother.estimate().world_T_mast[1])
     assert np.abs(apart / sigma).max() < 1e-2
     assert np.abs(batch.final.world_T_mast[1].localCoordinates(before) / sigma).max() > 0.3
-    assert smoother.covariance(traverse.stops[1].id) == pytest.approx(
-        batch.stop_covariance[1], rel=1e-2, abs=1e-12
-    )
+    off = smoother.covariance(traverse.stops[1].id) - batch.stop_covariance[1]
+    assert np.abs(off / np.outer(sigma, sigma)).max() < 1e-2
     with pytest.raises(
         InputError, match=r"constraints\[0\] .*: expected a tie on stops, found one on terrain"
     ):
