@@ -18,6 +18,8 @@ from pancam_graph import Solution
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray
 from pancam_graph.cameras import Brown, Camera, straight_pixels
+from pancam_graph.cli import main
+from pancam_graph.data import Site
 from pancam_graph.io import read_cahvor, write_traverse
 from pancam_graph.results import DOORS, convert, write_results
 from pancam_graph.results.formats import Source, source_of
@@ -287,6 +289,43 @@ def test_bundler_and_nvm_have_the_residuals_of_the_solution(tmp_path: Path) -> N
     assert np.allclose(np.sort(again), expected, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("to", "suffix", "read"), [("tsai", ".tsai", tsai_pixels), ("csm", ".json", csm_pixels)]
+)
+def test_with_a_site_cameras_are_fixed_to_the_body(
+    tmp_path: Path, to: str, suffix: str, read: Callable[[Path, FloatArray], FloatArray]
+) -> None:
+    """Points are taken to the body by latitude, longitude and height, not by the way of the writer."""
+    site = Site(body="Mars", latitude_deg=-4.6, longitude_deg=137.4, height_m=-4500.0, north_rad=0.3)
+    made = solved("brown")
+    solution = replace(made, traverse=replace(made.traverse, site=site))
+    written(solution, tmp_path / to, to)
+    points, uv = seen_points(solution, 1, np.random.default_rng(7))
+    latitude, longitude = np.radians(site.geographic(points)[:, :2]).T
+    height = site.geographic(points)[:, 2]
+    a, b = 3396190.0, 3376200.0
+    geodetic = latitude  # planetocentric: of the point itself, so its radius follows from the height
+    for _ in range(20):
+        normal = a / np.sqrt(1 - (1 - b**2 / a**2) * np.sin(geodetic) ** 2)
+        radial = np.hypot(
+            (normal + height) * np.cos(geodetic), (normal * b**2 / a**2 + height) * np.sin(geodetic)
+        )
+        geodetic = np.arctan2(
+            radial * np.sin(latitude) / (normal * b**2 / a**2 + height),
+            radial * np.cos(latitude) / (normal + height),
+        )
+    across = (normal + height) * np.cos(geodetic)
+    z = (normal * b**2 / a**2 + height) * np.sin(geodetic)
+    body = np.column_stack([across * np.cos(longitude), across * np.sin(longitude), z])
+    away = np.linalg.norm(points - solution.final.world_t_camera[1], axis=1)
+    file = tmp_path / to / f"{solution.traverse.images[1].id}{suffix}"
+    off = np.abs(read(file, body) - uv).max(axis=1)
+    assert (off * away).max() < 1e-4  # a micrometre among millions of metres, seen from each point's range
+    if to == "csm":
+        state = json.loads(file.read_text().partition("\n")[2])
+        assert (state["m_majorAxis"], state["m_minorAxis"], state["m_targetName"]) == (a, b, "Mars")
+
+
 def test_cahvor_files_project_as_the_solution(tmp_path: Path) -> None:
     solution, rng = solved("cahvor"), np.random.default_rng(4)
     written(solution, tmp_path / "cahvor", "cahvor")
@@ -374,3 +413,60 @@ def test_what_cannot_be_converted_is_said_in_a_sentence(
         with pytest.raises(InputError, match=says):
             convert(path, tmp_path / "x.what", to=to)
         assert not (tmp_path / "x.what").exists()
+
+
+def test_the_command_writes_or_says_why_not(
+    refined: tuple[Path, Solution], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, _ = refined
+    assert main(["convert", str(out), str(tmp_path / "net.csv")]) == 0
+    assert capsys.readouterr().out.endswith("net.csv: control-network\n")
+    assert main(["convert", str(out), str(tmp_path / "net.csv")]) == 2
+    error = capsys.readouterr().err
+    assert "expected a new file for control-network, found one; --overwrite replaces it" in error
+    assert error.count("\n") == 1
+    assert main(["convert", str(out), str(tmp_path / "net.csv"), "--overwrite"]) == 0
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["net.csv"]
+
+
+def test_a_solution_that_failed_is_written_with_status_1(
+    refined: tuple[Path, Solution], tmp_path: Path
+) -> None:
+    out, solution = refined
+    write_results(replace(solution, converged=False), tmp_path / "out", report=False)
+    assert main(["convert", str(tmp_path / "out"), str(tmp_path / "tables"), "--to", "tables"]) == 1
+    assert (tmp_path / "tables" / "stops.csv").exists()
+    assert out.exists()
+
+
+def test_help_lists_every_format(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["convert", "--help"])
+    text = capsys.readouterr().out
+    for name, door in DOORS.items():
+        assert (
+            any(name in line and door.says in line for line in text.splitlines())
+            or f"{name}, " in text
+            or (f", {name} " in text)
+        ), name
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda data: data[:-3], r"points\.ply: expected the points of a solution .*, found \d+ bytes for"),
+        (lambda data: data.replace(b"int track", b"int kcart"), "found the properties x, y, z, kcart"),
+        (lambda data: b"ply\n", "found something else"),
+    ],
+)
+def test_damaged_points_are_refused(
+    refined: tuple[Path, Solution], tmp_path: Path, change: Callable[[bytes], bytes], says: str
+) -> None:
+    out, solution = refined
+    write_results(solution, tmp_path / "out", report=False)
+    points = tmp_path / "out" / "points.ply"
+    points.write_bytes(change(points.read_bytes()))
+    with pytest.raises(InputError, match=says):
+        convert(tmp_path / "out", tmp_path / "cahvor", to="cahvor")
+    assert not (tmp_path / "cahvor").exists()
+    assert out.exists()
