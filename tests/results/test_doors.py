@@ -304,15 +304,11 @@ def test_with_a_site_cameras_are_fixed_to_the_body(
     latitude, longitude = np.radians(site.geographic(points)[:, :2]).T
     height = site.geographic(points)[:, 2]
     a, b = 3396190.0, 3376200.0
-    geodetic = latitude  # planetocentric: of the point itself, so its radius follows from the height
+    geodetic = latitude  # maps of Mars have the planetocentric one
     for _ in range(20):
         normal = a / np.sqrt(1 - (1 - b**2 / a**2) * np.sin(geodetic) ** 2)
-        radial = np.hypot(
-            (normal + height) * np.cos(geodetic), (normal * b**2 / a**2 + height) * np.sin(geodetic)
-        )
         geodetic = np.arctan2(
-            radial * np.sin(latitude) / (normal * b**2 / a**2 + height),
-            radial * np.cos(latitude) / (normal + height),
+            (normal + height) * np.sin(latitude), (normal * b**2 / a**2 + height) * np.cos(latitude)
         )
     across = (normal + height) * np.cos(geodetic)
     z = (normal * b**2 / a**2 + height) * np.sin(geodetic)
@@ -432,23 +428,16 @@ def test_the_command_writes_or_says_why_not(
 def test_a_solution_that_failed_is_written_with_status_1(
     refined: tuple[Path, Solution], tmp_path: Path
 ) -> None:
-    out, solution = refined
+    _, solution = refined
     write_results(replace(solution, converged=False), tmp_path / "out", report=False)
     assert main(["convert", str(tmp_path / "out"), str(tmp_path / "tables"), "--to", "tables"]) == 1
     assert (tmp_path / "tables" / "stops.csv").exists()
-    assert out.exists()
 
 
 def test_help_lists_every_format(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["convert", "--help"])
-    text = capsys.readouterr().out
-    for name, door in DOORS.items():
-        assert (
-            any(name in line and door.says in line for line in text.splitlines())
-            or f"{name}, " in text
-            or (f", {name} " in text)
-        ), name
+    assert main(["convert", "--help"]) == 0
+    words = capsys.readouterr().out.replace(",", " ").split()
+    assert set(DOORS) <= set(words)
 
 
 @pytest.mark.parametrize(
@@ -462,11 +451,10 @@ def test_help_lists_every_format(capsys: pytest.CaptureFixture[str]) -> None:
 def test_damaged_points_are_refused(
     refined: tuple[Path, Solution], tmp_path: Path, change: Callable[[bytes], bytes], says: str
 ) -> None:
-    out, solution = refined
+    _, solution = refined
     write_results(solution, tmp_path / "out", report=False)
     points = tmp_path / "out" / "points.ply"
     points.write_bytes(change(points.read_bytes()))
     with pytest.raises(InputError, match=says):
         convert(tmp_path / "out", tmp_path / "cahvor", to="cahvor")
     assert not (tmp_path / "cahvor").exists()
-    assert out.exists()
