@@ -42,7 +42,8 @@ Label = Annotated[str, Field(pattern=r"^[^\p{Cc}\p{Zl}\p{Zp}]+$")]
 class Entry(BaseModel):
     """Base of all entries."""
 
-    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, frozen=True)
+    # Deferred: to build the checks of all files takes longer than to read the one or two kinds of a process.
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, frozen=True, defer_build=True)
 
 
 class SparseEntry(Entry):
