@@ -160,11 +160,12 @@ KERNEL = {"gtsam", "numpy", "scipy"}
 @pytest.mark.parametrize(
     ("name", "libraries", "rooms"),
     [
-        (
+        pytest.param(
             "solve",
             KERNEL,
             {"base", "cameras", "data", "elimination", "factors", "graph", "initialise", "landmarks", "rigs"}
             | {"solve"},
+            marks=pytest.mark.slow,
         ),
         (
             "read_traverse",

@@ -15,6 +15,7 @@ import pytest
 
 from pancam_graph.base import by_numba, kept_code
 from pancam_graph.base.compiled import is_on_disk
+from support.parameters import slow_for
 from support.permissions import run_bound, sealed
 
 pytestmark = pytest.mark.skipif(bool(os.environ.get("NUMBA_DISABLE_JIT")), reason="nothing is compiled")
@@ -140,7 +141,12 @@ LOOKS_RIGHT = {"no function", "a strange need"}
 """Whole files of the right label: that they are of no use shows when they are linked."""
 
 
-@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize(
+    "damage",
+    slow_for(
+        ["one byte", "foreign", "a digest alone", "another processor", "label cut off, signed"], DAMAGES
+    ),
+)
 def test_damaged_files_are_made_anew(damage: str, folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     assert (hits(folder), hits(folder)) == (0, 2)
     DAMAGES[damage](folder / "__pycache__")

@@ -11,23 +11,25 @@ from pancam_graph.cli import main
 from pancam_graph.results import write_results
 from support.kills import BYSTANDERS, CACHE, FULL, KEPT, NEW, OLD, killed_at_every_step
 from support.made_solutions import fabricate
+from support.parameters import slow_but_for
 
 SENT = [signal.SIGKILL, signal.SIGTERM]
 
 
-def test_a_folder_is_whole_old_or_whole_new_whenever_its_writer_is_killed(tmp_path: Path) -> None:
-    for sent in SENT:
-        (tmp_path / sent.name).mkdir()
-        runs = killed_at_every_step("folder in place of an older one", sent, tmp_path / sent.name)
-        assert len(runs) > 30
-        states = [run.out for run in runs]
-        assert [s for s in states if s not in ({**OLD, **KEPT}, {**NEW, **KEPT})] == []
-        first_new = states.index({**NEW, **KEPT})
-        assert 10 < first_new < len(runs)
-        assert all(s == {**NEW, **KEPT} for s in states[first_new:])  # once there, it stays
-        assert all(run.beside == BYSTANDERS for run in runs)
-        assert all(run.again == {**NEW, **KEPT} for run in runs)
-        assert {run.status for run in runs[:-1]} <= {-sent if sent == signal.SIGKILL else 130}
+@pytest.mark.parametrize("sent", slow_but_for([signal.SIGKILL], SENT))
+def test_a_folder_is_whole_old_or_whole_new_whenever_its_writer_is_killed(
+    sent: signal.Signals, tmp_path: Path
+) -> None:
+    runs = killed_at_every_step("folder in place of an older one", sent, tmp_path)
+    assert len(runs) > 30
+    states = [run.out for run in runs]
+    assert [s for s in states if s not in ({**OLD, **KEPT}, {**NEW, **KEPT})] == []
+    first_new = states.index({**NEW, **KEPT})
+    assert 10 < first_new < len(runs)
+    assert all(s == {**NEW, **KEPT} for s in states[first_new:])  # once there, it stays
+    assert all(run.beside == BYSTANDERS for run in runs)
+    assert all(run.again == {**NEW, **KEPT} for run in runs)
+    assert {run.status for run in runs[:-1]} <= {-sent if sent == signal.SIGKILL else 130}
 
 
 def test_a_new_folder_is_whole_or_not_there(tmp_path: Path) -> None:

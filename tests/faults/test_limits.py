@@ -69,6 +69,7 @@ def test_a_file_is_whole_old_or_whole_new_wherever_the_disk_is_full(tmp_path: Pa
     assert all(run.again == {**OLD, **KEPT, "a": "new"} for run in runs)
 
 
+@pytest.mark.slow
 def test_results_that_are_too_large_leave_the_older_ones(tmp_path: Path) -> None:
     """Sizes at which each of the files is the one that does not fit; under the last all fit."""
     out = tmp_path / "out"

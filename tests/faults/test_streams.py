@@ -9,6 +9,7 @@ import pytest
 
 from pancam_graph import SimulationOptions, simulate, write_traverse
 from pancam_graph.rigs import mer_navcam
+from support.parameters import slow_for
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="streams are another thing there")
 
@@ -78,7 +79,11 @@ def test_a_locale_without_letters_shows_what_it_can(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "streams"), [("--version", ">&-"), ("--help", ">/dev/full"), ("completion bash", ">/dev/full")]
+    ("words", "streams"),
+    slow_for(
+        [("completion bash", ">/dev/full")],
+        [("--version", ">&-"), ("--help", ">/dev/full"), ("completion bash", ">/dev/full")],
+    ),
 )
 def test_what_is_only_to_be_shown_fails_where_it_cannot_be(words: str, streams: str) -> None:
     if "/dev/full" in streams and not Path("/dev/full").exists():

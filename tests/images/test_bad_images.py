@@ -73,6 +73,7 @@ def test_an_image_of_all_sky_is_named_and_the_rest_found(tmp_path: Path) -> None
     assert seen(found) == {0, 1}
 
 
+@pytest.mark.slow
 def test_an_over_exposed_image_is_named_and_the_rest_found(truth: Traverse) -> None:
     assert truth.folder is not None
     bright = read_picture(truth.folder / LAST).astype(float) * 1.8

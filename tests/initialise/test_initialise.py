@@ -91,7 +91,7 @@ def test_residuals_are_radial_and_along_the_normal() -> None:
     assert fit.residual_m[:, 0] == pytest.approx(np.zeros(8), abs=1e-7)
 
 
-@pytest.mark.parametrize("arc_rad", [2 * np.pi * 11 / 12, 1.2])
+@pytest.mark.parametrize("arc_rad", slow_but_for([1.2], [2 * np.pi * 11 / 12, 1.2]))
 def test_sigma_of_the_centre_against_monte_carlo(arc_rad: float) -> None:
     """The spread of the centre in the plane, in its worst direction, over 400 fits."""
     rng = np.random.default_rng(0)
@@ -142,6 +142,7 @@ def test_what_determines_no_circle_is_refused(points: FloatArray, message: str) 
         fit_circle(points)
 
 
+@pytest.mark.slow
 def test_noise_that_hides_the_bend_ends_in_a_circle_or_a_refusal() -> None:
     """The best circle may then be a line: its normal equations are singular and its radius has no bound."""
     refused = 0

@@ -282,7 +282,8 @@ def pictured(solved: Callable[..., Solution], tmp_path: Path) -> Callable[..., S
     return lambda rig, dtype: with_pictures(solved(rig), tmp_path / "pictures", dtype)
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, pytest.param(np.uint16, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_an_undistorted_image_shows_what_its_pinhole_sees(
     pictured: Callable[..., Solution], tmp_path: Path, dtype: type
 ) -> None:

@@ -24,7 +24,7 @@ from pancam_graph.graph import (
     read_variable,
 )
 from pancam_graph.rigs import Rig, exomars_pancam, mer_navcam
-from support.parameters import slow_but_for, slow_for
+from support.parameters import slow_but_for
 
 PAN_T_TILT = gtsam.Pose3(gtsam.Rot3.Rodrigues(0.2, -0.1, 0.3), np.array([0.03, -0.02, 0.05]))
 
@@ -153,7 +153,10 @@ def templates(t: Traverse, sharing: Sharing | None = None) -> dict[str, FactorTe
         *slow_but_for(
             [("a tilt held", "hard", "nothing")], ((name, "hard", "nothing") for name in TRAVERSES)
         ),
-        *slow_for([("all free", "hard", "all")], ((name, "hard", "all") for name in TRAVERSES)),
+        *slow_but_for(
+            [("a stop held with its frames", "hard", "all"), ("a tilt held", "hard", "all")],
+            ((name, "hard", "all") for name in TRAVERSES),
+        ),
         *slow_but_for(
             [("all free", "hard", "per stop"), ("all free", "hard", "per image")],
             (("all free", "hard", sharing) for sharing in SHARINGS if sharing not in ("nothing", "all")),
@@ -163,7 +166,7 @@ def templates(t: Traverse, sharing: Sharing | None = None) -> dict[str, FactorTe
             ((name, "hard", sharing) for name in TRAVERSES for sharing in FLEXING),
         ),
         *slow_but_for(
-            [("all free", "mast", "nothing"), ("all free", "mast", "all"), ("all free", "mast", "per stop")],
+            [("all free", "mast", "all"), ("all free", "mast", "per stop")],
             (("all free", "mast", sharing) for sharing in SHARINGS),
         ),
         ("a stop held", "circle", "nothing"),

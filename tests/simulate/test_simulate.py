@@ -130,7 +130,7 @@ def test_every_image_sees_enough_and_every_track_is_seen_enough(template: str) -
         assert eye.camera.contains(simulation.truth.uv_px[traverse.image_eye[observations.image] == i]).all()
 
 
-@pytest.mark.parametrize("template", PANORAMAS)
+@pytest.mark.parametrize("template", slow_but_for(["mer-navcam", "stereo-pan-tilt"], PANORAMAS))
 def test_each_stop_hangs_together_by_shared_tracks(template: str) -> None:
     traverse, observations = default_of(template).traverse, observed(default_of(template))
     sees = coo_array(

@@ -31,7 +31,7 @@ from pancam_graph.rigs import mer_navcam
 from pancam_graph.solve import Fitted
 from pancam_graph.solve import _alternation as alternation
 from support.elimination_reference import whole
-from support.parameters import slow_but_for, slow_for
+from support.parameters import slow_but_for
 from support.solving import fitted
 
 SMALL = SimulationOptions(stops=2, pans=3, sweep_rad=1.5, points_per_image=15)
@@ -172,7 +172,7 @@ def test_halves_of_the_tracks_are_solved_in_turn_too() -> None:
 # --- what is held ---
 
 
-@pytest.mark.parametrize("name", ["radius", "calibration", "mounts"])
+@pytest.mark.parametrize("name", slow_but_for("radius", ["radius", "calibration", "mounts"]))
 def test_what_telemetry_or_the_rig_holds_stays_bit_for_bit(name: str) -> None:
     solution, t = solved(name, "alternation"), traverse()
     assert solution.final.pan_tilt_rad[0, 0] != t.pan_tilt_rad[0, 0]
@@ -259,7 +259,7 @@ def ended(options: SolveOptions) -> Fitted:
     return fitted(traverse(), options)
 
 
-@pytest.mark.parametrize("name", slow_for("residuals", CRITERIA))
+@pytest.mark.parametrize("name", slow_but_for("gradient", CRITERIA))
 def test_each_criterion_alone_ends_it_and_says_so(name: str) -> None:
     criterion, reason = CRITERIA[name]
     outcome = ended(replace(BARE, **criterion)).outcome  # type: ignore[arg-type]  # options by name

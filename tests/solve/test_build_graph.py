@@ -21,7 +21,7 @@ from pancam_graph import (
 from pancam_graph.base.errors import InputError
 from pancam_graph.data import RigTreatment
 from pancam_graph.rigs import mer_navcam
-from support.parameters import slow_but_for, slow_for
+from support.parameters import slow_for
 from support.small_drives import HARD, SMALL, SOFT, near_part, simulated
 
 POINTS = 6
@@ -66,7 +66,8 @@ def test_gtsams_own_levenberg_marquardt_ends_at_our_optimum(way: str) -> None:
         assert np.abs(pose.localCoordinates(values.atPose3(keys.mast(stop.id)))).max() < 1e-5
 
 
-@pytest.mark.parametrize("rig", slow_but_for("considered", ["estimated", "considered"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("rig", ["estimated", "considered"])
 def test_the_cost_is_that_of_solve_where_heads_flex(rig: RigTreatment) -> None:
     """At the solution, whose values are put under the keys of the graph; and it has no gradient there."""
     t, options = near(), replace(HARD, rig=rig)
@@ -104,7 +105,7 @@ def test_heads_that_do_not_flex_have_no_key() -> None:
         graph_keys(near()).flex("f")
 
 
-@pytest.mark.parametrize("way", ["hard", "soft", "circle"])
+@pytest.mark.parametrize("way", slow_for("hard", ["hard", "soft", "circle"]))
 def test_covariance_between_stops_is_gtsams(way: str) -> None:
     """Of stops that share tracks and of the last and the first, which is held."""
     graph, values = by_gtsam(way)

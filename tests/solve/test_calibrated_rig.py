@@ -112,6 +112,7 @@ def test_with_sigmas_alone_it_is_not() -> None:
     assert np.abs(apart / np.sqrt(np.diag(both.rig_covariance.matrix))).max() > 0.3
 
 
+@pytest.mark.slow
 def test_a_calibrated_rig_is_surer() -> None:
     found, without = solve(second()), solve(replace(second(), rig=claimed()))
     assert found.passed

@@ -237,6 +237,7 @@ def test_exact_halves_agree() -> None:
     assert max(s.other_px for s in exact.scores) < 1e-5
 
 
+@pytest.mark.slow
 def test_the_same_arguments_give_the_same_numbers(
     traverse: Traverse, solution: Solution, found: CrossValidation
 ) -> None:

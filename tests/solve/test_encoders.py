@@ -82,6 +82,7 @@ def test_stop_by_stop_and_explicit_landmarks_have_the_same_scale(way: str) -> No
         assert b.sigma == pytest.approx(a.sigma, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_the_graph_has_the_same_cost() -> None:
     near = read_with(near_part(simulate(mer_navcam(), SMALL, seed=2)), SERVO)
     options = replace(HARD, rig="estimated")

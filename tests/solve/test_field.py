@@ -78,6 +78,7 @@ def test_where_it_is_estimated_unasked() -> None:
     assert is_free(given, SolveOptions(rig="held", field=True))
 
 
+@pytest.mark.slow
 def test_a_sharing_frees_it_alone() -> None:
     sharing = Sharing(field=Freedom(scope="eye", sigma={"field_px": 0.3}))
     found = solve(drive().traverse, SolveOptions(sharing=sharing))

@@ -83,7 +83,7 @@ def test_right_telemetry_is_all_believed() -> None:
 @pytest.mark.parametrize(
     ("how", "pan", "tilt"),
     slow_but_for(
-        [(solve, 1.0, 0.0), (solve, 10.0, 0.0), (solve_incrementally, 0.0, 0.6)],
+        [(solve, 10.0, 0.0), (solve_incrementally, 0.0, 0.6)],
         [
             (how, *error)
             for how in (solve, solve_incrementally)
@@ -124,6 +124,7 @@ def test_of_two_frames_that_only_see_each_other_both_are_let_go() -> None:
     assert solution.angle_sigma_rad[[3, 10], 0].min() > np.deg2rad(1.0)
 
 
+@pytest.mark.slow
 def test_pans_of_a_stop_in_common_and_all_that_looks_alike_are_let_go() -> None:
     simulation = drive(options=replace(DRIVE, sigma_stop_rad=1e-3))
     of_second = np.flatnonzero(simulation.traverse.frame_stop == 1).tolist()

@@ -286,7 +286,8 @@ def options_of(name: str, **changes: Any) -> SolveOptions:
     return SolveOptions(**given_ | {"relative_decrease": 1e-12} | changes)
 
 
-@pytest.mark.parametrize("name", slow_but_for("mounts", COMPARED))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMPARED)
 def test_landmarks_eliminated_or_explicit_give_one_optimum(name: str) -> None:
     ours, theirs = (solve(near(), options_of(name, landmarks=way)) for way in ("eliminated", "explicit"))
     assert ours.converged

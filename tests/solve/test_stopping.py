@@ -76,9 +76,7 @@ CRITERIA = {
 
 @pytest.mark.parametrize(
     ("solver", "name"),
-    slow_for(
-        [("explicit", name) for name in CRITERIA if name != "relative_decrease"], product(SOLVERS, CRITERIA)
-    ),
+    slow_for([("explicit", name) for name in CRITERIA], product(SOLVERS, CRITERIA)),
 )
 def test_each_criterion_alone_ends_a_solve_and_says_so(solver: str, name: str) -> None:
     bound, reason = CRITERIA[name]
