@@ -52,7 +52,8 @@ class Block:
         row = np.concatenate([np.zeros(0, dtype=np.int64), *(layout.row[g] for g in groups)])
         of, is_nobodys = group.repeat(width), row < 0
         # Where each group begins in the panel of each; -1 where it is not there.
-        first = np.array([panels.first_columns(g) for g in groups]).reshape(len(groups), link.n_groups)[:, of]
+        starts = np.array([panels.first_columns(g) for g in groups], dtype=np.int64)
+        first = starts.reshape(len(groups), link.n_groups)[:, of]
         return Block(
             groups=groups,
             group=group,

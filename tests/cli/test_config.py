@@ -96,7 +96,7 @@ def test_the_command_line_wins(tmp_path: Path) -> None:
         ("[refine]\nstop = 3", "[refine] stop: expected text, found 3"),
         ("[refine]\nmosaic = 'yes'", "[refine] mosaic: expected true or false, found 'yes'"),
         ("[refine]\nmodel = 'ring'", "[refine] model: expected one of mast, circle, free, projective"),
-        ("[refine]\nexport = 'colmop'", "[refine] export: expected one of colmap, cahvor, rig; found 'colmop'; is 'colmap' meant?"),  # noqa: E501  the whole sentence
+        ("[refine]\nexport = 'colmop'", "[refine] export: expected one of colmap, cahvor, rig, gis; found 'colmop'; is 'colmap' meant?"),  # noqa: E501  the whole sentence
         ("[refine]\nexport = []", "[refine] export: expected one entry or more, found an empty list"),
         ("[refine]\nout = ['a', 'b']", "[refine] out: expected text, found a list of 2"),
         ("[refine]\nreport = true\nno-report = true", "no-report: expected report or no-report, found both"),
