@@ -21,6 +21,7 @@ __all__ = [
     "FloatArray",
     "IntArray",
     "axes_across",
+    "block_diagonal",
     "compose",
     "corrected_poses",
     "correction_twists",
@@ -78,6 +79,15 @@ def axes_across(directions: FloatArray) -> FloatArray:
     first = np.cross(directions, least)
     first = first / np.linalg.norm(first, axis=1, keepdims=True)
     return np.stack([first, np.cross(directions, first)], axis=1)
+
+
+def block_diagonal(blocks: Sequence[FloatArray]) -> FloatArray:
+    """Blocks (m_i, n_i) on the diagonal of a matrix (sum of m_i, sum of n_i) that is 0 elsewhere."""
+    down, across = (np.cumsum([0, *(block.shape[k] for block in blocks)]) for k in (0, 1))
+    out = np.zeros((int(down[-1]), int(across[-1])))
+    for i, block in enumerate(blocks):
+        out[down[i] : down[i + 1], across[i] : across[i + 1]] = block
+    return out
 
 
 def skew(v: FloatArray) -> FloatArray:

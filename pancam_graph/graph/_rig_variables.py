@@ -16,6 +16,7 @@ import scipy
 from pancam_graph.base.geometry import (
     FloatArray,
     IntArray,
+    block_diagonal,
     corrected_poses,
     correction_twists,
     pose_arrays,
@@ -440,13 +441,13 @@ class RigVariables:
         order = np.concatenate([np.zeros(0, dtype=np.int64), *columns])
         moved = [self._moved(v, values) for v in variables]
         of_field = [np.eye(len(RIG_ENTRIES["field"])) for _ in self.field_keys]  # it is linear
-        jacobian = scipy.linalg.block_diag(*moved, *of_field)
+        jacobian = block_diagonal([*moved, *of_field])
         matrix = jacobian @ covariance.block(g, g)[np.ix_(order, order)] @ jacobian.T
         prior = self.sharing.covariance
         if prior is not None:
             unseen = [e for e in prior.entries if e not in entries]
             entries += unseen
-            matrix = scipy.linalg.block_diag(matrix, prior.among(unseen, np.zeros(len(unseen))))
+            matrix = block_diagonal([matrix, prior.among(unseen, np.zeros(len(unseen)))])
         return RigCovariance(entries=tuple(entries), matrix=(matrix + matrix.T) / 2)
 
     def _moved(self, variable: RigVariable, values: gtsam.Values) -> FloatArray:

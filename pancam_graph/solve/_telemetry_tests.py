@@ -12,9 +12,8 @@ from typing import Protocol, overload
 
 import gtsam
 import numpy as np
-import scipy
 
-from pancam_graph.base.geometry import FloatArray, IntArray, pose_arrays
+from pancam_graph.base.geometry import FloatArray, IntArray, block_diagonal, pose_arrays
 from pancam_graph.elimination import Covariance, Root
 from pancam_graph.graph import FactorTemplate, Kind, index_of, kind_of
 from pancam_graph.solve._covariance import Uncertainty
@@ -278,7 +277,7 @@ def _of_stop(
             np.diag(1 / np.where(p.sigma > 0, p.sigma, 1.0)) if p.whitening is None else p.whitening
             for p in priors
         ]
-        whitening = np.asarray(scipy.linalg.block_diag(*blocks)[np.ix_(free, free)])
+        whitening = block_diagonal(blocks)[np.ix_(free, free)]
     entry = [name for p in priors for name in p.entry]
     posterior = covariance.block(stop, stop)[np.ix_(column[free], column[free])]
     by_shared = None

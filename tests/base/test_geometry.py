@@ -5,6 +5,7 @@ from collections.abc import Callable
 import gtsam
 import numpy as np
 import pytest
+import scipy
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -14,6 +15,7 @@ from pancam_graph.base.geometry import (
     HEAD_R_FORWARD_CAMERA,
     Z_DOWN_R_Z_UP,
     FloatArray,
+    block_diagonal,
     compose,
     corrected_poses,
     correction_twists,
@@ -254,3 +256,9 @@ def test_no_poses_are_empty_arrays() -> None:
     rotations, translations = pose_arrays([])
     assert rotations.shape == (0, 3, 3)
     assert translations.shape == (0, 3)
+
+
+def test_blocks_stand_on_the_diagonal_of_a_matrix() -> None:
+    blocks = [np.arange(6.0).reshape(2, 3) + 1, np.zeros((0, 1)), np.full((1, 1), 9.0)]
+    np.testing.assert_array_equal(block_diagonal(blocks), scipy.linalg.block_diag(*blocks))
+    assert block_diagonal([]).shape == (0, 0)
