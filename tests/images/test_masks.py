@@ -67,6 +67,7 @@ def test_nothing_is_observed_where_a_mask_is_black_nor_moved_by_what_it_covers(t
     assert grey.shape == (SIZE_PX, SIZE_PX)
 
 
+@pytest.mark.slow
 def test_a_mask_of_zeros_and_ones_means_the_same(tmp_path: Path) -> None:
     truth, _ = make_traverse(tmp_path, pans_deg=(0.0, 8.0), eyes=("left",))
     masked = replace(truth, images=tuple(replace(i, mask="mask.png") for i in truth.images))

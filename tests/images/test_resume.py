@@ -90,6 +90,7 @@ def gone_on(run: Run, calls: list[int], tmp_path: Path, monkeypatch: pytest.Monk
     return tmp_path / "out"
 
 
+@pytest.mark.slow
 def test_an_interrupt_is_one_line_and_the_same_command_goes_on(gone_on: Path) -> None:
     assert json.loads((gone_on / "solution.json").read_text())["converged"]
 

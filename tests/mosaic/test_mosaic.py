@@ -159,6 +159,7 @@ def expected_shift(solution: Solution, row: int, overlap: Overlap) -> FloatArray
     return np.asarray(PX_PER_RAD * np.column_stack([right, -moved_elevation]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("error", [(-2e-3, 5e-3)])
 def test_a_pointing_error_is_the_seam_error(tmp_path: Path, error: tuple[float, float]) -> None:
     solution = solved(Scene(error_rad=((0.0, 0.0), error)), tmp_path)

@@ -129,6 +129,7 @@ def test_a_kept_drive_goes_on_with_the_factors(tmp_path: Path) -> None:
         TraverseSmoother.load(tmp_path / "drive.npz")
 
 
+@pytest.mark.slow
 def test_the_incremental_solution_counts_them() -> None:
     batch = solve(drive(), TO_THE_END, factors=factors_of(drive()))
     solution = solve_incrementally(drive(), TO_THE_END, factors=factors_of(drive()))

@@ -118,6 +118,7 @@ def test_what_is_left_out_counts_once() -> None:
     assert out.sum() <= sum(u.rejected for u in updates) < 1.05 * out.sum()
 
 
+@pytest.mark.slow
 def test_a_track_taken_back_whole_can_come_again() -> None:
     traverse = simulated(0.0, seed=16).traverse
     smoother, _ = driven(traverse)

@@ -163,6 +163,7 @@ def test_the_answer_after_the_last_stop_is_that_of_the_batch(small: Simulation, 
     assert np.all(np.abs(found - angles) < 0.05 * batch.angle_sigma_rad)
 
 
+@pytest.mark.slow
 def test_stops_may_come_in_any_order(small: Simulation, batch: Solution) -> None:
     smoother = TraverseSmoother(small.traverse.rig)
     driven(small.traverse, smoother, [2, 0, 3, 1])

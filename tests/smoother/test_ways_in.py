@@ -169,6 +169,7 @@ def test_where_nothing_is_held_telemetry_holds_all_stops_in_common(
         assert np.abs(error[3:]).max() < 0.1
 
 
+@pytest.mark.slow
 def test_an_eye_that_the_first_stop_does_not_show_has_its_prior() -> None:
     """Its mount was free without one: the images hold it badly, and the stops with it."""
     options = replace(SHORT, mount_error_rad=1e-3, mount_error_m=1e-3)

@@ -224,6 +224,7 @@ def test_a_considered_rig_adds_what_its_errors_do_to_the_solution() -> None:
     assert np.all(np.abs(more_points - points[near]).max(axis=(1, 2)) < 0.05 * size)
 
 
+@pytest.mark.slow
 def test_the_flex_of_frames_is_estimated_where_the_rig_is_considered() -> None:
     """It is no number of the rig: where nothing else is uncertain, considered and estimated are the same."""
     bends = with_rig(drive().traverse, replace(mer_navcam(), uncertainty=replace(EXACT, flex_rad=1e-3)))
