@@ -16,7 +16,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from pancam_graph import Solution, Traverse
+from pancam_graph import Solution, SolveOptions, Traverse, solve
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray, rotation_from_wxyz
 from pancam_graph.cameras import CAHV, CAHVORE, cahv_of_vectors
@@ -34,12 +34,16 @@ from pancam_graph.data import (
 from pancam_graph.io import read_input, with_network, write_traverse
 from pancam_graph.io.vicar import picture_identities, read_nav, read_ties, with_pointing, with_ties
 from pancam_graph.results import DOORS, convert
+from pancam_graph.results._read_source import traverse_source
 from pancam_graph.results.formats import source_of
 from pancam_graph.rigs import rig_template
 from support.fuzzing import mutated_bytes, mutated_text, outcome
 from support.made_solutions import fabricate
+from support.small_drives import simulated
+from support.tied_drives import landmark_ties, noise_free
 
 ROVER_T_MAST = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.01, -0.02, 0.4), np.array([0.46, 0.03, 1.1]))
+SAID = {"landmark-position", "landmark-height", "landmark-azimuth", "landmark-elevation"}
 NAMES = ("position", "map", "height", "far", "azimuth", "elevation")
 
 
@@ -337,6 +341,41 @@ def test_ties_that_are_wrong_are_refused(tmp_path: Path, pattern: str, by: str, 
     with pytest.raises(InputError, match=says) as error:
         with_ties(bare(solved()), read_ties(path), path)
     assert str(path) in str(error.value)
+
+
+@pytest.mark.slow
+def test_ties_lead_a_drive_back(tmp_path: Path) -> None:
+    """Without noise a drive whose telemetry is off, and loose, ends where pairs and known points of a .tpt say."""
+    simulation = simulated(2, 2)
+    ties = [tie for tie in landmark_ties(simulation) if tie.kind in SAID]
+    told = noise_free(simulation)
+    source = traverse_source(replace(told, constraints=(ties[0], *ties[3:])))
+    DOORS["tpt"].writer()(source, tmp_path / "a.tpt")
+    assert {tie.type for tie in read_ties(tmp_path / "a.tpt").ties} == {0, 1, 6, 7, 8}
+    first, second = told.stops
+    shift = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.01, -0.01, 0.03), np.array([0.4, -0.3, 0.1]))
+    loose = replace(
+        told,
+        observations=None,
+        stops=(
+            first,
+            replace(
+                second,
+                world_T_mast=second.world_T_mast * shift,
+                sigma_rotation_rad=1.0,
+                sigma_translation_m=10.0,
+            ),
+        ),
+        frames=tuple(replace(f, sigma_pan_rad=0.5, sigma_tilt_rad=0.5) for f in told.frames),
+    )
+    back = with_ties(loose, read_ties(tmp_path / "a.tpt"), tmp_path / "a.tpt")
+    solution = solve(back, SolveOptions(rig="held"))
+    assert solution.converged
+    true = simulation.truth.world_T_mast[1]
+    assert np.abs(true.localCoordinates(solution.final.world_T_mast[1])).max() < 1e-4
+    assert not [
+        test for test in (solution.verdict.failures if solution.verdict else ()) if "let go" in test.name
+    ]
 
 
 # --- pointing and places ---
