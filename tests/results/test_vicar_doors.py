@@ -345,7 +345,7 @@ def test_ties_that_are_wrong_are_refused(tmp_path: Path, pattern: str, by: str, 
 
 @pytest.mark.slow
 def test_ties_lead_a_drive_back(tmp_path: Path) -> None:
-    """Without noise a drive whose telemetry is off, and loose, ends where pairs and known points of a .tpt say."""
+    """Without noise a drive whose telemetry is off, and loose, ends where the ties of a .tpt say."""
     simulation = simulated(2, 2)
     ties = [tie for tie in landmark_ties(simulation) if tie.kind in SAID]
     told = noise_free(simulation)
