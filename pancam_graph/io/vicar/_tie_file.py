@@ -321,7 +321,7 @@ def _tie_lines(tie: Tie) -> list[str]:
         told = [(a, v) for a, v in zip("xyz", tie.xyz, strict=True) if a in name and v is not None]
         lines.append(f"      <{name}{_attributes(told)}/>")
     if tie.type in _ANGLE:
-        lines.append(f'      <{_ANGLE[tie.type]} degrees="{tie.angle_deg!r}"/>')
+        lines.append(f'      <{_ANGLE[tie.type]} degrees="{float(tie.angle_deg or 0.0)!r}"/>')
     if tie.adjusted is not None:
         found = tie.adjusted
         lines += [_pixel_line(n, uv) for n, uv in zip(_RESIDUALS, found.residuals, strict=True)]
@@ -336,11 +336,11 @@ def _tie_lines(tie: Tie) -> list[str]:
 
 
 def _attributes(numbers: Iterable[tuple[str, float]]) -> str:
-    return "".join(f' {name}="{value!r}"' for name, value in numbers)
+    return "".join(f' {name}="{float(value)!r}"' for name, value in numbers)
 
 
 def _pixel_line(name: str, uv: tuple[float, float]) -> str:
-    return f'      <{name} line="{uv[1]!r}" samp="{uv[0]!r}"/>'
+    return f'      <{name} line="{float(uv[1])!r}" samp="{float(uv[0])!r}"/>'
 
 
 def tie_text(ties: Sequence[Tie]) -> str:
