@@ -60,11 +60,15 @@ def tie_file(source: Source) -> TieFile:
     for track, rows in pairs_of_tracks(source):
         mine = known.get(track, [])
         ties += _pairs(source, track, rows, mine, frame)
-        ties += [tie for constraint in mine for tie in _singles(source, track, rows, constraint, frame)]
+        for constraint in mine:
+            singles = _singles(source, track, rows, constraint, frame)
+            ties += singles
+            # Angles are from a stop: without an image of it that sees the point there is no tie.
+            lost[constraint.kind] += bool(constraint.stops) and not singles
     if not ties:
         raise InputError("tpt: expected observations that join two images, found none")
-    if lost:
-        each = ", ".join(f"{count} {kind}" for kind, count in lost.items())
+    each = ", ".join(f"{count} {kind}" for kind, count in lost.items() if count)
+    if each:
         source.warnings.append(f"tpt: ties of marsnav have no equal of some constraints, left out: {each}")
     images: dict[int, str | None] = {row: who.unique_id for row, who in enumerate(source.identities)}
     return TieFile(images=images, ties=tuple(ties), frames=(frame,))
