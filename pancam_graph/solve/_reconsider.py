@@ -12,7 +12,6 @@ from pancam_graph.elimination import Root
 from pancam_graph.graph import LetGo
 from pancam_graph.solve._constraint_tests import ConstraintTest
 from pancam_graph.solve._fit import Fitted, fit
-from pancam_graph.solve._growing_errors import GrowingErrors
 from pancam_graph.solve._judge import Judged, judge
 from pancam_graph.solve._let_go import letting_go, most_let_go, parts_let_go
 from pancam_graph.solve._screen import screened_again
@@ -62,7 +61,7 @@ def reconsidered(judged: Judged) -> Judged:
                 return judged
         else:
             errors = _largest(suspected)
-            if _is_of_rig(errors[0], now) or _grows(errors[0], suspected.growing):
+            if _is_of_rig(errors[0], now) or _grows(errors[0], suspected):
                 return judged
             let_go = problem.template.let_go + letting_go(traverse, errors)
             if len(parts_let_go(traverse, let_go, now.state)) > most:
@@ -110,10 +109,17 @@ def _is_of_rig(error: Correction, judged: Judged) -> bool:
     return any(0.5 * error.sigmas**2 < share * gain for gain in gains)
 
 
-def _grows(error: Correction, growing: GrowingErrors | None) -> bool:
-    """Whether an error that grows along the drive explains more than one of a stop's place, or of a leg."""
-    is_place = error.entry in _PLACES or error.entry.startswith("leg")
-    return growing is not None and is_place and error.sigmas**2 < growing.square
+def _grows(error: Correction, suspected: Suspected) -> bool:
+    """Whether an error that grows along the drive explains more than one of a stop's place, or of a leg.
+
+    In all three directions, less what two more directions add by chance.
+    """
+    is_leg = error.entry.startswith("leg")
+    if suspected.growing is None or not (is_leg or error.entry in _PLACES):
+        return False
+    names = {f"leg {name}" if is_leg else name for name in _PLACES}
+    alike = [c.sigmas**2 for c in suspected.stops if c.stop == error.stop and c.entry in names]
+    return sum(alike) - len(alike) + 1 < suspected.growing.square
 
 
 def _fitted_again(fitted: Fitted, let_go: LetGo) -> Fitted:
