@@ -45,6 +45,8 @@ def pds4_text(real: str, name: str, shot: Shot, mast: Mast, *, clock: str = "722
     text = re.sub(r"(<img:first_sample>)\d+", r"\g<1>1", text)
     text = once(r"(<mars2020:spacecraft_clock_start>)[^<]*", text, clock)
     text = once(r"(<img_surface:ops_instrument_key>)[^<]*", text, shot.instrument)
+    if shot.instrument.endswith("RIGHT"):  # the real label is the left camera's
+        text = once(r"(<img_surface:instrument_serial_number>)[^<]*", text, "104")
     text = once(r"(<file_name>)[^<]*IMG", text, f"{name}.IMG")
     return sized(text, model.width_px, model.height_px)
 
