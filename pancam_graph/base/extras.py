@@ -14,5 +14,6 @@ def needed(package: str, extra: str) -> Any:
         return import_module(package)
     except ImportError as error:
         raise InputError(
-            f"{extra}: expected the Python package {package}, found none: pip install 'pancam-graph[{extra}]'"
+            f"{extra}: expected the Python package {package}, found none: pip install "
+            f"'pancam-graph[{extra}]', in a checkout pip install -e '.[{extra}]'"
         ) from error

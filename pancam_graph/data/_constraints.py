@@ -41,6 +41,10 @@ Landmark = str | int
 
 EXACT = 1e-5
 """Sigma, metres or radians, that stands for 0: far below what pictures tell, and above rounding."""
+_LARGEST = 1e9
+"""Metres: beyond the size of all bodies that anything drives on; squares of it keep their digits."""
+_UNIT = 1e-3
+"""How far the length of a unit normal may be from 1; it is made 1."""
 _STOPS = "stops: expected the ids of two different stops"
 _ASYMMETRY = 1e-9
 """Largest difference of mixed entries of a covariance, as a share of its largest variance."""
@@ -202,12 +206,12 @@ class LandmarkHeight(_Measured):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LandmarkPlane(_Measured):
-    """A terrain point on a known plane: normal . x = offset."""
+    """A terrain point on a known plane: unit normal . x = offset."""
 
     kind, _value, _sigma = "landmark-plane", "offset_m", "sigma_m"
     landmark: Landmark
     normal: Sequence[float]
-    """(3,) normal of the plane in the world, of any length but 0."""
+    """(3,) unit normal of the plane in the world."""
     offset_m: float
     """Distance of the plane from the world's origin along the unit normal."""
     sigma_m: float
@@ -217,8 +221,11 @@ class LandmarkPlane(_Measured):
         """Check numbers."""
         super().__post_init__()
         normal = _three("normal", self.normal)
-        if not np.linalg.norm(normal) > 0:  # NaN where an entry is null
-            raise InputError(f"normal: expected three numbers, not all 0; found {list(self.normal)}")
+        length = float(np.linalg.norm(normal))  # NaN where an entry is null
+        if not abs(length - 1) <= _UNIT:  # of another normal, whose offset counts in other units
+            raise InputError(
+                f"normal: expected three numbers of length 1, found {list(self.normal)} of length {length:g}"
+            )
 
     @property
     def unit_normal(self) -> FloatArray:
@@ -422,6 +429,8 @@ def _number(name: str, value: object) -> float:
     number = float_array(name, value)
     if number.ndim or not np.isfinite(number):
         raise InputError(f"{name}: expected a finite number, found {value}")
+    if abs(number) > _LARGEST:
+        raise InputError(f"{name}: expected a number of at most {_LARGEST:g}, found {value}")
     return float(number)
 
 

@@ -322,7 +322,18 @@ class Traverse:
             _require_rows(
                 "image", f"a row of images, 0 to {len(self.images) - 1}", wrong, self.points.image, "points"
             )
+            self._require_marks_in_images(self.points)
         self._require_constraints()
+
+    def _require_marks_in_images(self, points: NamedPoints) -> None:
+        """Raise InputError for a mark beside its picture."""
+        for name, row, (u, v) in zip(points.name, points.image.tolist(), points.uv_px.tolist(), strict=True):
+            camera = self.rig.eyes[int(self.image_eye[row])].camera
+            if not (-0.5 <= u <= camera.width_px - 0.5 and -0.5 <= v <= camera.height_px - 0.5):
+                raise InputError(
+                    f"points: {name}: image {self.images[row].id}: expected pixels in a picture of "
+                    f"{camera.width_px} x {camera.height_px}, found ({u:g}, {v:g})"
+                )
 
     def _require_constraints(self) -> None:
         """Raise InputError for a constraint on what there is not, and for exact ones that contradict."""

@@ -82,6 +82,8 @@ def with_network(traverse: Traverse, path: Path) -> Traverse:
     def cell(cells: tuple[str, ...], name: str) -> str:
         return cells[at[name]].strip() if name in at else ""
 
+    if not table.rows:
+        raise InputError(f"{path}: expected rows of measures under the head, found none")
     serials = list(dict.fromkeys(cells[at["serialnumber"]].strip() for _, cells in table.rows))
     rows = image_rows(serials, picture_identities(traverse), path, traverse)
     groups: dict[object, list[Mark]] = {}

@@ -28,7 +28,11 @@ __all__ = [
 ]
 
 _MAX_QUOTED = 60
+_UNION_TAGS = {"constrained-int", "constrained-str"}
+"""Pieces of a location that are no entry, but the type that pydantic tried."""
 _EXPECTED = {
+    "bool_parsing": "true or false",
+    "bool_type": "true or false",
     "finite_number": "a finite number",
     "float_type": "a number",
     "int_type": "an integer",
@@ -65,7 +69,7 @@ def entry_name(location: Sequence[int | str]) -> str:
     for piece in location:
         if isinstance(piece, int):
             name += f"[{piece}]"
-        elif not (piece.startswith("<") and piece.endswith(">")):
+        elif piece not in _UNION_TAGS and not (piece.startswith("<") and piece.endswith(">")):
             name += f".{piece}" if name else piece
     return name
 

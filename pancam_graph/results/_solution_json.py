@@ -11,7 +11,9 @@ import gtsam
 import numpy as np
 from pydantic import Field
 
+from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray, IntArray
+from pancam_graph.base.regular_files import is_missing
 from pancam_graph.cameras import FieldCamera
 from pancam_graph.data import (
     ENTRIES,
@@ -251,6 +253,8 @@ class SolutionFile(Entry):
 def read_solution_json(path: Path | str) -> SolutionFile:
     """Read a `solution.json`. Raises InputError naming file, entry, expected and found."""
     path = Path(path)
+    if is_missing(path):
+        raise InputError(f"{path}: expected a folder of results or its solution.json, found nothing there")
     return validated(SolutionFile, read_json(path, SOLUTION_FORMAT, VERSION), path)
 
 

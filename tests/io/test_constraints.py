@@ -44,7 +44,7 @@ EVERY = (
     LandmarkPosition(landmark="rock7", position_m=(1.0, None, 3.0), sigma_m=(0.01, None, 0.0), robust=True),
     LandmarkPosition(landmark=0, position_m=(1.0, 2.0, 3.0), covariance_m2=np.diag([1e-4, 2e-4, 3e-4])),
     LandmarkHeight(landmark="rock7", height_m=0.2, sigma_m=0.01),
-    LandmarkPlane(landmark="peak", normal=(0.0, 0.0, 2.0), offset_m=0.2, sigma_m=0.01),
+    LandmarkPlane(landmark="peak", normal=(0.0, 0.6, 0.8), offset_m=0.2, sigma_m=0.01),
     LandmarkAzimuth(landmark="peak", stop=S0, azimuth_rad=0.5, sigma_rad=1e-3),
     LandmarkElevation(landmark="peak", stop=S1, elevation_rad=0.05, sigma_rad=1e-3),
     LandmarkInfinity(landmark="peak"),
@@ -181,7 +181,15 @@ WRONG: dict[str, tuple[Change, str]] = {
         "covariance_m2: expected 3 rows",
     ),
     "elevation of the zenith": (entry(5, elevation_rad=1.6), "between -pi / 2 and pi / 2"),
-    "no normal": (entry(3, normal=[0.0, 0.0, 0.0]), "not all 0"),
+    "long normal": (
+        entry(3, normal=[0.0, 0.0, 2.0]),
+        r"normal: expected three numbers of length 1, found .* of length 2",
+    ),
+    "huge": (entry(2, height_m=1e308), r"height_m: expected a number of at most 1e\+09, found 1e\+308"),
+    "no normal": (
+        entry(3, normal=[0.0, 0.0, 0.0]),
+        r"normal: expected three numbers of length 1, found .* of length 0",
+    ),
     "contradictory exact heights": (
         lambda c: c["constraints"].extend(EXACT),
         r"constraints\[15\] \(landmark-height\): expected what constraints\[14\] says, which is exact",
@@ -272,3 +280,11 @@ def test_damaged_constraints_end_in_a_result_or_one_sentence(tmp_path: Path) -> 
 @pytest.mark.slow
 def test_hundreds_of_damaged_constraints_end_in_a_result_or_one_sentence(tmp_path: Path) -> None:
     assert len(damaged(tmp_path, range(100, 700))) > 50
+
+
+def test_a_mark_beside_its_picture_is_refused_by_name(tmp_path: Path) -> None:
+    write_traverse(sample(), tmp_path)
+    (tmp_path / "points.csv").write_text("name,image,u_px,v_px,sigma_px\nrock7,frame00000-left,-5000,3,0.1\n")
+    sentence = r"points: rock7: image frame00000-left: expected pixels in a picture of .* found \(-5000, 3\)"
+    with pytest.raises(InputError, match=sentence):
+        read_traverse(tmp_path)

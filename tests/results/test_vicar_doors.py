@@ -5,23 +5,19 @@ were not at hand.
 """
 
 import re
-from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree as ET
 
 import gtsam
 import numpy as np
 import pytest
 
-from pancam_graph import Solution, SolveOptions, Traverse, solve
+from pancam_graph import SolveOptions, solve
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray, rotation_from_wxyz
 from pancam_graph.cameras import CAHV, CAHVORE, cahv_of_vectors
 from pancam_graph.data import (
-    Constraint,
     LandmarkAzimuth,
     LandmarkElevation,
     LandmarkHeight,
@@ -29,90 +25,13 @@ from pancam_graph.data import (
     LandmarkPlane,
     LandmarkPosition,
     Observations,
-    Site,
 )
-from pancam_graph.io import read_input, with_network, write_traverse
-from pancam_graph.io.vicar import picture_identities, read_nav, read_ties, with_pointing, with_ties
-from pancam_graph.results import DOORS, convert
+from pancam_graph.io.vicar import read_nav, read_ties, with_pointing, with_ties
+from pancam_graph.results import DOORS
 from pancam_graph.results._read_source import traverse_source
-from pancam_graph.results.formats import source_of
-from pancam_graph.rigs import rig_template
-from support.fuzzing import mutated_bytes, mutated_text, outcome
-from support.made_solutions import fabricate
+from support.door_solutions import SAID, bare, marks, solved, written
 from support.small_drives import simulated
 from support.tied_drives import landmark_ties, noise_free
-
-ROVER_T_MAST = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.01, -0.02, 0.4), np.array([0.46, 0.03, 1.1]))
-SAID = {"landmark-position", "landmark-height", "landmark-azimuth", "landmark-elevation"}
-NAMES = ("position", "map", "height", "far", "azimuth", "elevation")
-
-
-@cache
-def solved(template: str = "msl-navcam", *, rover: bool = False) -> Solution:
-    """A solution with points on which something is known, each kind on a point of its own."""
-    rig = rig_template(template)
-    made = fabricate(
-        rig=replace(rig, rover_T_mast=ROVER_T_MAST if rover else None), stops=2, pans=3, points=240
-    )
-    observations = made.traverse.observations
-    assert observations is not None
-    use = made.used & (np.bincount(observations.track[made.used])[observations.track] > 1)
-    made = replace(made, used=use, reason=tuple("" if u else "outlier" for u in use))
-    # Points that both eyes at the first stop see.
-    at_first = use & (made.traverse.image_stop[observations.image] == 0)
-    count = np.bincount(observations.track[at_first])
-    tracks = np.flatnonzero(count >= 2)[: len(NAMES)].tolist()
-    point = {t: made.final.landmarks_m[made.landmark_track.tolist().index(t)] for t in tracks}
-    mast = made.final.world_T_mast[0].translation()
-    said = dict(zip(NAMES, tracks, strict=True))
-
-    def arm(name: str) -> FloatArray:
-        return np.asarray(point[said[name]] - mast)
-
-    x, y, _ = point[said["map"]].tolist()
-    constraints: tuple[Constraint, ...] = (
-        LandmarkPosition(
-            landmark=said["position"], position_m=tuple(point[said["position"]].tolist()), sigma_m=(0.01,) * 3
-        ),
-        LandmarkPosition(landmark=said["map"], position_m=(x, y, None), sigma_m=(0.5, 0.5, None)),
-        LandmarkHeight(landmark=said["height"], height_m=float(point[said["height"]][2]), sigma_m=0.05),
-        LandmarkInfinity(landmark=said["far"]),
-        LandmarkAzimuth(
-            landmark=said["azimuth"],
-            stop=made.traverse.stops[0].id,
-            azimuth_rad=float(np.arctan2(arm("azimuth")[1], arm("azimuth")[0])),
-            sigma_rad=2e-3,
-        ),
-        LandmarkElevation(
-            landmark=said["elevation"],
-            stop=made.traverse.stops[0].id,
-            elevation_rad=float(np.arcsin(arm("elevation")[2] / np.linalg.norm(arm("elevation")))),
-            sigma_rad=2e-3,
-        ),
-    )
-    return replace(made, traverse=replace(made.traverse, constraints=constraints))
-
-
-def written(solution: Solution, path: Path, to: str) -> list[str]:
-    source = source_of(solution)
-    if DOORS[to].is_folder:
-        path.mkdir()
-    DOORS[to].writer()(source, path)
-    return source.warnings
-
-
-def marks(observations: Observations, rows: Any = slice(None)) -> set[tuple[int, float, float]]:
-    return {
-        (int(i), float(u), float(v))
-        for i, (u, v) in zip(observations.image[rows], observations.uv_px[rows], strict=True)
-    }
-
-
-def bare(solution: Solution) -> Traverse:
-    return replace(solution.traverse, observations=None, constraints=())
-
-
-# --- ties ---
 
 
 def test_ties_come_back_with_all_that_is_known(tmp_path: Path) -> None:
@@ -502,137 +421,3 @@ def test_without_a_rover_there_is_no_rvf(tmp_path: Path) -> None:
 
 
 # --- control networks ---
-
-
-@pytest.mark.parametrize("placed", [False, True])
-def test_a_control_network_comes_back(tmp_path: Path, placed: bool) -> None:
-    solution = solved()
-    site = Site(body="Mars", latitude_deg=-4.6, longitude_deg=137.4, height_m=-4500.0, north_rad=0.3)
-    solution = replace(solution, traverse=replace(solution.traverse, site=site if placed else None))
-    (warning,) = written(solution, tmp_path / "net.csv", "control-network")
-    assert warning.startswith("control-network: 5 constraints")
-    back = with_network(bare(solution), tmp_path / "net.csv")
-    given = solution.traverse.observations
-    assert given is not None
-    assert back.observations is not None
-    (known,) = back.constraints
-    assert isinstance(known, LandmarkPosition)
-    truth = solution.traverse.constraints[0]
-    assert isinstance(truth, LandmarkPosition)
-    assert np.allclose(known.target_m, truth.target_m, atol=1e-8)
-    assert np.allclose(known.covariance, 1e-4 * np.eye(3), atol=1e-12)
-    ours = np.array(sorted(marks(back.observations)))
-    theirs = np.array(sorted(marks(given, solution.used)))
-    assert np.allclose(ours, theirs, atol=1e-9)
-
-
-def test_a_network_counts_pixels_from_one(tmp_path: Path) -> None:
-    t = solved().traverse
-    rows = "".join(f"p,{t.images[i].id},{3 + i},7,false\nq,{t.images[i].id},1,1,true\n" for i in range(2))
-    (tmp_path / "n.csv").write_text(f"id,serialnumber,sample,line,pointIgnore\n{rows}")
-    back = with_network(bare(solved()), tmp_path / "n.csv")
-    assert back.observations is not None
-    assert back.observations.uv_px.tolist() == [[2, 6], [3, 6]]
-
-
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ("id,sample,line\n", "serialnumber: expected one such column"),
-        ("id,serialnumber,sample,line\np,{a},x,1\n", 'line 2: sample: expected a number, found "x"'),
-        ("id,serialnumber,sample,line\n,{a},1,1\n", "line 2: id: expected a name, found an empty cell"),
-        (
-            "id,serialnumber,sample,line\np,{a},1,1\n",
-            "expected points that two images or more see, found none",
-        ),
-        ("id,serialnumber,sample,line\np,elsewhere,1,1\n", "expected pictures of .*, found elsewhere"),
-        (
-            "id,serialnumber,sample,line,pointType,aprioriX,aprioriY,aprioriZ,aprioriCovar\np,{a},1,1,3,1,2,3,[1]\n",
-            "line 2: aprioriCovar: expected a list of six numbers",
-        ),
-    ],
-)
-def test_networks_that_are_wrong_are_refused(tmp_path: Path, text: str, says: str) -> None:
-    path = tmp_path / "n.csv"
-    path.write_text(text.replace("{a}", solved().traverse.images[0].id))
-    with pytest.raises(InputError, match=says) as error:
-        with_network(bare(solved()), path)
-    assert str(path) in str(error.value)
-
-
-# --- the command ---
-
-
-def test_files_become_a_drive(tmp_path: Path) -> None:
-    solution = solved()
-    write_traverse(solution.traverse, tmp_path / "drive")
-    written(solution, tmp_path / "a.tpt", "tpt")
-    written(solution, tmp_path / "a.nav", "nav")
-    convert(tmp_path / "a.nav", tmp_path / "pointed", images=tmp_path / "drive")
-    done = convert(tmp_path / "a.tpt", tmp_path / "tied", images=tmp_path / "pointed")
-    assert (done.to, done.passed) == ("traverse", True)
-    back = read_input(tmp_path / "tied")
-    assert len(back.constraints) == 6
-    assert np.allclose(np.sin(back.pan_tilt_rad), np.sin(solution.final.pan_tilt_rad), atol=1e-12)
-    with pytest.raises(
-        InputError, match=r"a\.tpt: expected the folder of its pictures \(--images\), found none told"
-    ):
-        convert(tmp_path / "a.tpt", tmp_path / "other")
-    convert(tmp_path / "tied", tmp_path / "again.tpt")
-    assert {t.type for t in read_ties(tmp_path / "again.tpt").ties} == {0, 1, 3, 4, 6, 7, 8}
-
-
-def test_tables_hold_what_the_solution_does(tmp_path: Path) -> None:
-    solution = solved()
-    written(solution, tmp_path / "tables", "tables")
-    text = (tmp_path / "tables" / "frames.csv").read_text().splitlines()
-    numbers = np.array([[float(c) for c in line.split(",")[2:6]] for line in text[1:]])
-    assert np.array_equal(numbers[:, :2], solution.final.pan_tilt_rad)
-    assert np.array_equal(numbers[:, 2:], solution.angle_sigma_rad)
-    stops = [line.split(",") for line in (tmp_path / "tables" / "stops.csv").read_text().splitlines()]
-    sigmas = np.array([[float(c) for c in line[8:14]] for line in stops[1:]])
-    assert np.allclose(sigmas**2, [np.diag(c) for c in solution.stop_covariance], rtol=1e-12, atol=0)
-    assert sorted(p.name for p in (tmp_path / "tables").iterdir()) == sorted(
-        ["export.json", *(f"{n}.csv" for n in ("stops", "frames", "images", "points", "observations", "rig"))]
-    )
-
-
-# --- hostile files ---
-
-
-@pytest.mark.parametrize(
-    ("to", "name"),
-    [
-        ("tpt", "a.tpt"),
-        ("tpt-text", "b.tpt"),
-        ("nav", "a.nav"),
-        ("nav-text", "b.nav"),
-        ("control-network", "n.csv"),
-    ],
-)
-def test_mutated_files_are_read_or_refused_in_a_sentence(tmp_path: Path, to: str, name: str) -> None:
-    solution, path = solved(), tmp_path / name
-    written(solution, path, to)
-    lines = path.read_text().splitlines(keepends=True)
-    text = "".join(lines[:60] + lines[-3:] if name.endswith("a.tpt") or name == "a.nav" else lines[:20])
-    traverse = bare(solution)
-    take: dict[str, Callable[[], object]] = {
-        ".tpt": lambda: with_ties(traverse, read_ties(path), path),
-        ".nav": lambda: with_pointing(traverse, read_nav(path), path),
-        ".csv": lambda: with_network(traverse, path),
-    }
-    rng, said = np.random.default_rng(5), set()
-    for case in range(24):
-        if case % 2:
-            path.write_bytes(mutated_bytes(rng, text.encode()))
-        else:
-            path.write_text(mutated_text(rng, text), encoding="utf-8", errors="replace")
-        said.add(outcome(take[path.suffix], path))
-    assert len(said) > 3
-
-
-def test_labels_say_who_an_image_is(opportunity_folder: Path) -> None:
-    who = picture_identities(read_input(opportunity_folder))
-    assert [w.unique_id for w in who[:2]] == ["MER1NL_491020376", "MER1NL_491020519"]
-    assert {w.place for w in who} == {(195, 973)}
-    assert who[0].pointing_type == "MERpmaCamera"

@@ -54,7 +54,7 @@ def landmark_ties(simulation: Simulation, sigma: float = 1e-3) -> tuple[Constrai
         return np.asarray(point[landmark] - true.world_T_mast[stop].translation())
 
     level, up = arm(f, 1), arm(g, len(stops) - 1)
-    normal = np.array([1.0, 2.0, 3.0])
+    normal = np.array([1.0, 2.0, 3.0]) / np.sqrt(14.0)
     return (
         LandmarkPosition(landmark=a, position_m=tuple(point[a]), sigma_m=(sigma,) * 3),
         LandmarkPosition(
@@ -67,7 +67,7 @@ def landmark_ties(simulation: Simulation, sigma: float = 1e-3) -> tuple[Constrai
         LandmarkPlane(
             landmark=e,
             normal=tuple(normal),
-            offset_m=float(normal @ point[e] / np.linalg.norm(normal)),
+            offset_m=float(normal @ point[e]),
             sigma_m=sigma,
         ),
         LandmarkAzimuth(

@@ -60,6 +60,11 @@ class Centred:
         of_row = dict(zip(self.rows, self.cameras, strict=True))
         every = [of_row.get(row) for row in range(len(solution.traverse.images))]
         written = set(write_straight_images(solution, folder / "images", every, names, self.brightness))
+        if len(written) < len(names):
+            none = "no file of an image" if not written else f"files of {len(written)} of {len(names)} images"
+            self.source.warnings.append(f"{kind}: {none} can be read; the others are named and not written")
+        if not self.source.is_solved:
+            self.source.warnings.append(f"{kind}: a drive as telemetry has it has no points: refine it first")
         for name, text in files.items():
             (folder / name).write_text(text, encoding="utf-8", newline="\n")
         images = solution.traverse.images
