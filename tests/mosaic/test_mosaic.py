@@ -461,9 +461,9 @@ def test_each_eye_has_its_mosaic_and_the_report_shows_them(tmp_path: Path) -> No
         ("right", "ground"),
     ]
     assert entries[0]["origin_m"] == entries[2]["origin_m"]
-    named = {f for e in entries for f in e["files"].values()} | {"mosaics.json"}
+    named = {f for e in entries for f in e["files"].values()} | {"mosaics.json", "mosaics.html"}
     assert {p.name for p in (out / "mosaics").iterdir()} == named
-    assert {f.rsplit(".", 1)[1] for f in named} == {"png", "jpg", "json"}
+    assert {f.rsplit(".", 1)[1] for f in named} == {"png", "pgw", "jpg", "json", "html"}
     page = (out / "report.html").read_text()
     assert page.count('<figure class="blink"') == 2 * 3
     assert page.count("seam error") >= 2

@@ -21,6 +21,8 @@ _INVERSE_DEPTH, _SPREAD = 0.1, 0.5
 """Start and root mean square of the inverse depths of points, per metre: they are the scale of the scene."""
 _NEAREST = 2.0
 """Largest inverse depth, per metre."""
+_BEYOND = -0.1
+"""Least one, beyond infinity: errors of far points have both signs, and a bound at 0 bends focal lengths."""
 _OUTLIER = 3.0
 """Scale of the Cauchy weights, in standard deviations."""
 _WIDENINGS = (40.0, 20.0, 10.0, 5.0, 2.0, 1.0)
@@ -240,7 +242,7 @@ class _System:
         depth_gradient = (
             weight * np.einsum("ni,ni->n", by_depth, off) + points.worth * inverse_depth / _SPREAD**2
         )
-        held = (inverse_depth <= 0.0) & (depth_gradient > 0)
+        held = (inverse_depth <= _BEYOND) & (depth_gradient > 0)
         held |= (inverse_depth >= _NEAREST) & (depth_gradient < 0)
         per_depth = np.where(held, 0.0, 1 / depth_information)
         # Each point's inverse depth is eliminated (Schur complement of a diagonal block).
@@ -330,7 +332,7 @@ def _descended(
         step = np.zeros(len(prior))
         step[free] = -np.linalg.solve(damped, (system.gradient + prior * told)[free])
         moved = state.moved(step)
-        depth_moved = np.clip(inverse_depth + system.depth_step(step), 0.0, _NEAREST)
+        depth_moved = np.clip(inverse_depth + system.depth_step(step), _BEYOND, _NEAREST)
         tried = _System.of(rig, moved, points, depth_moved, scale)
         tried_cost = tried.cost + prior @ moved.over_the_rig() ** 2
         if tried_cost >= cost:
