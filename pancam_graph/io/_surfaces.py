@@ -11,7 +11,14 @@ from pancam_graph.base.extras import needed
 from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.base.regular_files import instead_of_file
 from pancam_graph.data import MapImage, Site, Surface
-from pancam_graph.io._maps import cell_m, crs_name, on_world_grid, require_same_body, world_box_m
+from pancam_graph.io._maps import (
+    cell_m,
+    crs_name,
+    on_world_grid,
+    require_same_body,
+    world_affine,
+    world_box_m,
+)
 
 __all__ = ["REACH_M", "read_map_image", "read_surface", "write_surface"]
 
@@ -142,7 +149,7 @@ def write_surface(surface: Surface, path: Path) -> None:
         width=columns,
         count=1,
         dtype="float64",
-        transform=rasterio.Affine(step[0], 0.0, corner[0], 0.0, step[1], corner[1]),
+        transform=world_affine(None, corner[0], corner[1], step),
         nodata=np.nan,
         compress="deflate",
         BIGTIFF="IF_SAFER",

@@ -1,9 +1,9 @@
 """A page that shows mosaics at full size: zoomed and moved, with both pointings, and where the cursor is."""
 
-import json
 from collections.abc import Sequence
 
-from pancam_graph.report._escaped import escape
+from pancam_graph.report._blink import BLINKING
+from pancam_graph.report._escaped import escape, script_json
 from pancam_graph.report._numbers import Json
 from pancam_graph.report._packed import HEAD
 from pancam_graph.report._style import STYLE
@@ -23,21 +23,23 @@ _STYLE = """
 #view:focus-visible { outline: 3px solid var(--after); }
 #view img { position: absolute; left: 0; top: 0; transform-origin: 0 0; max-width: none; }
 #view img.sharp { image-rendering: pixelated; }
-.controls button { font: inherit; padding: 3px 14px; cursor: pointer; }
-.controls button[aria-pressed=true] { background: var(--after); color: #ffffff; border-style: inset; }
+.controls button { min-width: 0; }
 #where { font-variant-numeric: tabular-nums; }
 """
-_SCRIPT = r"""
+_SCRIPT = (
+    r"""
 "use strict";
 (() => {
+"""
+    + BLINKING
+    + r"""
   const page = JSON.parse(document.getElementById("mosaics-listed").textContent);
   const view = document.getElementById("view"), where = document.getElementById("where");
   const which = document.getElementById("which"), shown = document.getElementById("shown");
   const button = document.getElementById("blink");
   const [before, after] = view.querySelectorAll("img");
-  const still = matchMedia("(prefers-reduced-motion: reduce)");
   const held = new Map();
-  let mosaic, scale = 1, left = 0, top = 0, timer = null;
+  let mosaic, scale = 1, left = 0, top = 0;
 
   const place = () => {
     const box = view.getBoundingClientRect();
@@ -88,12 +90,8 @@ _SCRIPT = r"""
       + `, elevation ${elevation.toFixed(2)}°`;
   };
   const show = () => { after.style.visibility = shown.value === "refined" ? "visible" : "hidden"; };
-  const stop = () => {
-    clearInterval(timer);
-    timer = null;
-    button.setAttribute("aria-pressed", "false");
-  };
   const swap = () => { shown.value = shown.value === "refined" ? "telemetry" : "refined"; show(); };
+  const stop = blinking(button, swap);
   const choose = () => {
     mosaic = page.mosaics[which.value];
     before.src = encodeURIComponent(mosaic.files.telemetry);
@@ -145,13 +143,6 @@ _SCRIPT = r"""
   document.getElementById("out").addEventListener("click", () => zoom(1 / 1.5, ...middle()));
   document.getElementById("fit").addEventListener("click", fit);
   document.getElementById("full").addEventListener("click", () => zoom(1 / scale, ...middle()));
-  button.addEventListener("click", () => {
-    if (timer !== null) { stop(); return; }
-    swap();
-    if (still.matches) return;
-    timer = setInterval(swap, 700);
-    button.setAttribute("aria-pressed", "true");
-  });
   shown.addEventListener("change", () => { stop(); show(); });
   which.addEventListener("change", choose);
   addEventListener("resize", place);
@@ -159,6 +150,7 @@ _SCRIPT = r"""
   show();
 })();
 """
+)
 
 
 def make_mosaic_page(entries: Sequence[Json], north_deg: float | None, name: str) -> str:
@@ -168,8 +160,7 @@ def make_mosaic_page(entries: Sequence[Json], north_deg: float | None, name: str
     the world's x axis; None: not known.
     """
     listed = [{key: entry[key] for key in _KEPT if key in entry} for entry in entries]
-    text = json.dumps({"north_deg": north_deg, "mosaics": listed}, separators=(",", ":"), allow_nan=False)
-    safe = text.replace("<", "\\u003c")
+    page = {"north_deg": north_deg, "mosaics": listed}
     options = "".join(
         f'<option value="{k}">stop {escape(str(e["stop"]))}, camera {escape(str(e["camera"]))}, '
         f"{_KINDS[str(e['kind'])]}</option>"
@@ -193,6 +184,6 @@ def make_mosaic_page(entries: Sequence[Json], north_deg: float | None, name: str
         '<button type="button" id="full">Full size</button></div>\n'
         '<div id="view" tabindex="0" role="group" aria-label="Mosaic"><img alt=""><img alt=""></div>\n'
         '<p class="caption" id="where" aria-live="off">&nbsp;</p>\n</main>\n'
-        f'<script type="application/json" id="mosaics-listed">{safe}</script>\n'
+        f'<script type="application/json" id="mosaics-listed">{script_json(page)}</script>\n'
         f"<script>{_SCRIPT}</script>\n</body>\n</html>\n"
     )

@@ -1,10 +1,11 @@
 """Mosaics in the page: the picture of one place with each pointing, shown in turn or faded by a slider."""
 
-import base64
 from itertools import groupby
 
 from pancam_graph.mosaic import Blink, WrittenMosaics
+from pancam_graph.report._blink import BLINKING
 from pancam_graph.report._escaped import escape
+from pancam_graph.report._packed import jpeg_uri
 
 __all__ = ["mosaic_section"]
 
@@ -13,22 +14,22 @@ _STYLE = """
 .blink .stack { position: relative; width: fit-content; max-width: 100%; }
 .blink img { display: block; max-width: 100%; height: auto; border: 1px solid var(--line); }
 .blink img.after { position: absolute; inset: 0; }
-.controls button { font: inherit; padding: 3px 14px; min-width: 6em; cursor: pointer; }
-.controls button[aria-pressed=true] { background: var(--after); color: #ffffff; border-style: inset; }
 .controls input[type=range] { width: 220px; vertical-align: middle; }
 .blink figcaption { margin-top: 6px; font-weight: 600; min-height: 1.5em; overflow-wrap: anywhere; }
 @media print { #mosaics .controls { display: none; } }
 .seams li { overflow-wrap: anywhere; max-width: 130ch; }
 """
-_SCRIPT = r"""
+_SCRIPT = (
+    r"""
 "use strict";
 (() => {
+"""
+    + BLINKING
+    + r"""
   const blinks = [...document.querySelectorAll(".blink")];
   const select = document.getElementById("mosaic-view");
   const slider = document.getElementById("mosaic-fade");
   const button = document.getElementById("mosaic-blink");
-  const still = matchMedia("(prefers-reduced-motion: reduce)");
-  let timer = null;
   const show = () => blinks.forEach((blink, row) => {
     blink.hidden = row !== Number(select.value);
     const share = Number(slider.value) / 100;
@@ -43,30 +44,13 @@ _SCRIPT = r"""
     if (!blink.hidden) slider.setAttribute("aria-valuetext", words);
   });
   const swap = () => { slider.value = Number(slider.value) < 50 ? 100 : 0; show(); };
-  const stop = () => {
-    clearInterval(timer);
-    timer = null;
-    if (!still.matches) button.setAttribute("aria-pressed", "false");
-  };
-  const name = () => {
-    stop();
-    button.textContent = still.matches ? "Swap" : "Blink";
-    if (still.matches) button.removeAttribute("aria-pressed");
-  };
-  button.addEventListener("click", () => {
-    if (timer !== null) { stop(); return; }
-    swap();
-    if (still.matches) return;
-    timer = setInterval(swap, 700);
-    button.setAttribute("aria-pressed", "true");
-  });
+  const stop = blinking(button, swap);
   slider.addEventListener("input", () => { stop(); show(); });
   select.addEventListener("change", show);
-  still.addEventListener("change", name);
-  name();
   show();
 })();
 """
+)
 _CAPTION = (
     "Blink shows both pointings in turn; where the system asks for less motion, each press swaps them. The "
     "slider fades. Both are on the surface that the adjusted landmarks span, with the same exposures, seams "
@@ -105,7 +89,7 @@ def _figure(blink: Blink, *, hidden: bool) -> str:
     before, after = (escape(f"{blink.group}: {blink.captions[p]}") for p in ("telemetry", "refined"))
     size = f'width="{blink.width_px}" height="{blink.height_px}"'
     images = "".join(
-        f'<img class="{kind}" {size} alt="{escape(blink.title)}, {words}" src="{_uri(jpeg)}">'
+        f'<img class="{kind}" {size} alt="{escape(blink.title)}, {words}" src="{jpeg_uri(jpeg)}">'
         for kind, words, jpeg in (
             ("before", before, blink.jpeg["telemetry"]),
             ("after", after, blink.jpeg["refined"]),
@@ -115,7 +99,3 @@ def _figure(blink: Blink, *, hidden: bool) -> str:
         f'<figure class="blink" data-before="{before}" data-after="{after}"{" hidden" if hidden else ""}>'
         f'<div class="stack">{images}</div><figcaption>{after}</figcaption></figure>'
     )
-
-
-def _uri(jpeg: bytes) -> str:
-    return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode("ascii")

@@ -4,7 +4,7 @@ import base64
 import gzip
 from functools import lru_cache
 
-__all__ = ["HEAD", "UNPACKED", "packed", "packed_plotly"]
+__all__ = ["HEAD", "UNPACKED", "jpeg_uri", "packed", "packed_plotly"]
 
 HEAD = """<!DOCTYPE html>
 <html lang="en">
@@ -35,6 +35,11 @@ def packed(content: str | bytes) -> str:
     """Text or bytes compressed and written in letters; the same content always gives the same letters."""
     raw = content.encode("utf-8") if isinstance(content, str) else content
     return base64.b64encode(gzip.compress(raw, 9, mtime=0)).decode("ascii")
+
+
+def jpeg_uri(jpeg: bytes) -> str:
+    """The address of a picture that is in the page itself."""
+    return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode("ascii")
 
 
 @lru_cache(maxsize=1)

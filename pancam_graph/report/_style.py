@@ -62,6 +62,8 @@ tr.quiet td { color: var(--quiet); }
 tr.beaten td { background: var(--fail); color: var(--fail-ink); font-weight: 600; }
 .controls { display: flex; flex-wrap: wrap; gap: 8px 18px; align-items: center; margin: 6px 0 8px; }
 .controls label { max-width: 100%; }
+.controls button { font: inherit; padding: 3px 14px; min-width: 6em; cursor: pointer; }
+.controls button[aria-pressed=true] { background: var(--after); color: #ffffff; border-style: inset; }
 .controls select { font: inherit; max-width: min(640px, 100%); padding: 3px 6px; }
 .scroll { max-height: 440px; overflow: auto; border: 1px solid var(--line); border-radius: 6px; }
 table { border-collapse: collapse; width: 100%; font-size: 13.5px; font-variant-numeric: tabular-nums; }

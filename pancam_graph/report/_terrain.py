@@ -1,14 +1,11 @@
 """Terrain in a page: the lit surface before and after, the orthoimage, and heights along a line."""
 
-import base64
-import json
-
 import numpy as np
 from numpy.typing import NDArray
 
-from pancam_graph.report._escaped import escape
+from pancam_graph.report._escaped import escape, script_json
 from pancam_graph.report._numbers import Json
-from pancam_graph.report._packed import HEAD, packed
+from pancam_graph.report._packed import HEAD, jpeg_uri, packed
 from pancam_graph.report._section import section_figures
 from pancam_graph.report._style import STYLE
 from pancam_graph.report._terrain_script import TERRAIN_SCRIPT, UNKNOWN
@@ -58,8 +55,6 @@ _STYLE = """
 .section .first { stroke: var(--after); }
 .section .second { stroke: #d55e00; }
 #terrain a { color: var(--after); }
-.controls button { font: inherit; padding: 3px 14px; min-width: 6em; cursor: pointer; }
-.controls button[aria-pressed=true] { background: var(--after); color: #ffffff; border-style: inset; }
 @media print {
   #terrain .controls { display: none; }
   #terrain .pair { display: block; }
@@ -82,7 +77,6 @@ def terrain_section(written: WrittenTerrain, folder: str) -> str:
     pictures = "".join(f'<option value="{kind}">{words}</option>' for kind, words in _PICTURES.items())
     figures = "\n".join(_figure(s, folder, hidden=k > 0) for k, s in enumerate(surfaces))
     described, numbers = _described(surfaces)
-    text = json.dumps(described, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     more = (
         f" {left_out} more stops are in the folder only, so that this page stays small." if left_out else ""
     )
@@ -96,7 +90,7 @@ def terrain_section(written: WrittenTerrain, folder: str) -> str:
         '<p class="caption" id="terrain-readout" aria-live="polite"></p></div></div>\n'
         f'<p class="caption">{escape(_CAPTION + more)}</p>\n'
         f"{section_figures(written.section, written.frame_ids) if written.section is not None else ''}"
-        f'<script type="application/json" id="terrain-surfaces">{text}</script>\n'
+        f'<script type="application/json" id="terrain-surfaces">{script_json(described)}</script>\n'
         f'<script type="text/plain" id="packed-terrain">{packed(numbers)}</script>\n'
         f"<script>{TERRAIN_SCRIPT}</script>\n</section>\n"
     )
@@ -127,7 +121,7 @@ def _figure(surface: ShownSurface, folder: str, *, hidden: bool) -> str:
     size = f'width="{surface.width_px}" height="{surface.height_px}"'
     images = "".join(
         f'<img data-kind="{kind}" {size} alt="{escape(surface.title)}, {words}" '
-        f'src="data:image/jpeg;base64,{base64.b64encode(surface.jpeg[kind]).decode("ascii")}"'
+        f'src="{jpeg_uri(surface.jpeg[kind])}"'
         f"{' hidden' if kind != 'refined' else ''}>"
         for kind, words in _PICTURES.items()
         if kind in surface.jpeg

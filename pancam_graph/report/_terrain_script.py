@@ -1,5 +1,6 @@
 """The script of the section of terrain: a line on the picture, and heights along it."""
 
+from pancam_graph.report._blink import BLINKING
 from pancam_graph.report._packed import UNPACKED
 
 __all__ = ["TERRAIN_SCRIPT", "UNKNOWN"]
@@ -12,6 +13,7 @@ TERRAIN_SCRIPT = (
 (async () => {
   """
     + UNPACKED
+    + BLINKING
     + r"""
   const make = (kind, attributes, text) => {
     const element = document.createElementNS("http://www.w3.org/2000/svg", kind);
@@ -27,9 +29,7 @@ TERRAIN_SCRIPT = (
   const button = document.getElementById("terrain-blink");
   const plot = document.getElementById("terrain-profile");
   const readout = document.getElementById("terrain-readout");
-  const still = matchMedia("(prefers-reduced-motion: reduce)");
   const ends = surfaces.map((s) => s.line.map((end) => [...end]));
-  let timer = null;
 
   const value = (s, band, column, row) => {
     const number = numbers[s.first + (band * s.rows + row) * s.columns + column];
@@ -184,18 +184,7 @@ TERRAIN_SCRIPT = (
   });
 
   const swap = () => { picture.value = picture.value === "refined" ? "telemetry" : "refined"; show(); };
-  const stop = () => {
-    clearInterval(timer);
-    timer = null;
-    button.setAttribute("aria-pressed", "false");
-  };
-  button.addEventListener("click", () => {
-    if (timer !== null) { stop(); return; }
-    swap();
-    if (still.matches) return;
-    timer = setInterval(swap, 700);
-    button.setAttribute("aria-pressed", "true");
-  });
+  const stop = blinking(button, swap);
   picture.addEventListener("change", () => { stop(); show(); });
   which.addEventListener("change", () => { stop(); show(); });
   addEventListener("resize", draw);

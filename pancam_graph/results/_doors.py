@@ -177,6 +177,8 @@ def door_of(out: Path, to: str | None) -> Door:
     found = next((door for door in _ALL if ending in door.endings), None)
     if found is None:
         endings = ", ".join(ending for door in _ALL for ending in door.endings)
-        ends = f"a file that ends in one of {endings}, or " if endings else ""
-        raise InputError(f"{out}: expected {ends}a format told by --to ({', '.join(DOORS)}), found neither")
+        raise InputError(
+            f"{out}: expected a file that ends in one of {endings}, or a format told by --to "
+            f"({', '.join(DOORS)}), found neither"
+        )
     return found

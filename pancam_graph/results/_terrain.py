@@ -7,6 +7,7 @@ from pathlib import Path
 from pancam_graph import report
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.whole_files import whole_folder
+from pancam_graph.data import Traverse
 from pancam_graph.images import cache_folder
 from pancam_graph.results._older import TERRAIN, TERRAIN_FOLDER
 from pancam_graph.results._output import OutputWriter, Written
@@ -15,6 +16,7 @@ from pancam_graph.terrain import (
     Drive,
     Terrain,
     TerrainOptions,
+    WrittenTerrain,
     drive_of,
     make_terrain,
     require_extra,
@@ -46,11 +48,23 @@ def write_terrain_of(
     terrain = make_terrain(drive, options, progress=progress, cache=cache_folder(out))
     try:
         with whole_folder(path) as folder:
-            shown = write_terrain(terrain, drive.traverse, folder, options, progress=progress)
-            report.write_terrain_page(shown, drive.traverse.name, folder / TERRAIN_PAGE)
+            _fill(terrain, drive.traverse, folder, options, progress)
     except OSError as error:
         raise InputError(f"{path}: expected a place where terrain can be written, found: {error}") from error
     return terrain
+
+
+def _fill(
+    terrain: Terrain,
+    traverse: Traverse,
+    folder: Path,
+    options: TerrainOptions,
+    progress: Callable[[str, int, int], None] | None,
+) -> WrittenTerrain:
+    """Write the files of terrain, and the page that shows them, into an empty folder."""
+    shown = write_terrain(terrain, traverse, folder, options, progress=progress)
+    report.write_terrain_page(shown, traverse.name, folder / TERRAIN_PAGE)
+    return shown
 
 
 def _write(written: Written, folder: Path) -> Written:
@@ -60,8 +74,7 @@ def _write(written: Written, folder: Path) -> Written:
         terrain = make_terrain(
             drive_of(solution), options, progress=written.progress, cache=cache_folder(written.out)
         )
-        shown = write_terrain(terrain, solution.traverse, folder, options, progress=written.progress)
-        report.write_terrain_page(shown, solution.traverse.name, folder / TERRAIN_PAGE)
+        shown = _fill(terrain, solution.traverse, folder, options, written.progress)
         warnings = shown.warnings
     except InputError as error:  # a solve that took long must not be lost for it
         shown, warnings = None, (str(error),)

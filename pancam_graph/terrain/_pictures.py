@@ -8,7 +8,7 @@ from pancam_graph.base.geometry import FloatArray
 from pancam_graph.charts import INK, STEPS, Axis, Picture, framed, write_over
 from pancam_graph.terrain._make import Fused
 
-__all__ = ["hillshade", "hillshade_grey", "hillshade_picture", "slope_deg", "slope_picture"]
+__all__ = ["hillshade", "hillshade_grey", "hillshade_picture", "on_paper", "slope_deg", "slope_picture"]
 
 _EMPTY = (228, 228, 228)
 _LIGHT_AZIMUTH, _LIGHT_HEIGHT = np.deg2rad(135.0), np.deg2rad(45.0)
@@ -44,10 +44,11 @@ def hillshade_grey(height_m: NDArray[np.float32], cell_m: float) -> Picture:
     """The surface lit from the upper left (rows, columns, 3); holes have the colour of an empty page."""
     shade = hillshade(height_m, cell_m)
     grey = np.clip(20 + 235 * np.nan_to_num(shade), 0, 255).astype(np.uint8)
-    return _on_paper(np.repeat(grey[..., None], 3, axis=-1), np.isfinite(shade))
+    return on_paper(np.repeat(grey[..., None], 3, axis=-1), np.isfinite(shade))
 
 
-def _on_paper(coloured: Picture, seen: NDArray[np.bool_]) -> Picture:
+def on_paper(coloured: Picture, seen: NDArray[np.bool_]) -> Picture:
+    """A picture (rows, columns, 3) with the colour of an empty page where nothing is seen (rows, columns)."""
     return np.where(seen[..., None], coloured, np.array(_EMPTY, dtype=np.uint8)).astype(np.uint8)
 
 
@@ -63,7 +64,7 @@ def slope_picture(fused: Fused, title: str) -> Picture:
     scaled = np.clip(np.nan_to_num(slope) * (255 / _STEEPEST_DEG), 0, 255).astype(np.uint8)
     coloured = np.asarray(cv2.applyColorMap(scaled, cv2.COLORMAP_VIRIDIS), dtype=np.uint8)
     says = f"{title}: slope, dark 0 to bright {_STEEPEST_DEG:.0f} degrees or more"
-    return _page(fused, _on_paper(coloured, np.isfinite(slope)), says)
+    return _page(fused, on_paper(coloured, np.isfinite(slope)), says)
 
 
 def _page(fused: Fused, picture: Picture, title: str) -> Picture:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pancam_graph.charts import Picture, encoded
 from pancam_graph.terrain._grid import Grid
 from pancam_graph.terrain._make import Fused
-from pancam_graph.terrain._pictures import hillshade_grey
+from pancam_graph.terrain._pictures import hillshade_grey, on_paper
 from pancam_graph.terrain._section import Section
 
 __all__ = ["Relief", "ShownSurface", "WrittenTerrain", "shown_surface"]
@@ -69,7 +69,7 @@ def shown_surface(fused: Fused, grey: NDArray[np.uint8], title: str, files: dict
     block = max(1, -(-max(fused.grid.rows, fused.grid.columns) // _MOST_NODES))
     pictures: dict[Relief, Picture] = {
         "refined": hillshade_grey(fused.height_m, cell_m),
-        "orthoimage": np.repeat(np.where(grey > 0, grey, np.uint8(228))[..., None], 3, axis=-1),
+        "orthoimage": on_paper(np.repeat(grey[..., None], 3, axis=-1), grey > 0),
     }
     if np.isfinite(fused.telemetry_m).any():
         pictures["telemetry"] = hillshade_grey(fused.telemetry_m, cell_m)
