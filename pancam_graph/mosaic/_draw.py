@@ -12,7 +12,7 @@ from pancam_graph.mosaic._placed import POINTINGS, Pointing
 from pancam_graph.mosaic._projections import Cylinder, Ground
 from pancam_graph.mosaic._seam_error import Case
 
-__all__ = ["close_ups", "comparison", "shrunk", "with_axes"]
+__all__ = ["EMPTY", "around_axes", "close_ups", "comparison", "draw_compass", "shrunk", "with_axes"]
 
 PAPER, EMPTY = (255, 255, 255), 228
 _CYLINDER_WIDTH_PX, _GROUND_WIDTH_PX = 2400, 1200
@@ -49,21 +49,7 @@ def with_axes(
     scale = grey.shape[1] / projection.width_px
     picture: Picture = np.repeat(grey[..., None], 3, axis=-1)
     if isinstance(projection, Cylinder):
-        ends_deg = projection.azimuth_deg(np.array([0.0, projection.width_px - 1.0]))
-        across = Axis.of(
-            ends_deg if north_deg is None else north_deg - ends_deg,
-            scale,
-            projection.width_px,
-            wrap=True,
-        )
-        down = Axis.of(
-            projection.elevation_deg(np.array([0.0, projection.height_px - 1.0])),
-            scale,
-            projection.height_px,
-            room_px=_LINE_ROOM_PX,
-        )
-        way = "anticlockwise from the world's x axis" if north_deg is None else "clockwise from north"
-        names = f"azimuth, degrees {way}", "elevation, degrees"
+        across, down, names = around_axes(projection, scale, north_deg)
     else:
         x, y = projection.origin_m[0] + projection.left_m, projection.origin_m[1] + projection.top_m
         side = (projection.width_px - 1) * projection.m_per_px
@@ -76,38 +62,58 @@ def with_axes(
     return framed(picture, across, down, names, title)
 
 
+def around_axes(
+    cylinder: Cylinder, scale: float, north_deg: float | None
+) -> tuple[Axis, Axis, tuple[str, str]]:
+    """Axes of azimuth and of elevation, with their names, of a panorama drawn `scale` times its size."""
+    ends_deg = cylinder.azimuth_deg(np.array([0.0, cylinder.width_px - 1.0]))
+    azimuth = ends_deg if north_deg is None else north_deg - ends_deg
+    across = Axis.of(azimuth, scale, cylinder.width_px, wrap=True)
+    elevation = cylinder.elevation_deg(np.array([0.0, cylinder.height_px - 1.0]))
+    down = Axis.of(elevation, scale, cylinder.height_px, room_px=_LINE_ROOM_PX)
+    way = "anticlockwise from the world's x axis" if north_deg is None else "clockwise from north"
+    return across, down, (f"azimuth, degrees {way}", "elevation, degrees")
+
+
 def _draw_circles(picture: Picture, projection: Ground, scale: float, north_deg: float | None) -> None:
     """Circles of equal distance from the mast, and lines of equal azimuth; see `with_axes`."""
+    per_m = scale / projection.m_per_px
+    centre = [((c / projection.m_per_px + 0.5) * scale - 0.5) for c in (-projection.left_m, projection.top_m)]
+    radius_m = 0.5 * projection.width_px * projection.m_per_px
+    step = next((s for s in STEPS if s >= radius_m / 5.5), STEPS[-1])
+    rings = [(r * per_m, f"{r:g} m") for r in (step * np.arange(1, int(radius_m / step) + 1)).tolist()]
+    draw_compass(picture, np.array(centre), rings or [(radius_m * per_m, "")], north_deg)
+
+
+def draw_compass(
+    picture: Picture, centre_px: FloatArray, rings: Sequence[tuple[float, str]], north_deg: float | None
+) -> None:
+    """Circles about the mast, each a radius in pixels with its label, and lines of azimuth, every 30 degrees.
+
+    `north_deg` as in `with_axes`; the world's x axis is to the right, or, in a picture that has north up, the
+    caller gives 90 as the direction of north.
+    """
 
     def along(azimuth: float) -> FloatArray:
         anticlockwise = np.deg2rad(azimuth if north_deg is None else north_deg - azimuth)
         return np.array([np.cos(anticlockwise), -np.sin(anticlockwise)])
 
-    per_m = scale / projection.m_per_px
-    centre = [((c / projection.m_per_px + 0.5) * scale - 0.5) for c in (-projection.left_m, projection.top_m)]
-    radius_m = 0.5 * projection.width_px * projection.m_per_px
-    step = next((s for s in STEPS if s >= radius_m / 5.5), STEPS[-1])
-    middle = round(centre[0]), round(centre[1])
-    rings = step * np.arange(1, int(radius_m / step) + 1)
-    outer = float(rings[-1]) if len(rings) else radius_m
+    inner, outer = rings[0][0] if len(rings) > 1 else 0.0, rings[-1][0]
+    middle = round(float(centre_px[0])), round(float(centre_px[1]))
     layer = picture.copy()
-    for r in rings:
-        cv2.circle(layer, middle, round(float(r) * per_m), (60, 190, 255), 1, cv2.LINE_AA)
+    for radius, _ in rings:
+        cv2.circle(layer, middle, round(radius), (60, 190, 255), 1, cv2.LINE_AA)
     for azimuth in range(0, 360, 30):
         d = along(azimuth)
-        ends = [
-            tuple(np.rint(np.array(centre) + d * m * per_m).astype(int).tolist())
-            for m in (rings[0] if len(rings) else 0, outer)
-        ]
+        ends = [tuple(np.rint(centre_px + d * r).astype(int).tolist()) for r in (inner, outer)]
         cv2.line(layer, ends[0], ends[1], (60, 190, 255), 1, cv2.LINE_AA)
     cv2.addWeighted(layer, 0.6, picture, 0.4, 0, dst=picture)
     cv2.drawMarker(picture, middle, (0, 94, 213), cv2.MARKER_CROSS, 18, 2)
-    for r in rings:  # between two lines of azimuth, where no other label is
-        d = along(-15) * (float(r) * per_m - 22)
-        write_over(picture, f"{r:g} m", np.array(centre) + d)
+    for radius, label in rings:  # between two lines of azimuth, where no other label is
+        if label:
+            write_over(picture, label, centre_px + along(-15) * (radius - 22))
     for azimuth in range(0, 360, 30):
-        d = along(azimuth)
-        write_over(picture, f"{azimuth}", np.array(centre) + d * (outer * per_m - 24))
+        write_over(picture, f"{azimuth}", centre_px + along(azimuth) * (outer - 24))
 
 
 def close_ups(mosaics: StopMosaics, most: int) -> list[tuple[int, dict[Pointing, Picture]]]:

@@ -14,10 +14,12 @@ from pancam_graph.base.errors import InputError
 from pancam_graph.charts import encoded
 from pancam_graph.data import Solution
 from pancam_graph.io import MOSAIC_FORMAT, VERSION, same_pictures
+from pancam_graph.mosaic._anaglyph import anaglyph, eye_pairs
 from pancam_graph.mosaic._draw import close_ups, comparison, with_axes
 from pancam_graph.mosaic._make import Mosaic, StopGround, StopMosaics, make_mosaics, stop_ground
 from pancam_graph.mosaic._mosaic_options import MosaicOptions
 from pancam_graph.mosaic._placed import POINTINGS, Pointing
+from pancam_graph.mosaic._polar import goes_half_round, polar_view
 from pancam_graph.mosaic._projections import Cylinder
 from pancam_graph.mosaic._seam_error import CASES, Case
 
@@ -87,20 +89,24 @@ def write_mosaics(
     blinks: list[Blink] = []
     lines, warnings = [], []
     ground: tuple[int, StopGround] | None = None
+    at_stop: dict[int, tuple[StopMosaics, Json]] = {}
     twice = same_pictures(traverse)
     spent = 0
     for n, (stop, eye) in enumerate(pairs):
         stop_id, camera = traverse.stops[stop].id, traverse.rig.eyes[eye].name
         try:
             if ground is None or ground[0] != stop:
-                ground = stop, stop_ground(solution, stop, twice)
+                ground, at_stop = (stop, stop_ground(solution, stop, twice)), {}
             made = make_mosaics(solution, stop_id, camera, options, ground=ground[1])
         except InputError as error:
             warnings.append(str(error))
         else:
             name = f"{stop + 1:03d}-{eye + 1}_{_plain(stop_id)}_{_plain(camera)}"
             title = f"stop {stop_id}, camera {camera}"
-            entries += _write(made, folder, name, title, north_deg)
+            new_entries = _write(made, folder, name, title, north_deg)
+            entries += new_entries
+            at_stop[eye] = made, new_entries[0]
+            _write_stereo(solution, stop, eye, at_stop, ground[1], folder, north_deg)
             lines.append(f"{title}: {_in_words(made)}")
             warnings += made.warnings
             if spent < _BLINK_BUDGET:
@@ -154,6 +160,10 @@ def _write(made: StopMosaics, folder: Path, name: str, title: str, north_deg: fl
             if isinstance(mosaic.projection, Cylinder):
                 (folder / plain).with_suffix(".pgw").write_text(_world_file(mosaic.projection, north_deg))
                 files[f"{pointing}_world_file"] = plain.removesuffix(".png") + ".pgw"
+                if goes_half_round(mosaic.projection):
+                    polar = f"{name}_polar_{pointing}.jpg"
+                    _save(folder / polar, polar_view(mosaic, pointing, caption, north_deg=north_deg))
+                    files[f"{pointing}_polar"] = polar
             if mosaic.samples is not None:
                 deep = f"{name}_{kind}_{pointing}_16bit.png"
                 _save(folder / deep, mosaic.samples[pointing])
@@ -169,6 +179,39 @@ def _write(made: StopMosaics, folder: Path, name: str, title: str, north_deg: fl
             entry["seam_error"] = _seam_error(made)
         entries.append(entry)
     return entries
+
+
+def _write_stereo(
+    solution: Solution,
+    stop: int,
+    eye: int,
+    at_stop: dict[int, tuple[StopMosaics, Json]],
+    ground: StopGround,
+    folder: Path,
+    north_deg: float | None,
+) -> None:
+    """Write the stereo panoramas of an eye and those at its stop that were written before it.
+
+    Each is named in the entry of its left eye's panorama.
+    """
+    for pair in eye_pairs(solution, stop):
+        if eye not in (pair.left, pair.right) or not {pair.left, pair.right} <= at_stop.keys():
+            continue
+        (left, entry), (right, _) = at_stop[pair.left], at_stop[pair.right]
+        files = entry["files"]
+        assert isinstance(files, dict)  # as `_write` made it
+        file = (
+            f"{str(files['comparison']).removesuffix('_comparison.jpg')}_{_plain(right.camera)}_anaglyph.jpg"
+        )
+        title = (
+            f"stop {left.stop}, cameras {left.camera} and {right.camera}: refined, for red and cyan glasses"
+        )
+        surface = ground.surfaces["refined"]
+        picture = anaglyph(
+            left.cylinder, right.cylinder, surface, pair.baseline_m, "refined", title, north_deg=north_deg
+        )
+        _save(folder / file, picture)
+        files[f"anaglyph_{right.camera}"] = file
 
 
 _POINTING: dict[Pointing, str] = {"telemetry": "telemetry's", "refined": "refined"}
@@ -235,6 +278,13 @@ def _blinks(made: StopMosaics, group: str, north_deg: float | None) -> list[Blin
         }
         title = f"overlap of {overlap.images[0]} and {overlap.images[1]}"
         blinks.append(_blink(group, title, captions, pieces))
+    cylinder = made.cylinder.projection
+    if isinstance(cylinder, Cylinder) and goes_half_round(cylinder):
+        discs = {
+            p: polar_view(made.cylinder, p, "", _BLINK_GROUND_PX, north_deg=north_deg) for p in POINTINGS
+        }
+        named = {p: f"{_POINTING[p]} pointing" for p in POINTINGS}
+        blinks.append(_blink(group, "from above the mast, the horizon a circle", named, discs))
     if made.ground is not None:
         blinks.append(_blink_of(made.ground, group, "from above", _BLINK_GROUND_PX, north_deg))
     return blinks

@@ -1,6 +1,7 @@
 """A page that shows mosaics at full size: zoomed and moved, with both pointings, and where the cursor is."""
 
 from collections.abc import Sequence
+from urllib.parse import quote
 
 from pancam_graph.report._blink import BLINKING
 from pancam_graph.report._escaped import escape, script_json
@@ -183,7 +184,25 @@ def make_mosaic_page(entries: Sequence[Json], north_deg: float | None, name: str
         '<button type="button" id="fit">Whole</button>'
         '<button type="button" id="full">Full size</button></div>\n'
         '<div id="view" tabindex="0" role="group" aria-label="Mosaic"><img alt=""><img alt=""></div>\n'
-        '<p class="caption" id="where" aria-live="off">&nbsp;</p>\n</main>\n'
+        f'<p class="caption" id="where" aria-live="off">&nbsp;</p>\n{_other_views(entries)}</main>\n'
         f'<script type="application/json" id="mosaics-listed">{script_json(page)}</script>\n'
         f"<script>{_SCRIPT}</script>\n</body>\n</html>\n"
     )
+
+
+def _other_views(entries: Sequence[Json]) -> str:
+    """Links to the views from the pole and to the stereo panoramas; nothing where there are none."""
+    links = []
+    for entry in entries:
+        files = entry["files"]
+        assert isinstance(files, dict)  # as the index has them
+        place = f"stop {entry['stop']}, camera {entry['camera']}"
+        for key, file in files.items():
+            if key.endswith("_polar"):
+                words = f"{place}, from above its mast, {key.removesuffix('_polar')} pointing"
+            elif key.startswith("anaglyph_"):
+                words = f"{place} with {key.removeprefix('anaglyph_')}, for red and cyan glasses"
+            else:
+                continue
+            links.append(f'<li><a href="{quote(file)}">{escape(words)}</a></li>')
+    return f"<h2>Other views</h2>\n<ul>{''.join(links)}</ul>\n" if links else ""

@@ -45,3 +45,11 @@ def test_every_mosaic_is_listed_with_what_tells_its_place(north_deg: float | Non
     assert "images" not in first  # hundreds of names that the page has no use for
     assert page.count("<option value=") == 4  # two mosaics, two pointings
     assert "<script>alert(1)" not in page
+
+
+def test_other_views_are_linked() -> None:
+    files = CYLINDER["files"] | {"refined_polar": "a b_polar.jpg", "anaglyph_right<": "x_anaglyph.jpg"}
+    page = make_mosaic_page([CYLINDER | {"files": files}, GROUND], None, "a drive")
+    assert re.findall(r'<li><a href="([^"]+)">', page) == ["a%20b_polar.jpg", "x_anaglyph.jpg"]
+    assert "right&lt;, for red and cyan glasses" in page
+    assert "Other views" not in make_mosaic_page([CYLINDER, GROUND], None, "a drive")
