@@ -51,7 +51,7 @@ def centre(grey: NDArray[np.float64]) -> FloatArray:
     """Column and row of the brightest spot."""
     weight = np.maximum(grey - 120.0, 0.0)
     rows, columns = np.indices(grey.shape)
-    return np.array([(weight * columns).sum(), (weight * rows).sum()]) / weight.sum()
+    return np.asarray(np.array([(weight * columns).sum(), (weight * rows).sum()]) / weight.sum())
 
 
 @pytest.mark.parametrize("azimuth", [0.0, 37.0, 180.0, -179.9, 250.0])
