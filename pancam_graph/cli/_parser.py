@@ -21,6 +21,7 @@ __all__ = [
     "Parser",
     "ScriptParser",
     "Several",
+    "above_zero",
     "degrees",
 ]
 
@@ -32,6 +33,17 @@ COMMON_OPTIONS = ("verbose", "quiet", "log", "progress")
 def degrees(text: str) -> float:
     """An argument in degrees, as radians."""
     return math.radians(float(text))
+
+
+def above_zero(text: str) -> float:
+    """An argument that is a number above 0. Raises ArgumentTypeError for others."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise argparse.ArgumentTypeError(f"expected a number above 0, found {text!r}")
+    return number
 
 
 @dataclass(frozen=True)
@@ -99,11 +111,17 @@ class Flag(argparse.BooleanOptionalAction):
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose complaints are one sentence."""
+    """An argument parser whose complaints are one sentence.
+
+    Options are given by their whole names: the beginning of one may be that of another in a later version.
+    """
 
     def __init__(self, description: str = "", **others: Any) -> None:
         super().__init__(
-            description=description, formatter_class=argparse.RawDescriptionHelpFormatter, **others
+            description=description,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+            **others,
         )
 
     def error(self, message: str) -> NoReturn:
@@ -123,7 +141,7 @@ class Parser(argparse.ArgumentParser):
         return {o.removeprefix("--"): a for a in self._actions for o in a.option_strings if o[:2] == "--"}
 
     def option(self, word: str) -> argparse.Action | None:
-        """The option that a word of a command line gives, shortened as argparse allows; None for others.
+        """The option that a word of a command line gives, by its whole name; None for other words.
 
         Ends the program with a sentence where no option has this name.
         """
@@ -131,13 +149,10 @@ class Parser(argparse.ArgumentParser):
         if not word.startswith("--") or word == "--" or " " in name:
             return None
         options = self.long_options()
-        if name in options:
-            return options[name]
-        matching = [o for o in options if o.startswith(name)]
-        if not matching:
+        if name not in options:
             near = nearest(f"--{name}", [f"--{known}" for known in options])
             self.error(f"expected one of its options, found --{name}{near}")
-        return options[matching[0]] if len(matching) == 1 else None
+        return options[name]
 
 
 class ScriptParser(Parser):

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from pancam_graph.base.text import shortened
 from pancam_graph.cli._command import Command, Invocation
-from pancam_graph.cli._parser import CommandParser
+from pancam_graph.cli._parser import CommandParser, above_zero
 from pancam_graph.cli._streams import write
 
 __all__ = ["TERRAIN"]
@@ -29,13 +29,13 @@ def _add_options(parser: CommandParser) -> None:
     add("out", metavar="OUT", type=Path, help="folder of results")
     add(
         "--cell",
-        type=float,
+        type=above_zero,
         metavar="M",
         help="side of a cell, metres (default: as far as points lie apart on the ground 6 m away)",
     )
     add(
         "--reach",
-        type=float,
+        type=above_zero,
         default=25.0,
         metavar="M",
         help="farthest ground from a mast, metres (%(default)s)",
