@@ -154,6 +154,13 @@ def _add_options(parser: CommandParser) -> None:
         "the extra: pip install 'pancam-graph[terrain]'",
     )
     add("--csv", action=Flag, help="write residuals.csv too, a line for each observation")
+    add(
+        "--plots",
+        type=Path,
+        metavar="DIR",
+        help="draw the report's figures as SVG and PNG into a folder of their own, with all tables as CSV; "
+        "needs Chrome or Chromium and the extra: pip install 'pancam-graph[plots]'",
+    )
     add("--report", action=Flag, default=True, help="write report.html (default)")
 
 
@@ -186,6 +193,10 @@ def _work(call: Invocation) -> int:
 
         require_extra()
     check_out(arguments.out)
+    if arguments.plots is not None:
+        from pancam_graph.results import check_plots
+
+        check_plots(arguments.plots)
     with progress.shown(f"reading {arguments.folder}"), resumable(arguments.out):
         traverse = read_input(arguments.folder)
         if arguments.use_rig is not None:
@@ -235,6 +246,11 @@ def _work(call: Invocation) -> int:
 
             results["terrain"] = TerrainOptions()
         solution = write_results(solution, arguments.out, **results, progress=progress.counted)
+        if arguments.plots is not None:
+            from pancam_graph.results import write_plots
+
+            progress.say("drawing figures")
+            write_plots(solution, arguments.plots)
     print_summary(solution, str(arguments.out), quiet=arguments.quiet)
     return 0 if solution.passed else 1
 

@@ -23,13 +23,17 @@ from pancam_graph.results._solution_json import read_solution_json as read_solut
 if TYPE_CHECKING:
     from pancam_graph.results._convert import Converted as Converted
     from pancam_graph.results._convert import convert as convert
+    from pancam_graph.results._plots import check_plots as check_plots
+    from pancam_graph.results._plots import write_plots as write_plots
     from pancam_graph.results._refined_drive import read_drive as read_drive
     from pancam_graph.results._terrain import write_terrain_of as write_terrain_of
 else:
     _LATE = {
         "Converted": "_convert",
+        "check_plots": "_plots",
         "convert": "_convert",
         "read_drive": "_refined_drive",
+        "write_plots": "_plots",
         "write_terrain_of": "_terrain",
     }
 

@@ -10,7 +10,7 @@ from pancam_graph.base.errors import InputError
 from pancam_graph.base.whole_files import whole_folder
 from pancam_graph.io import VERSION, read_json, short
 
-__all__ = ["EXPORT_JSON", "file_names", "require_export", "whole_export", "write_export_json"]
+__all__ = ["EXPORT_JSON", "check_export", "file_names", "require_export", "whole_export", "write_export_json"]
 
 EXPORT_JSON = "export.json"
 _FORMAT = "pancam-graph/export"
@@ -57,6 +57,15 @@ def require_export(folder: Path, expected: str) -> None:
             raise InputError(f"{expected}, found what others made in it: {folder.name}/{name}")
 
 
+def check_export(folder: Path) -> None:
+    """Raise InputError unless a folder is new, empty, or an older export with nothing else in it."""
+    expected = f"{folder}: expected a new folder or one of an older export"
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{expected}, found a file")
+    if folder.is_dir() and any(folder.iterdir()):
+        require_export(folder, expected)
+
+
 @contextmanager
 def whole_export(folder: Path) -> Iterator[Path]:
     """A folder to write an export into, renamed to `folder` when the block ends; see `whole_folder`.
@@ -64,12 +73,8 @@ def whole_export(folder: Path) -> Iterator[Path]:
     Raises InputError unless `folder` is new, empty, or an older export with nothing else in it, and where
     writing fails.
     """
-    expected = f"{folder}: expected a new folder or one of an older export"
     try:
-        if folder.exists() and not folder.is_dir():
-            raise InputError(f"{expected}, found a file")
-        if folder.is_dir() and any(folder.iterdir()):
-            require_export(folder, expected)
+        check_export(folder)
         with whole_folder(folder) as partial:
             yield partial
     except OSError as error:
