@@ -1,6 +1,6 @@
 """Where a stop stands relative to another, from terrain points of the one and pixels of the other."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -116,7 +116,7 @@ def telemetry_alignment(terrain: StopTerrain, a: int, b: int) -> Alignment:
 
 def align_stops(
     terrain: StopTerrain,
-    features: list[Features],
+    features: Callable[[int], Features],
     feature_of: IntArray,
     a: int,
     b: int,
@@ -153,7 +153,7 @@ def align_stops(
 
 def _begun(
     terrain: StopTerrain,
-    features: list[Features],
+    features: Callable[[int], Features],
     feature_of: IntArray,
     stops: tuple[int, int],
     telemetry: Alignment,
@@ -201,7 +201,7 @@ def believed(telemetry: Alignment, found: Alignment) -> Alignment:
 
 def _matched(
     terrain: StopTerrain,
-    features: list[Features],
+    features: Callable[[int], Features],
     feature_of: IntArray,
     stops: tuple[int, int],
     at: Alignment,
@@ -219,9 +219,9 @@ def _matched(
             magnification=seen.zoom,
             valid=sought.usable,
         )
-        of_terrain = features[sought.own].select(feature_of[terrain.row[sought.rows]])
+        of_terrain = features(sought.own).select(feature_of[terrain.row[sought.rows]])
         theirs = np.flatnonzero(terrain.image == sought.image)
-        other = features[sought.image].select(feature_of[terrain.row[theirs]])
+        other = features(sought.image).select(feature_of[terrain.row[theirs]])
         matches = match_in_windows(of_terrain, other, segments, options)
         parts.append(
             Ties(

@@ -1,6 +1,6 @@
 """Ties between stops: where patches of the terrain of one stop lie in the images of another."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
@@ -102,9 +102,10 @@ class StopMatcher:
     terrain: StopTerrain
     """Points of all stops, without those that a mask covers."""
     spline: Splines
-    usable: Sequence[BoolArray | None]
-    """By image: which pixels (height, width) show terrain; None without a mask."""
-    features: list[Features]
+    usable: Callable[[int], BoolArray]
+    """Which pixels (height, width) of an image show terrain, by row."""
+    features: Callable[[int], Features]
+    """Features of an image, by row."""
     feature_of: IntArray
     """(observations,) row of each of the terrain's observations in its image's features."""
     options: FrontEndOptions
@@ -212,13 +213,12 @@ class _Sought:
         return _Sought(**{name: value + getattr(other, name) for name, value in vars(self).items()})
 
 
-def on_terrain(usable: Sequence[BoolArray | None], image: IntArray, uv_px: FloatArray) -> BoolArray:
+def on_terrain(usable: Callable[[int], BoolArray], image: IntArray, uv_px: FloatArray) -> BoolArray:
     """Which pixels (n, 2) of images (n,) show terrain."""
     shows = np.zeros(len(image), dtype=bool)
     for i in np.unique(image).tolist():
-        mask, rows = usable[i], image == i
-        assert mask is not None  # it has observations
-        shows[rows] = pixels_at(mask, uv_px[rows])
+        rows = image == i
+        shows[rows] = pixels_at(usable(i), uv_px[rows])
     return shows
 
 

@@ -10,8 +10,11 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from io import BytesIO
 from pathlib import Path
+from shutil import rmtree
+from tempfile import mkdtemp
 from threading import Lock
 from typing import Any
+from weakref import finalize
 
 import cv2
 import gtsam
@@ -22,6 +25,7 @@ from pancam_graph.base.errors import InputError
 from pancam_graph.base.regular_files import is_missing
 from pancam_graph.base.whole_files import whole_file
 from pancam_graph.images._cache_folder import begin_cache
+from pancam_graph.images._held import Held
 from pancam_graph.io import NpzFile, prefixed
 
 __all__ = ["Cache", "digest"]
@@ -29,6 +33,7 @@ __all__ = ["Cache", "digest"]
 _LOG = logging.getLogger(__name__)
 _SUFFIX = ".npz"
 _KEY = "key"
+_HELD_BYTES = 256 << 20
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -39,27 +44,80 @@ class Cache:
     Nothing in the cache can therefore be out of date: after a change of an image, of the rig, of an option,
     of a module that makes the arrays, of a library's version or of the kind of processor, they are asked for
     by another key. With the arrays a file keeps a digest of them: files that cannot be read, or have other
-    content than was written, are logged and made anew. Several threads may ask at once, each for other keys.
+    content than was written, are logged and made anew. Several threads may ask at once.
+
+    The latest arrays are held in memory. Of those that memory has no room for, what has no file in the folder
+    goes into a temporary one, which is deleted with this object.
     """
 
-    def __init__(self, folder: Path | None) -> None:
-        """Keep files in `folder`, which is made when the first is written; None: keep nothing."""
+    def __init__(self, folder: Path | None, most_bytes: int = _HELD_BYTES) -> None:
+        """Keep files in `folder`, which is made when the first is written; None: there is no such folder."""
         self._folder = folder
         self._used: set[Path] = set()
         self._begun = False
         self._beginning = Lock()
+        self._held = Held[str, Arrays](most_bytes, _n_bytes, self._put_aside)
+        self._aside: Path | None = None
+        self._no_room: dict[str, Arrays] = {}
+        """What could not be written to the temporary folder."""
 
     def recall(self, kind: str, key: str, make: Callable[[], Mapping[str, NDArray[Any]]]) -> Arrays:
-        """The arrays kept under a key, or else those that `make` returns, which then are kept."""
-        if self._folder is None:
-            return dict(make())
-        path = self._folder / f"{kind}-{key[:40]}{_SUFFIX}"
-        self._used.add(path)
-        arrays = _read(path, key)
-        if arrays is None:
-            arrays = dict(make())
-            self._write(path, key, arrays)
+        """The arrays kept under a key, or else those that `make` returns, which then are kept.
+
+        They are not to be written to.
+        """
+        if self._folder is not None:
+            self._used.add(self._folder / _file_name(kind, key))
+
+        def find_or_make() -> Arrays:
+            found = self._found(kind, key)
+            return self._made(kind, key, make) if found is None else found
+
+        return dict(self._held.get(f"{kind} {key}", find_or_make))
+
+    def __reduce__(self) -> tuple[type["Cache"], tuple[Path | None]]:
+        """Another process gets the folder, and nothing of what memory holds."""
+        return Cache, (self._folder,)
+
+    def _found(self, kind: str, key: str) -> Arrays | None:
+        """The arrays of a file in the folder or the temporary one, if there are any."""
+        if (kept := self._no_room.get(f"{kind} {key}")) is not None:
+            return kept
+        for folder in (self._folder, self._aside):
+            arrays = None if folder is None else _read(folder / _file_name(kind, key), key)
+            if arrays is not None:
+                return arrays
+        return None
+
+    def _made(self, kind: str, key: str, make: Callable[[], Mapping[str, NDArray[Any]]]) -> Arrays:
+        arrays = dict(make())
+        if self._folder is not None:
+            path = self._folder / _file_name(kind, key)
+            try:
+                with self._beginning:
+                    if not self._begun:
+                        begin_cache(self._folder)
+                        self._begun = True
+                _write(path, key, arrays)
+            except OSError as error:  # without a cache the step works too
+                _LOG.warning("%s: not kept: %s", path, error)
         return arrays
+
+    def _put_aside(self, name: str, arrays: Arrays) -> None:
+        """Write what memory has no room for to the temporary folder, unless there is a file of it."""
+        kind, key = name.split(" ")
+        file = _file_name(kind, key)
+        if any(folder is not None and (folder / file).is_file() for folder in (self._folder, self._aside)):
+            return
+        try:
+            if self._aside is None:
+                self._aside = Path(mkdtemp(prefix="pancam-graph-"))
+                finalize(self, rmtree, self._aside, ignore_errors=True)
+            _write(self._aside / file, key, arrays)
+        except OSError as error:
+            if not self._no_room:
+                _LOG.warning("memory holds what has no room in a temporary folder: %s", error)
+            self._no_room[name] = arrays
 
     def forget_others(self) -> None:
         """Delete the cache's files whose keys were not asked for since this object was made."""
@@ -69,18 +127,19 @@ class Cache:
                     with suppress(OSError):  # a folder of such a name, or no right to delete
                         path.unlink()
 
-    def _write(self, path: Path, key: str, arrays: Arrays) -> None:
-        assert self._folder is not None  # `recall` returns before
-        content = BytesIO()
-        np.savez(content, **{_KEY: np.array(_mark(key, arrays))}, **arrays)  # type: ignore[arg-type]  # names of ours, none of its options
-        try:
-            with self._beginning:
-                if not self._begun:
-                    begin_cache(self._folder)
-                    self._begun = True
-            whole_file(path, content.getvalue())
-        except OSError as error:  # without a cache the step works too
-            _LOG.warning("%s: not kept: %s", path, error)
+
+def _file_name(kind: str, key: str) -> str:
+    return f"{kind}-{key[:40]}{_SUFFIX}"
+
+
+def _n_bytes(arrays: Arrays) -> int:
+    return sum(array.nbytes for array in arrays.values())
+
+
+def _write(path: Path, key: str, arrays: Arrays) -> None:
+    content = BytesIO()
+    np.savez(content, **{_KEY: np.array(_mark(key, arrays))}, **arrays)  # type: ignore[arg-type]  # names of ours, none of its options
+    whole_file(path, content.getvalue())
 
 
 def _read(path: Path, key: str) -> Arrays | None:

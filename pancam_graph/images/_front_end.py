@@ -1,27 +1,41 @@
 """From image files to observations: masks, features, pairs, matches, tracks."""
 
+import logging
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import overload
 
 import numpy as np
 
 from pancam_graph.base.errors import InputError
+from pancam_graph.base.geometry import IntArray
 from pancam_graph.base.options import options_of
+from pancam_graph.base.threads import in_order
 from pancam_graph.data import Matching, Observations, PairMatching, StopMatching, Traverse
+from pancam_graph.images._alignment import Ties
+from pancam_graph.images._between import StopTies, agreeing, joined
 from pancam_graph.images._cache import Cache
 from pancam_graph.images._front_end_options import FrontEndOptions
-from pancam_graph.images._masks import ImageMask
-from pancam_graph.images._match import Matches
+from pancam_graph.images._masks import ImageMask, Reason
 from pancam_graph.images._match_pair import PairMatches
 from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._read import image_name, listed
 from pancam_graph.images._steps import Progress, Steps
-from pancam_graph.images._tracks import Links, apart_tracks, join_tracks, shared_still, spread_tracks
 
 __all__ = ["find_masks", "find_observations"]
 
+_LOG = logging.getLogger(__name__)
 _SURE_OVERLAP = 0.1
 _SURE_DEPTH_M = 3.0
+_OVER_EXPOSED = 0.3
+_MOST = 0.5
+_WHY = {
+    Reason.USER: "is black in its mask",
+    Reason.MISSING: "has no data",
+    Reason.SATURATED: "is over-exposed",
+    Reason.SKY: "is sky",
+}
 
 
 def find_observations(
@@ -58,54 +72,37 @@ def find_observations(
     """
     options = options_of(FrontEndOptions, options, "find_observations")
     work = Steps(traverse, options, progress, Cache(cache))
-    warnings = [*work.pictures.warnings, *work.over_exposed()]
-    parts: list[Links] = []
+    _make_masks(work)
+    work.plan()
+    warnings = [*work.pictures.warnings, *_over_exposed(work)]
+    _make_features(work)
+    pairs = _match(work)
     far = replace(options, min_depth_m=max(options.min_depth_m, _SURE_DEPTH_M))
-    for pair, matched in zip(work.pairs, work.matches, strict=True):
-        if len(matched.matches):
-            parts.append(_links(pair, matched.matches))
-        elif np.mean(pair.overlap(far, widened=False)) > _SURE_OVERLAP:
+    for pair, report in zip(work.pairs, pairs, strict=True):
+        if not report.kept and np.mean(pair.overlap(far, widened=False)) > _SURE_OVERLAP:
             names = traverse.images[pair.a].id, traverse.images[pair.b].id
             warnings.append(
                 f"images {names[0]} and {names[1]}: no matches, although they overlap by pointing"
             )
-    image, feature, track = join_tracks(Links.concatenate(parts))
-    unseen = [i for i in range(len(traverse.images)) if i not in set(image.tolist())]
-    if not len(track):
-        why = [f"{image_name(traverse, i)}{work.why_nothing(i)}" for i in unseen]
+    seen = {row for group in range(len(work.groups)) for row in work.tracks(group)["seen"].tolist()}
+    unseen = [i for i in range(len(traverse.images)) if i not in seen]
+    if not seen:
+        why = [f"{image_name(traverse, i)}{_why_nothing(work, i)}" for i in unseen]
         raise InputError(
             f"images of {traverse.name}: expected features that several images share, found none "
             f"({len(work.pairs)} pairs overlap by pointing): {listed(why)}"
         )
     warnings += [
-        f"image {image_name(traverse, i)}: no observations were found in it{work.why_nothing(i)}"
+        f"image {image_name(traverse, i)}: no observations were found in it{_why_nothing(work, i)}"
         if traverse.images[i].file is not None
         else f"image {traverse.images[i].id}: it has no file"
         for i in unseen
         if i not in work.pictures.unusable
     ]
-    uv_px, size_px = np.empty((len(image), 2)), np.empty(len(image))
-    for i in np.unique(image):
-        rows = image == i
-        uv_px[rows] = work.features[i].uv_px[feature[rows]]
-        size_px[rows] = work.features[i].size_px[feature[rows]]
-    kept = np.flatnonzero(apart_tracks(image, track, uv_px, options.min_apart_px))
-    cameras = [traverse.rig.eyes[eye].camera for eye in traverse.image_eye]
-    extent_px = np.array([[c.width_px, c.height_px] for c in cameras])
-    kept = kept[spread_tracks(image[kept], track[kept], uv_px[kept], extent_px, options.max_ties)]
-    image, feature, uv_px, size_px = image[kept], feature[kept], uv_px[kept], size_px[kept]
-    track = np.unique(track[kept], return_inverse=True)[1]
-    as_found_px = np.hypot(options.sigma_px, options.sigma_per_size * size_px)
-    uv_px, covariance, spare = work.refined(image, track, uv_px, as_found_px)
-    used = shared_still(track, ~spare)
-    image, feature, uv_px, as_found_px = image[used], feature[used], uv_px[used], as_found_px[used]
-    track = np.unique(track[used], return_inverse=True)[1]
-    observations = Observations(
-        image=image, track=track, uv_px=uv_px, sigma_px=as_found_px, origin="images"
-    ).with_covariance(covariance[used])
+    observations, feature = _within_stops(work)
     stops: list[StopMatching] = []
     if work.stop_pairs:
-        observations, stops = work.tied(observations, feature)
+        observations, stops = _between_stops(work, observations, feature)
         untied = {(a, b) for a, b in work.stop_pairs} - {tuple(sorted((s.a, s.b))) for s in stops if s.kept}
         warnings += [
             f"stops {traverse.stops[a].id} and {traverse.stops[b].id}: no ties, although they may see the "
@@ -113,8 +110,7 @@ def find_observations(
             for a, b in sorted(untied)
         ]
     work.cache.forget_others()
-    pairs = tuple(_report(*each) for each in zip(work.pairs, work.matches, strict=True))
-    matching = Matching(pairs=pairs, stops=tuple(stops))
+    matching = Matching(pairs=tuple(pairs), stops=tuple(stops))
     return traverse.with_observations(observations.with_points(traverse.points), warnings, matching=matching)
 
 
@@ -124,15 +120,146 @@ def find_masks(
     *,
     progress: Progress | None = None,
     cache: Path | None = None,
-) -> tuple[ImageMask | None, ...]:
+) -> Sequence[ImageMask | None]:
     """Which pixels of each image are left out, and why; None for an image without a file or a repeated one.
 
     Sky, saturated pixels and the rover are found in the images, unless `options.masks` is "user". The rover
     is what stands still relative to the mast between stops, in images in which an eye looks the same way at
-    both. Raises as `find_observations` does.
+    both. Memory holds them packed. Raises as `find_observations` does.
     """
     options = options_of(FrontEndOptions, options, "find_masks")
-    return tuple(Steps(traverse, options, progress, Cache(cache)).masks)
+    work = Steps(traverse, options, progress, Cache(cache))
+    _make_masks(work)
+    return _Masks(work)
+
+
+class _Masks(Sequence[ImageMask | None]):
+    """The masks of a drive by row, each unpacked when it is asked for."""
+
+    def __init__(self, work: Steps) -> None:
+        self._work = work
+
+    def __len__(self) -> int:
+        return len(self._work.traverse.images)
+
+    @overload
+    def __getitem__(self, row: int) -> ImageMask | None: ...
+
+    @overload
+    def __getitem__(self, row: slice) -> Sequence[ImageMask | None]: ...
+
+    def __getitem__(self, row: int | slice) -> ImageMask | Sequence[ImageMask | None] | None:
+        rows = range(len(self))[row]
+        return self._work.mask(rows) if isinstance(rows, int) else [self._work.mask(each) for each in rows]
+
+
+def _make_masks(work: Steps) -> None:
+    work.begin()
+    in_order(work.figures, work.rows, lambda k, _: work.tell("masks", k + 1, len(work.rows)))
+
+
+def _make_features(work: Steps) -> None:
+    rows = work.rows
+
+    def tell(k: int, found: int) -> None:
+        _LOG.info("%s: %d features", work.traverse.images[rows[k]].id, found)
+        work.tell("features", k + 1, len(rows))
+
+    in_order(lambda row: len(work.features(row)), rows, tell)
+
+
+def _match(work: Steps) -> list[PairMatching]:
+    """Match all pairs; a report of each."""
+    pairs, stop = work.pairs, work.traverse.image_stop
+    # Stop by stop: features of neighbours are in memory together.
+    order = sorted(range(len(pairs)), key=lambda k: (*sorted(stop[[pairs[k].a, pairs[k].b]])[::-1], k))
+
+    def tell(k: int, report: PairMatching) -> None:
+        names = work.traverse.images[report.a].id, work.traverse.images[report.b].id
+        _LOG.info("%s, %s: %d matches %s", *names, report.kept, report.refusal.text)
+        work.tell("matches", k + 1, len(pairs))
+
+    reports = in_order(lambda k: _report(pairs[k], work.matches(pairs[k])), order, tell)
+    return [report for _, report in sorted(zip(order, reports, strict=True), key=lambda each: each[0])]
+
+
+def _within_stops(work: Steps) -> tuple[Observations, IntArray]:
+    """Observations within the stops, sorted by track, then image, and the row of each among its features."""
+    parts = [(group, origin) for group in range(len(work.groups)) for origin in work.origins(group)]
+
+    def refine(part: tuple[int, int]) -> None:
+        work.refined(*part)
+
+    in_order(refine, parts, lambda k, _: work.tell("refinement", k + 1, len(parts)))
+    groups = [work.observed(group) for group in range(len(work.groups))]
+    begin = np.cumsum([0, *(1 + int(each["track"].max(initial=-1)) for each in groups)])
+    columns = {name: np.concatenate([each[name] for each in groups]) for name in groups[0]}
+    track = np.concatenate([each["track"] + first for each, first in zip(groups, begin, strict=False)])
+    # Tracks are numbered by the images in which they begin, whatever their group.
+    first = columns["image"][np.searchsorted(track, np.arange(begin[-1]))]
+    number = np.empty(begin[-1], dtype=np.int64)
+    number[np.argsort(first, kind="stable")] = np.arange(begin[-1])
+    order = np.argsort(number[track], kind="stable")
+    observations = Observations(
+        image=columns["image"][order],
+        track=number[track][order],
+        uv_px=columns["uv_px"][order],
+        sigma_px=columns["sigma_px"][order],
+        origin="images",
+    ).with_covariance(columns["covariance_px2"][order])
+    return observations, columns["feature"][order]
+
+
+def _between_stops(
+    work: Steps, observations: Observations, feature: IntArray
+) -> tuple[Observations, list[StopMatching]]:
+    """Observations within stops with ties between stops added, and a report of each pair of stops.
+
+    A solve of them places the terrain of each stop, which is then sought in the images of other stops. The
+    result for each direction of each pair of stops is kept in the cache as soon as it is done.
+    """
+    placed = work.placed(observations, feature)
+    directed = [d for a, b in work.stop_pairs for d in ((a, b), (b, a))]
+
+    def tell(k: int, tied: StopTies) -> None:
+        report = tied.report
+        names = work.traverse.stops[report.a].id, work.traverse.stops[report.b].id
+        _LOG.info("%s in %s: %d ties, noise %.2f px", *names, report.kept, report.noise_px)
+        work.tell("ties between stops", k + 1, len(directed))
+
+    found = in_order(lambda stops: placed.ties(*stops), directed, tell)
+    terrain = placed.matcher.terrain
+    both = [agreeing(terrain, *pair) for pair in zip(found[::2], found[1::2], strict=True)]
+    stop_ties = [each for pair in both for each in pair]
+    ties = Ties.concatenate([each.ties for each in stop_ties])
+    ties = ties.scaled(np.full(len(ties), placed.unit))
+    return joined(observations, terrain, ties), [each.report for each in stop_ties]
+
+
+def _over_exposed(work: Steps) -> list[str]:
+    """A warning for each image of which much is saturated."""
+    known = [(row, work.figures(row)) for row in range(len(work.traverse.images))]
+    return [
+        f"image {image_name(work.traverse, row)}: over-exposed, {figures.share[Reason.SATURATED]:.0%} of its "
+        "pixels are saturated"
+        for row, figures in known
+        if figures is not None and figures.share[Reason.SATURATED] > _OVER_EXPOSED
+    ]
+
+
+def _why_nothing(work: Steps, row: int) -> str:
+    """Why an image may have no observations, as the end of a sentence; empty where nothing is known."""
+    if row in work.pictures.unusable:
+        return f" ({work.pictures.unusable[row]})"
+    figures = work.figures(row)
+    if figures is None:
+        return ""
+    for reason, text in _WHY.items():
+        if figures.share[reason] > _MOST:
+            return f" ({figures.share[reason]:.0%} of it {text})"
+    if not any(row in {pair.a, pair.b} for pair in work.pairs):
+        return " (it overlaps no other image by pointing)"
+    return f" (none of its {len(work.features(row))} features was found in another image)"
 
 
 def _report(pair: PairGeometry, matched: PairMatches) -> PairMatching:
@@ -144,14 +271,4 @@ def _report(pair: PairGeometry, matched: PairMatches) -> PairMatching:
         off_line=matched.off_line,
         kept=len(matched.matches),
         refusal=matched.refusal,
-    )
-
-
-def _links(pair: PairGeometry, matches: Matches) -> Links:
-    return Links(
-        image_a=np.full(len(matches), pair.a, dtype=np.int64),
-        feature_a=matches.a,
-        image_b=np.full(len(matches), pair.b, dtype=np.int64),
-        feature_b=matches.b,
-        distance=matches.distance,
     )

@@ -1,6 +1,6 @@
 """Where images show the rover itself: it stands still relative to the mast while the rover drives."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -84,26 +84,22 @@ def rover_partners(traverse: Traverse, row: int, *, available: BoolArray) -> lis
 def find_rover(
     traverse: Traverse,
     row: int,
-    images: Sequence[NDArray[Any] | None],
+    samples: Callable[[int], NDArray[Any]],
     partners: Sequence[int],
     options: FrontEndOptions,
 ) -> BoolArray:
     """Which pixels of an image (height, width) show the rover, its shadow, or dust on the lens.
 
-    Each partner (see `rover_partners`) is laid over the image as if the rover had not moved. Where the two
-    then look alike, window by window, what they show moved along. No pixel is called rover where terrain
-    would look alike too: within 3 degrees of the horizontal and above, and where ground 0.8 to 3 m below the
-    eye would hardly move in the image between the two stops.
+    `samples` gives the samples of an image by row. Each partner (see `rover_partners`) is laid over the image
+    as if the rover had not moved. Where the two then look alike, window by window, what they show moved
+    along. No pixel is called rover where terrain would look alike too: within 3 degrees of the horizontal and
+    above, and where ground 0.8 to 3 m below the eye would hardly move in the image between the two stops.
     """
-    image = images[row]
-    assert image is not None  # an image without a file has no partners
+    image = samples(row)
     rover = np.zeros(image.shape, dtype=bool)
     for partner in partners:
-        other = images[partner]
-        if other is not None:
-            rover |= _standing_still(
-                PairGeometry(traverse, row, partner, options.mount_sigma_rad), image, other, options
-            )
+        pair = PairGeometry(traverse, row, partner, options.mount_sigma_rad)
+        rover |= _standing_still(pair, image, samples(partner), options)
     return rover
 
 

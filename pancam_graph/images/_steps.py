@@ -1,62 +1,50 @@
-"""The steps of the front end, each done when first asked for, or taken from the cache.
+"""The steps of the front end: of an image, a pair of images, stops that are compared, and two stops.
 
-The key of what a step keeps is a digest of its inputs and of the sources of all modules that it runs through,
-so that an edit makes anew what it may change, and what follows from that.
+Each is asked for by its item alone, and is made when it is first asked for, or taken from the cache. It
+loads the pictures, masks and features that it needs, and lets go of them: memory holds a bounded part of
+them, however long the drive is (see `Held`). The key of what a step keeps is a digest of its inputs and of
+the sources of all modules that it runs through, so that an edit makes anew what it may change, and what
+follows from that.
 
-A step is a cached property, which two threads must not ask for at once: before a step shares its work among
-threads, it takes the steps that it needs into local names.
+Several threads may ask for items at once. What is known of the drive as a whole (`pictures`, `pairs`,
+`wanted` and other cached properties) must be there before; see `Steps.plan`.
 """
 
-import logging
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
+import scipy
 
-from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.base.geometry import BoolArray, IntArray
 from pancam_graph.base.sources import source_digest
-from pancam_graph.base.threads import in_order
-from pancam_graph.data import Observations, StopMatching, Traverse
-from pancam_graph.images._alignment import Ties
-from pancam_graph.images._between import (
-    StopMatcher,
-    StopTies,
-    agreeing,
-    joined,
-    on_terrain,
-    stereo_stops,
-)
+from pancam_graph.data import Observations, Traverse
+from pancam_graph.images._between import StopMatcher, StopTies, on_terrain, stereo_stops
 from pancam_graph.images._cache import Arrays, Cache, digest
 from pancam_graph.images._features import Features, find_features
 from pancam_graph.images._front_end_options import FrontEndOptions
+from pancam_graph.images._held import Held
 from pancam_graph.images._masks import ImageMask, Reason, elevation_rad, mask_image, pixels_at
 from pancam_graph.images._match_pair import PairMatches, match_pair
 from pancam_graph.images._overlap import near_stops, overlap_cells, overlapping_pairs
 from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._patch_noise import shared_by_tracks
-from pancam_graph.images._read import Pictures, image_name, read_pictures
+from pancam_graph.images._read import PictureFiles, Pictures, read_pictures
 from pancam_graph.images._refine import RefinedTracks, refine_tracks
 from pancam_graph.images._rover import find_rover, rover_partners
 from pancam_graph.images._splines import Splines
 from pancam_graph.images._terrain import terrain_arrays, terrain_from
+from pancam_graph.images._tracks import Links, apart_tracks, join_tracks, shared_still, spread_tracks
 from pancam_graph.solve import SolveOptions, solve
 
-__all__ = ["Progress", "Steps", "step_key"]
+__all__ = ["MaskFigures", "PlacedStops", "Progress", "Steps", "step_key"]
 
-_LOG = logging.getLogger(__name__)
 _WORLD_UP = np.array([0.0, 0.0, 1.0])
 _PATCH_PX = 8  # half width of the patch that refinement compares
-_OVER_EXPOSED = 0.3
-_MOST = 0.5
-_WHY = {
-    Reason.USER: "is black in its mask",
-    Reason.MISSING: "has no data",
-    Reason.SATURATED: "is over-exposed",
-    Reason.SKY: "is sky",
-}
+_HELD_MASK_BYTES = 64 << 20
 
 Progress = Callable[[str, int, int], None]
 
@@ -65,6 +53,7 @@ _CALLS: dict[str, tuple[Callable[..., Any], ...]] = {
     "mask": (elevation_rad, mask_image, find_rover),
     "features": (find_features,),
     "matches": (overlapping_pairs, match_pair),
+    "tracks": (join_tracks,),
     "refined": (Splines, refine_tracks),
     "terrain": (solve, terrain_arrays),
     "ties": (Splines, terrain_from, on_terrain, StopMatcher),
@@ -77,22 +66,66 @@ def step_key(kind: str, *inputs: Any) -> str:
     return digest(kind, source_digest(*_CALLS[kind], alone=(__name__, digest.__module__)), *inputs)
 
 
+@dataclass(frozen=True, kw_only=True)
+class MaskFigures:
+    """What is known of an image's mask without its pixels."""
+
+    reasons: str
+    """Digest of all of it."""
+    within_stops: str
+    """Digest of the pixels that are usable within a stop."""
+    between_stops: str
+    """Digest of the pixels that are usable between stops."""
+    share: dict[Reason, float]
+    """Share of the pixels that are left out, by the reason."""
+
+
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """The steps, each computed when first asked for, or taken from the cache."""
+    """The steps for the items of one drive.
+
+    Another process gets it by pickling: with the plan of the drive, without what memory holds.
+    """
 
     traverse: Traverse
     options: FrontEndOptions
     progress: Progress | None
     cache: Cache
+    _mask_keys: dict[int, str] = field(default_factory=dict)
+    _figures: dict[int, MaskFigures] = field(default_factory=dict)
+    _feature_keys: dict[int, str] = field(default_factory=dict)
 
     def tell(self, stage: str, done: int, total: int) -> None:
+        """Tell the caller that so many of the items of a stage are done."""
         if self.progress is not None:
             self.progress(stage, done, total)
 
+    # The drive as a whole
+
+    def begin(self) -> None:
+        """Find out what masks need to know of the drive as a whole, so that threads may ask for them."""
+        self.picture_keys, self.rows, self._files  # noqa: B018  made when asked for
+
+    def plan(self) -> None:
+        """Find out what all steps need to know of the drive as a whole, so that threads may ask for items."""
+        self.begin()
+        self.wanted, self.groups, self._spline, self._usable  # noqa: B018  made when asked for
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the caller's progress and what memory holds."""
+        left = ("_files", "_spline", "_usable")
+        return {**{k: v for k, v in vars(self).items() if k not in left}, "progress": None}
+
     @cached_property
     def pictures(self) -> Pictures:
+        """What is known of the image files."""
         return read_pictures(self.traverse, partial(self.tell, "images"))
+
+    @cached_property
+    def rows(self) -> list[int]:
+        """Rows of the images that have a picture, stop by stop: the order in which they are worked on."""
+        order = np.argsort(self.traverse.image_stop, kind="stable").tolist()
+        return [row for row in order if self.pictures.has(row)]
 
     @cached_property
     def picture_keys(self) -> list[str]:
@@ -106,8 +139,8 @@ class Steps:
         return [
             digest(rig, options, image, mask, entry.camera, traverse.frames[frame], traverse.stops[stop])
             for image, mask, entry, frame, stop in zip(
-                pictures.images,
-                pictures.user_masks,
+                pictures.digests,
+                pictures.mask_digests,
                 traverse.images,
                 traverse.image_frame,
                 traverse.image_stop,
@@ -127,50 +160,19 @@ class Steps:
         return pairs, [(a, b) for a, b in np.argwhere(np.triu(placed, 1)).tolist()]
 
     def _overlapping(self, stops: BoolArray) -> list[PairGeometry]:
-        usable = [image is not None for image in self.pictures.images]
+        has = self.pictures.has
         pairs = overlapping_pairs(self.traverse, self.options, partial(self.tell, "overlaps"), stops=stops)
-        return [pair for pair in pairs if usable[pair.a] and usable[pair.b]]
+        return [pair for pair in pairs if has(pair.a) and has(pair.b)]
 
     @property
     def pairs(self) -> list[PairGeometry]:
+        """Pairs of images whose features are compared."""
         return self._all_pairs[0]
 
     @property
     def stop_pairs(self) -> list[tuple[int, int]]:
+        """Pairs of stops that the terrain of each ties."""
         return self._all_pairs[1]
-
-    @cached_property
-    def masks(self) -> list[ImageMask | None]:
-        usable = np.array([image is not None for image in self.pictures.images])
-        keys = self.picture_keys
-        return in_order(
-            lambda row: self._mask(row, usable, keys) if usable[row] else None,
-            range(len(usable)),
-            lambda row, _: self.tell("masks", row + 1, len(usable)),
-        )
-
-    def _mask(self, row: int, usable: BoolArray, picture_keys: list[str]) -> ImageMask:
-        """Mask of an image; `usable` (images,) says which images have a picture."""
-        image = self.pictures.images[row]
-        assert image is not None  # it is usable
-        automatic = self.options.masks == "automatic"
-        partners = rover_partners(self.traverse, row, available=usable) if automatic else []
-
-        def make() -> Arrays:
-            elevation = elevation_rad(self.traverse, row)
-            mask = mask_image(image, self.pictures.user_masks[row], elevation, automatic=automatic)
-            rover = find_rover(self.traverse, row, self.pictures.images, partners, self.options)
-            packed = zlib.compress(mask.with_rover(rover).reasons.tobytes(), 1)
-            return {"reasons": np.frombuffer(packed, dtype=np.uint8)}
-
-        key = step_key("mask", [picture_keys[i] for i in (row, *partners)])
-        packed = self.cache.recall("mask", key, make)["reasons"]
-        reasons = np.frombuffer(zlib.decompress(packed.tobytes()), dtype=np.uint8)
-        return ImageMask(reasons=reasons.reshape(image.shape))
-
-    @cached_property
-    def mask_keys(self) -> list[str]:
-        return [digest(None if mask is None else mask.reasons) for mask in self.masks]
 
     @cached_property
     def wanted(self) -> BoolArray:
@@ -178,135 +180,258 @@ class Steps:
         return overlap_cells(self.traverse, self.pairs, self.options)
 
     @cached_property
-    def feature_keys(self) -> list[str]:
-        """Key of each image's features."""
+    def groups(self) -> list[list[int]]:
+        """Numbers of the pairs among stops that they connect, most often of one stop; by the first stop."""
+        stop, n = self.traverse.image_stop, len(self.traverse.stops)
+        ends = np.array([(stop[p.a], stop[p.b]) for p in self.pairs], dtype=np.int64).reshape(-1, 2)
+        joined = scipy.sparse.coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(n, n))
+        _, label = scipy.sparse.csgraph.connected_components(joined, directed=False)
+        of_pair = label[ends[:, 0]]
         return [
-            step_key(
-                "features",
-                picture_key,
-                None if mask is None else mask.usable(between_stops=False),
-                wanted,
-            )
-            for picture_key, mask, wanted in zip(self.picture_keys, self.masks, self.wanted, strict=True)
+            np.flatnonzero(of_pair == group).tolist() for group in dict.fromkeys(label) if group in of_pair
         ]
 
     @cached_property
-    def features(self) -> list[Features]:
-        """Features of each image where it overlaps others; none for an image without a file."""
-        world_R_camera, _ = self.traverse.camera_poses()
-        keys, masks, all_wanted = self.feature_keys, self.masks, self.wanted
-
-        def find(i: int) -> Features:
-            image, mask = self.pictures.images[i], masks[i]
-            if image is None or mask is None:
-                return Features.none()
-            camera = self.traverse.rig.eyes[int(self.traverse.image_eye[i])].camera
-            usable, up = mask.usable(between_stops=False), world_R_camera[i].T @ _WORLD_UP
-
-            def make() -> Arrays:
-                return vars(find_features(image, all_wanted[i], camera, up, self.options, usable=usable))
-
-            return Features(**self.cache.recall("features", keys[i], make))
-
-        def tell(i: int, features: Features) -> None:
-            _LOG.info("%s: %d features", self.traverse.images[i].id, len(features))
-            self.tell("features", i + 1, len(all_wanted))
-
-        return in_order(find, range(len(all_wanted)), tell)
-
-    @cached_property
-    def _off_rover(self) -> list[IntArray]:
-        """Rows of each image's features that may be matched with those of other stops."""
-        rows = []
-        for features, mask in zip(self.features, self.masks, strict=True):
-            keep = np.zeros(len(features), dtype=bool)
-            if mask is not None:
-                keep = pixels_at(mask.usable(between_stops=True), features.uv_px)
-            rows.append(np.flatnonzero(keep))
-        return rows
-
-    @cached_property
-    def matches(self) -> list[PairMatches]:
-        """Verified matches of each pair; those of two stops without the rover."""
-        pairs, features, keys = self.pairs, self.features, self.feature_keys
-        linking = any(not pair.same_stop for pair in pairs)
-        off_rover = self._off_rover if linking else []
-
-        def match(pair: PairGeometry) -> PairMatches:
-            a, b = features[pair.a], features[pair.b]
-            rows = None if pair.same_stop else (off_rover[pair.a], off_rover[pair.b])
-
-            def make() -> Arrays:
-                if rows is None:
-                    return match_pair(pair, a, b, self.options).arrays()
-                selected = match_pair(pair, a.select(rows[0]), b.select(rows[1]), self.options).arrays()
-                return {**selected, "a": rows[0][selected["a"]], "b": rows[1][selected["b"]]}
-
-            key = step_key("matches", keys[pair.a], keys[pair.b], rows)
-            return PairMatches.of_arrays(self.cache.recall("matches", key, make))
-
-        def tell(k: int, matched: PairMatches) -> None:
-            pair = pairs[k]
-            names = self.traverse.images[pair.a].id, self.traverse.images[pair.b].id
-            _LOG.info("%s, %s: %d matches %s", *names, len(matched.matches), matched.refusal.text)
-            self.tell("matches", k + 1, len(pairs))
-
-        return in_order(match, pairs, tell)
+    def _files(self) -> PictureFiles:
+        return PictureFiles(self.traverse, self.pictures)
 
     @cached_property
     def _spline(self) -> Splines:
-        return Splines(self.pictures.images)
+        return Splines(self._files.samples)
 
-    def refined(
-        self, image: IntArray, track: IntArray, uv_px: FloatArray, as_found_px: FloatArray
-    ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Positions (n, 2) after least-squares matching, covariances (n, 2, 2), and which (n,) to leave out.
+    # An image
 
-        See `refine_tracks`; left out are points that look unlike, where two images share enough others.
+    def mask(self, row: int) -> ImageMask | None:
+        """Which pixels of an image are left out, and why; None without a picture."""
+        if not self.pictures.has(row):
+            return None
+        camera = self.traverse.rig.eyes[int(self.traverse.image_eye[row])].camera
+        packed = self._mask_arrays(row)["reasons"]
+        reasons = np.frombuffer(zlib.decompress(packed.tobytes()), dtype=np.uint8)
+        return ImageMask(reasons=reasons.reshape(camera.height_px, camera.width_px))
 
-        One part of the work are the tracks that begin in one image. An observation keeps its position, to
-        `as_found_px` (n,), if the patch around it, or around the first of its track, has pixels that are left
-        out.
+    def _mask_arrays(self, row: int) -> Arrays:
+        def make() -> Arrays:
+            automatic, samples = self.options.masks == "automatic", self._files.samples
+            elevation = elevation_rad(self.traverse, row)
+            alone = mask_image(samples(row), self._files.user_mask(row), elevation, automatic=automatic)
+            rover = find_rover(self.traverse, row, samples, self._partners(row), self.options)
+            mask = alone.with_rover(rover)
+            digests = (mask.reasons, *(mask.usable(between_stops=between) for between in (False, True)))
+            return {
+                "reasons": np.frombuffer(zlib.compress(mask.reasons.tobytes(), 1), dtype=np.uint8),
+                "digests": np.array([digest(each) for each in digests]),
+                "share": np.array([mask.share(reason) for reason in Reason]),
+            }
+
+        if row not in self._mask_keys:
+            pictures = [self.picture_keys[i] for i in (row, *self._partners(row))]
+            self._mask_keys[row] = step_key("mask", pictures)
+        return self.cache.recall("mask", self._mask_keys[row], make)
+
+    def _partners(self, row: int) -> list[int]:
+        """Images with which the rover is found in an image."""
+        has = np.array([each is not None for each in self.pictures.digests])
+        return rover_partners(self.traverse, row, available=has) if self.options.masks == "automatic" else []
+
+    def figures(self, row: int) -> MaskFigures | None:
+        """What is known of an image's mask without its pixels; None without a picture."""
+        if row not in self._figures and self.pictures.has(row):
+            arrays = self._mask_arrays(row)
+            reasons, within, between = arrays["digests"].tolist()
+            share = dict(zip(Reason, arrays["share"].tolist(), strict=True))
+            self._figures[row] = MaskFigures(
+                reasons=reasons, within_stops=within, between_stops=between, share=share
+            )
+        return self._figures.get(row)
+
+    def feature_key(self, row: int) -> str:
+        """Key of an image's features."""
+        if row not in self._feature_keys:
+            figures = self.figures(row)
+            within = None if figures is None else figures.within_stops
+            self._feature_keys[row] = step_key("features", self.picture_keys[row], within, self.wanted[row])
+        return self._feature_keys[row]
+
+    def features(self, row: int) -> Features:
+        """Features of an image where it overlaps others; none for an image without a picture."""
+        if not self.pictures.has(row):
+            return Features.none()
+
+        def make() -> Arrays:
+            camera = self.traverse.rig.eyes[int(self.traverse.image_eye[row])].camera
+            world_R_camera, _ = self.traverse.camera_poses()
+            mask, up = self.mask(row), world_R_camera[row].T @ _WORLD_UP
+            assert mask is not None  # it has a picture
+            usable = mask.usable(between_stops=False)
+            samples, wanted = self._files.samples(row), self.wanted[row]
+            return vars(find_features(samples, wanted, camera, up, self.options, usable=usable))
+
+        return Features(**self.cache.recall("features", self.feature_key(row), make))
+
+    def _off_rover(self, row: int, features: Features) -> IntArray:
+        """Rows of an image's features that may be matched with those of other stops."""
+        mask = self.mask(row)
+        assert mask is not None  # it has a picture
+        return np.flatnonzero(pixels_at(mask.usable(between_stops=True), features.uv_px))
+
+    @cached_property
+    def _usable(self) -> Held[int, BoolArray]:
+        return Held[int, BoolArray](_HELD_MASK_BYTES, lambda usable: usable.nbytes)
+
+    def usable(self, row: int) -> BoolArray:
+        """Which pixels (height, width) of an image show terrain, a patch around them too."""
+
+        def make() -> BoolArray:
+            mask = self.mask(row)
+            assert mask is not None  # it has observations
+            return mask.usable(between_stops=True, margin_px=_PATCH_PX)
+
+        return self._usable.get(row, make)
+
+    # A pair of images
+
+    def match_key(self, pair: PairGeometry) -> str:
+        """Key of the matches of a pair."""
+        between = None if pair.same_stop else [self._between(row) for row in (pair.a, pair.b)]
+        return step_key("matches", self.feature_key(pair.a), self.feature_key(pair.b), between)
+
+    def _between(self, row: int) -> str | None:
+        figures = self.figures(row)
+        return None if figures is None else figures.between_stops
+
+    def matches(self, pair: PairGeometry) -> PairMatches:
+        """Verified matches of a pair; those of two stops without the rover."""
+
+        def make() -> Arrays:
+            a, b = self.features(pair.a), self.features(pair.b)
+            if pair.same_stop:
+                return match_pair(pair, a, b, self.options).arrays()
+            rows = self._off_rover(pair.a, a), self._off_rover(pair.b, b)
+            selected = match_pair(pair, a.select(rows[0]), b.select(rows[1]), self.options).arrays()
+            return {**selected, "a": rows[0][selected["a"]], "b": rows[1][selected["b"]]}
+
+        return PairMatches.of_arrays(self.cache.recall("matches", self.match_key(pair), make))
+
+    # Stops whose images are compared with each other
+
+    def tracks(self, group: int) -> Arrays:
+        """Tracks of the features of a group (see `groups`), as columns sorted by track, then image.
+
+        `image`, `feature` (row among the image's features), `track` from 0 on, `uv_px` (n, 2) and `size_px`;
+        and `seen`: rows of all images with features that another one shares, also where no track was kept.
         """
-        first = np.searchsorted(track, track)
-        firsts = np.unique(image[first])
-        rows_of = [np.flatnonzero(image[first] == origin) for origin in firsts]
-        spline, picture_keys = self._spline, self.picture_keys
+        pairs, options = [self.pairs[k] for k in self.groups[group]], self.options
 
-        def refine(rows: IntArray) -> Arrays:
-            columns = image[rows], track[rows], uv_px[rows], as_found_px[rows]
+        def make() -> Arrays:
+            found = [_links(pair, self.matches(pair)) for pair in pairs]
+            image, feature, track = join_tracks(Links.concatenate([links for links in found if links]))
+            seen = np.unique(image)
+            uv_px, size_px = np.empty((len(image), 2)), np.empty(len(image))
+            for i in seen.tolist():
+                rows, features = image == i, self.features(i)
+                uv_px[rows], size_px[rows] = features.uv_px[feature[rows]], features.size_px[feature[rows]]
+            kept = np.flatnonzero(apart_tracks(image, track, uv_px, options.min_apart_px))
+            cameras = [self.traverse.rig.eyes[eye].camera for eye in self.traverse.image_eye]
+            extent_px = np.array([[c.width_px, c.height_px] for c in cameras])
+            spread = spread_tracks(image[kept], track[kept], uv_px[kept], extent_px, options.max_ties)
+            kept = kept[spread]
+            return {
+                "image": image[kept],
+                "feature": feature[kept],
+                "track": np.unique(track[kept], return_inverse=True)[1],
+                "uv_px": uv_px[kept],
+                "size_px": size_px[kept],
+                "seen": seen,
+            }
 
-            def make() -> Arrays:
-                return vars(refine_tracks(self.traverse, spline, *columns, self.options))
+        return self.cache.recall("tracks", step_key("tracks", [self.match_key(pair) for pair in pairs]), make)
 
-            pictures = [picture_keys[i] for i in np.unique(image[rows])]
-            key = step_key("refined", pictures, columns)
-            return self.cache.recall("refined", key, make)
+    def origins(self, group: int) -> list[int]:
+        """Rows of the images of a group in which tracks begin."""
+        tracks = self.tracks(group)
+        first = np.searchsorted(tracks["track"], tracks["track"])
+        return [int(row) for row in np.unique(tracks["image"][first])]
 
-        parts = in_order(refine, rows_of, lambda k, _: self.tell("refinement", k + 1, len(firsts)))
-        order = np.argsort(np.concatenate(rows_of))
+    def refined(self, group: int, origin: int) -> Arrays:
+        """The tracks of a group that begin in an image, after least-squares matching; see `refine_tracks`.
+
+        Columns of `RefinedTracks`, and `row`: the rows of their observations among the group's.
+        """
+        tracks = self.tracks(group)
+        image, track = tracks["image"], tracks["track"]
+        rows = np.flatnonzero(image[np.searchsorted(track, track)] == origin)
+        own = np.unique(track[rows], return_inverse=True)[1]
+        columns = image[rows], own, tracks["uv_px"][rows], self._as_found_px(tracks)[rows]
+
+        def make() -> Arrays:
+            return vars(refine_tracks(self.traverse, self._spline, *columns, self.options))
+
+        pictures = [self.picture_keys[i] for i in np.unique(image[rows])]
+        return {**self.cache.recall("refined", step_key("refined", pictures, columns), make), "row": rows}
+
+    def _as_found_px(self, tracks: Arrays) -> Any:
+        return np.hypot(self.options.sigma_px, self.options.sigma_per_size * tracks["size_px"])
+
+    def observed(self, group: int) -> Arrays:
+        """Observations within a group, as columns sorted by track, then image.
+
+        `image`, `feature`, `track`, `uv_px` (n, 2), `sigma_px`, and `covariance_px2` (n, 2, 2). Points that
+        look unlike are left out where two images share enough others. An observation keeps its position as it
+        was found if the patch around it, or around the first of its track, has pixels that are left out.
+        """
+        tracks = self.tracks(group)
+        image, track, uv_px = tracks["image"], tracks["track"], tracks["uv_px"]
+        if not len(track):
+            none = {"sigma_px": np.empty(0), "covariance_px2": np.empty((0, 2, 2))}
+            return {**{name: tracks[name] for name in ("image", "feature", "track", "uv_px")}, **none}
+        parts = [self.refined(group, origin) for origin in self.origins(group)]
+        order = np.argsort(np.concatenate([part.pop("row") for part in parts]))
         fitted = RefinedTracks(**{n: np.concatenate([p[n] for p in parts])[order] for n in parts[0]})
         clear = self._clear(image, track, fitted.uv_px) & self._clear(image, track, uv_px)
-        clear &= clear[first]
+        clear &= clear[np.searchsorted(track, track)]
         moved, unlike = fitted.moved & clear, fitted.unlike & clear
+        as_found_px = self._as_found_px(tracks)
         as_found = as_found_px[:, None, None] ** 2 * np.eye(2)
         covariance = np.where((moved | unlike)[:, None, None], fitted.covariance_px2, as_found)
         frame = self.traverse.image_frame[image]
         covariance = shared_by_tracks(covariance, fitted.in_first_px2, moved, track, frame)
-        return np.where(moved[:, None], fitted.uv_px, uv_px), covariance, fitted.spare & clear
+        used = shared_still(track, ~(fitted.spare & clear))
+        return {
+            "image": image[used],
+            "feature": tracks["feature"][used],
+            "track": np.unique(track[used], return_inverse=True)[1],
+            "uv_px": np.where(moved[:, None], fitted.uv_px, uv_px)[used],
+            "sigma_px": as_found_px[used],
+            "covariance_px2": covariance[used],
+        }
 
-    def tied(self, observations: Observations, feature: IntArray) -> tuple[Observations, list[StopMatching]]:
-        """Observations within stops, with ties between stops added, and a report of each pair of stops.
+    def _clear(self, image: IntArray, track: IntArray, uv_px: Any) -> BoolArray:
+        """Which observations (n,) have no left-out pixel in the patch around them."""
+        stop = self.traverse.image_stop[image]
+        low, high = (np.full(int(track.max()) + 1, fill) for fill in (len(self.traverse.stops), -1))
+        np.minimum.at(low, track, stop)
+        np.maximum.at(high, track, stop)
+        linking = (low < high)[track]
+        clear = np.ones(len(image), dtype=bool)
+        for i in np.unique(image).tolist():
+            mask = self.mask(i)
+            assert mask is not None  # it has observations
+            for between in (False, True):
+                rows = np.flatnonzero((image == i) & (linking == between))
+                if len(rows):
+                    usable = mask.usable(between_stops=between, margin_px=_PATCH_PX)
+                    clear[rows] = pixels_at(usable, uv_px[rows])
+        return clear
 
-        The observations are sorted by track, then image; `feature` (n,) is the row of each in its image's
-        features. A solve of them places the terrain of each stop, which is then sought in the images of other
-        stops. The result for each direction of each pair of stops is kept in the cache as soon as it is done.
+    # All stops, and two stops
+
+    def placed(self, observations: Observations, feature: IntArray) -> "PlacedStops":
+        """The terrain that observations within stops place, each stop's by itself.
+
+        They are sorted by track, then image; `feature` (n,) is the row of each in its image's features.
         """
         traverse = replace(self.traverse, constraints=(), points=None).with_observations(observations)
-        usable = [
-            None if mask is None else mask.usable(between_stops=True, margin_px=_PATCH_PX)
-            for mask in self.masks
-        ]
 
         def place() -> Arrays:
             self.tell("terrain of the stops", 0, 1)
@@ -316,87 +441,59 @@ class Steps:
             # A solve scales all noise by one factor, and the ties' noise must be in the same unit.
             unit = np.median(observations.sigma_px / solution.sigma_px)
             self.tell("terrain of the stops", 1, 1)
-            return {**terrain_arrays(solution), "unit": np.array(unit)}
+            arrays: dict[str, Any] = dict(terrain_arrays(solution))
+            terrain = terrain_from(traverse, **arrays)
+            shown = on_terrain(self.usable, terrain.image, terrain.uv_px)
+            return {**arrays, "slope": terrain.slope, "shown": shown, "unit": np.array(unit)}
 
         noise = observations.covariance_px2
         columns = observations.image, observations.track, observations.uv_px, noise, feature
-        inputs = self.picture_keys, self.mask_keys, self.traverse.stops, columns
-        key = step_key("terrain", *inputs)
-        placed = self.cache.recall("terrain", key, place)
-        unit = float(placed.pop("unit"))
-        terrain = terrain_from(traverse, **placed)
-        terrain = terrain.select(on_terrain(usable, terrain.image, terrain.uv_px))
+        masks = [
+            None if (known := self.figures(row)) is None else known.reasons
+            for row in range(len(self.picture_keys))
+        ]
+        key = step_key("terrain", self.picture_keys, masks, self.traverse.stops, columns)
+        arrays: dict[str, Any] = self.cache.recall("terrain", key, place)
+        unit, shown = float(arrays.pop("unit")), arrays.pop("shown")
         matcher = StopMatcher(
-            terrain=terrain,
+            terrain=terrain_from(traverse, **arrays).select(shown),
             spline=self._spline,
-            usable=usable,
+            usable=self.usable,
             features=self.features,
             feature_of=feature,
             options=self.options,
         )
-
-        def tie(stops: tuple[int, int]) -> StopTies:
-            make = partial(_as_arrays, matcher, stops)
-            tie_key = step_key("ties", key, stops)
-            return StopTies.of_arrays(self.cache.recall("ties", tie_key, make))
-
-        def tell(k: int, tied: StopTies) -> None:
-            report = tied.report
-            names = self.traverse.stops[report.a].id, self.traverse.stops[report.b].id
-            _LOG.info("%s in %s: %d ties, noise %.2f px", *names, report.kept, report.noise_px)
-            self.tell("ties between stops", k + 1, len(directed))
-
-        directed = [d for a, b in self.stop_pairs for d in ((a, b), (b, a))]
-        found = in_order(tie, directed, tell)
-        both = [agreeing(terrain, *pair) for pair in zip(found[::2], found[1::2], strict=True)]
-        stop_ties = [each for pair in both for each in pair]
-        ties = Ties.concatenate([each.ties for each in stop_ties])
-        ties = ties.scaled(np.full(len(ties), unit))
-        return joined(observations, terrain, ties), [each.report for each in stop_ties]
-
-    def _clear(self, image: IntArray, track: IntArray, uv_px: FloatArray) -> BoolArray:
-        """Which observations (n,) have no left-out pixel in the patch around them."""
-        stop = self.traverse.image_stop[image]
-        low, high = (np.full(int(track.max()) + 1, fill) for fill in (len(self.traverse.stops), -1))
-        np.minimum.at(low, track, stop)
-        np.maximum.at(high, track, stop)
-        linking = (low < high)[track]
-        clear = np.ones(len(image), dtype=bool)
-        for i in np.unique(image):
-            mask = self.masks[i]
-            assert mask is not None  # it has observations
-            for between in (False, True):
-                rows = np.flatnonzero((image == i) & (linking == between))
-                if len(rows):
-                    usable = mask.usable(between_stops=between, margin_px=_PATCH_PX)
-                    clear[rows] = pixels_at(usable, uv_px[rows])
-        return clear
-
-    def over_exposed(self) -> list[str]:
-        """A warning for each image of which much is saturated."""
-        shares = [0.0 if mask is None else mask.share(Reason.SATURATED) for mask in self.masks]
-        return [
-            f"image {image_name(self.traverse, i)}: over-exposed, {share:.0%} of its pixels are saturated"
-            for i, share in enumerate(shares)
-            if share > _OVER_EXPOSED
-        ]
-
-    def why_nothing(self, row: int) -> str:
-        """Why an image may have no observations, as the end of a sentence; empty where nothing is known."""
-        if row in self.pictures.unusable:
-            return f" ({self.pictures.unusable[row]})"
-        mask = self.masks[row]
-        if mask is None:
-            return ""
-        for reason, text in _WHY.items():
-            share = mask.share(reason)
-            if share > _MOST:
-                return f" ({share:.0%} of it {text})"
-        if not any(row in {pair.a, pair.b} for pair in self.pairs):
-            return " (it overlaps no other image by pointing)"
-        n_features = len(self.features[row].uv_px)
-        return f" (none of its {n_features} features was found in another image)"
+        return PlacedStops(key=key, unit=unit, matcher=matcher, cache=self.cache)
 
 
-def _as_arrays(matcher: StopMatcher, stops: tuple[int, int]) -> Arrays:
-    return matcher.ties(*stops).arrays()
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlacedStops:
+    """The terrain of single stops, to be sought in the images of others."""
+
+    key: str
+    unit: float
+    """Factor from the ties' noise to that of the observations."""
+    matcher: StopMatcher
+    cache: Cache
+
+    def ties(self, one: int, other: int) -> StopTies:
+        """Ties of the terrain of one stop with the images of another."""
+
+        def make() -> Arrays:
+            return self.matcher.ties(one, other).arrays()
+
+        return StopTies.of_arrays(self.cache.recall("ties", step_key("ties", self.key, (one, other)), make))
+
+
+def _links(pair: PairGeometry, matched: PairMatches) -> Links | None:
+    """The matches of a pair as links; None where there are none."""
+    matches = matched.matches
+    if not len(matches):
+        return None
+    return Links(
+        image_a=np.full(len(matches), pair.a, dtype=np.int64),
+        feature_a=matches.a,
+        image_b=np.full(len(matches), pair.b, dtype=np.int64),
+        feature_b=matches.b,
+        distance=matches.distance,
+    )

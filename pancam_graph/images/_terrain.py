@@ -245,11 +245,12 @@ def terrain_from(
     pan_tilt_rad: FloatArray,
     world_R_mast: FloatArray,
     world_t_mast: FloatArray,
+    slope: FloatArray | None = None,
     **columns: Any,
 ) -> StopTerrain:
     """The points that a solution of the traverse places, each with its surface; see `terrain_arrays`.
 
-    Its traverse is at the solution, the rig too.
+    Its traverse is at the solution, the rig too. `slope` is that of the surface, where it is known already.
     """
     frames = tuple(
         replace(f, pan_rad=float(pan), tilt_rad=float(tilt))
@@ -267,14 +268,16 @@ def terrain_from(
     terrain = StopTerrain(
         traverse=replace(traverse, rig=rig, frames=frames, stops=stops),
         **columns,
-        slope=np.zeros((len(columns["track"]), 2)),
+        slope=np.zeros((len(columns["track"]), 2)) if slope is None else slope,
     )
-    slope = terrain.slope.copy()
+    if slope is not None:
+        return terrain
+    slopes = terrain.slope.copy()
     world_R_camera, _ = terrain.traverse.camera_poses()
     for i in np.unique(terrain.image):
         rows = np.flatnonzero(terrain.image == i)
-        slope[rows] = _slopes(terrain, rows, world_R_camera[i])
-    return replace(terrain, slope=slope)
+        slopes[rows] = _slopes(terrain, rows, world_R_camera[i])
+    return replace(terrain, slope=slopes)
 
 
 def _sigma_inverse_m(

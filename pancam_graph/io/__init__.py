@@ -27,6 +27,7 @@ from pancam_graph.io._json import read_json as read_json
 from pancam_graph.io._json import refused_by_schema as refused_by_schema
 from pancam_graph.io._json import short as short
 from pancam_graph.io._json import validated as validated
+from pancam_graph.io._looks import samples_digest as samples_digest
 from pancam_graph.io._maps import crs_name as crs_name
 from pancam_graph.io._maps import site_crs as site_crs
 from pancam_graph.io._maps import world_affine as world_affine
@@ -36,6 +37,7 @@ from pancam_graph.io._npz import NpzFile as NpzFile
 from pancam_graph.io._pds import read_pds as read_pds
 from pancam_graph.io._pictures import left_out as left_out
 from pancam_graph.io._pictures import picture_file as picture_file
+from pancam_graph.io._pictures import picture_look as picture_look
 from pancam_graph.io._pictures import read_picture as read_picture
 from pancam_graph.io._pictures import readable_picture as readable_picture
 from pancam_graph.io._pictures import same_pictures as same_pictures

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from pancam_graph.base.geometry import FloatArray
 from pancam_graph.data import Traverse
-from pancam_graph.io._image_files import GreyImage
+from pancam_graph.io._image_files import GreyImage, ImageContent
 
-__all__ = ["Look", "look_of", "same_looks"]
+__all__ = ["Look", "look_of", "same_looks", "samples_digest"]
 
 _SIDE = 64
 """Cells of a thumbnail along each side: noise and encoding average out in them."""
@@ -30,22 +30,40 @@ class Look:
     """What is kept of a picture to tell it from others."""
 
     digest: bytes
-    """Digest of all samples; empty for a picture of a single grey, which is the same as no other."""
+    """Digest of all samples, see `samples_digest`."""
+    shape: tuple[int, ...]
+    """Rows and columns."""
+    colour: bool
+    """Whether its file has bands that differ."""
+    blank: bool
+    """Whether it is of a single grey: such a picture is the same as no other."""
     thumbnail: NDArray[np.float32]
     """(64, 64) small picture without its shading; 0 where there is no data."""
     valid: NDArray[np.bool]
     """(64, 64) cells all of whose pixels have data."""
 
 
-def look_of(samples: GreyImage) -> Look:
-    """The look of a picture (rows, columns)."""
-    if samples.min() == samples.max():
-        nothing = np.zeros((_SIDE, _SIDE))
-        return Look(digest=b"", thumbnail=nothing.astype(np.float32), valid=nothing.astype(bool))
+def look_of(content: ImageContent) -> Look:
+    """The look of a picture."""
+    samples = content.samples
+    blank = bool(samples.min() == samples.max())
+    nothing = np.zeros((_SIDE, _SIDE))
+    thumbnail, valid = (nothing.astype(np.float32), nothing.astype(bool)) if blank else _thumbnail(samples)
+    return Look(
+        digest=samples_digest(samples),
+        shape=samples.shape,
+        colour=content.colour,
+        blank=blank,
+        thumbnail=thumbnail,
+        valid=valid,
+    )
+
+
+def samples_digest(samples: GreyImage) -> bytes:
+    """A digest of the samples of a picture (rows, columns), of their type and of its shape."""
     running = hashlib.sha256(f"{samples.dtype.str} {samples.shape} ".encode())
     running.update(np.ascontiguousarray(samples).data)
-    thumbnail, valid = _thumbnail(samples)
-    return Look(digest=running.digest(), thumbnail=thumbnail, valid=valid)
+    return running.digest()
 
 
 def _thumbnail(samples: GreyImage) -> tuple[NDArray[np.float32], NDArray[np.bool]]:
@@ -75,9 +93,9 @@ def same_looks(traverse: Traverse, looks: Mapping[int, Look]) -> dict[int, int]:
     first: dict[bytes, int] = {}
     same: dict[int, int] = {}
     for row, look in sorted(looks.items()):
-        if look.digest and first.setdefault(look.digest, row) != row:
+        if not look.blank and first.setdefault(look.digest, row) != row:
             same[row] = first[look.digest]
-    rows = [row for row, look in sorted(looks.items()) if look.digest and row not in same]
+    rows = [row for row, look in sorted(looks.items()) if not look.blank and row not in same]
     alike = _correlation([looks[row] for row in rows]) > _ALIKE if rows else np.zeros((0, 0), dtype=bool)
     for one, other in np.argwhere(np.triu(alike, 1)).tolist():
         a, b = rows[one], rows[other]

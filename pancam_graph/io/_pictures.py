@@ -15,6 +15,7 @@ from pancam_graph.io._picture_size import WantedSize
 __all__ = [
     "left_out",
     "picture_file",
+    "picture_look",
     "read_picture",
     "readable_picture",
     "same_pictures",
@@ -49,9 +50,28 @@ def read_picture(traverse: Traverse, row: int) -> ImageContent:
     size = WantedSize(width_px=width_px, height_px=height_px, words=words)
     folder = traverse.folder or Path()
     content = _tiled(folder, image.tiles, size) if image.tiles else read_content(path, size)
-    if _LOOKS.recall(path) is None:
-        _LOOKS.keep(path, look_of(content.samples), [folder / name for name in image.files])
+    if _known_look(traverse, row) is None:
+        _LOOKS.keep(path, look_of(content), [folder / name for name in image.files])
     return content
+
+
+def picture_look(traverse: Traverse, row: int) -> Look:
+    """What is kept of the picture of an image; a file that was decoded before is not decoded again.
+
+    Raises as `read_picture` does.
+    """
+    look = _known_look(traverse, row)
+    if look is None:
+        content = read_picture(traverse, row)
+        look = _known_look(traverse, row) or look_of(content)  # the file may have changed since
+    return look
+
+
+def _known_look(traverse: Traverse, row: int) -> Look | None:
+    """The look of an image whose file was decoded before, for a camera of this size, and has not changed."""
+    path, camera = picture_file(traverse, row), traverse.rig.eyes[int(traverse.image_eye[row])].camera
+    look = None if path is None else _LOOKS.recall(path)
+    return look if look is not None and look.shape == (camera.height_px, camera.width_px) else None
 
 
 def _tiled(folder: Path, tiles: Sequence[Tile], size: WantedSize) -> ImageContent:
@@ -97,14 +117,10 @@ def same_pictures(traverse: Traverse) -> dict[int, int]:
     """
     looks: dict[int, Look] = {}
     for row in range(len(traverse.images)):
-        path = picture_file(traverse, row)
-        if path is None:
-            continue
-        look = _LOOKS.recall(path)
-        if look is None and readable_picture(traverse, row) is not None:
-            look = _LOOKS.recall(path)
-        if look is not None:
-            looks[row] = look
+        try:
+            looks[row] = picture_look(traverse, row)
+        except (ImageError, OSError):
+            continue  # it has no file, or one that cannot be read any more
     return same_looks(traverse, looks)
 
 

@@ -128,9 +128,8 @@ def make_terrain(
     grid = grid_around(centres, options.reach_m, cell_m)
     masks = find_masks(traverse, progress=progress, cache=cache)
     telemetry = drive.telemetry()
-    every = max(
-        1, int(np.ceil(sum(m.reasons.size for m in masks if m is not None) / 2 / options.most_cloud_points))
-    )
+    most = sum(drive.cameras[pair.left].width_px * drive.cameras[pair.left].height_px for pair in pairs)
+    every = max(1, int(np.ceil(most / options.most_cloud_points)))
 
     def seen(pair: Pair) -> _Seen | str | None:
         left, right = _usable(masks[pair.left]), _usable(masks[pair.right])

@@ -31,6 +31,7 @@ from pancam_graph.data import Refusal, StopMatching
 from pancam_graph.images import FrontEndOptions, _alignment, _refine, _steps
 from pancam_graph.images._alignment import Alignment, Ties, believed, fit_pose, telemetry_alignment
 from pancam_graph.images._between import StopMatcher, StopTies, agreeing
+from pancam_graph.images._features import Features
 from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._splines import Splines
 from pancam_graph.images._terrain import StopTerrain, terrain_arrays, terrain_from
@@ -138,6 +139,9 @@ def test_a_search_begins_where_most_matches_agree(
         found = replace(ties, uv_px=np.where(there[:, None], ties.uv_px, chance))
         return found.select(seen.valid), half[seen.valid]
 
+    def no_features(_: int) -> Features:
+        return Features.none()
+
     monkeypatch.setattr(_alignment, "_matched", matched)
     for angle in np.deg2rad([75.0, 200.0]):
         off = 5 * sigma_m * np.array([np.cos(angle), np.sin(angle), 0.0])
@@ -149,7 +153,7 @@ def test_a_search_begins_where_most_matches_agree(
         for wide_px in (10.0, np.inf):
             monkeypatch.setattr(_alignment, "_WIDE_PX", wide_px)
             none = np.zeros(0, dtype=np.int64)
-            begun[wide_px] = _alignment._begun(terrain, [], none, (0, 1), told, QUICK)
+            begun[wide_px] = _alignment._begun(terrain, no_features, none, (0, 1), told, QUICK)
         assert begun[np.inf] is told
         apart = true.between(begun[10.0].world_T_mast).translation()
         assert np.linalg.norm(apart) < 0.5 * sigma_m
@@ -285,13 +289,11 @@ def small_run(small: tuple[Rendering, Traverse]) -> tuple[Traverse, Fitted, int]
     """What is found, what the least-squares matching within stops made of what, and how much was untied."""
     fitted: Fitted = []
     untied: list[int] = []
-    original, tied = _refine._refine_pair, _steps.Steps.tied
+    original, placed = _refine._refine_pair, _steps.Steps.placed
 
-    def counted(
-        steps: _steps.Steps, observations: Observations, feature: np.ndarray
-    ) -> tuple[Observations, list[StopMatching]]:
+    def counted(steps: _steps.Steps, observations: Observations, feature: np.ndarray) -> _steps.PlacedStops:
         untied.append(len(observations))
-        return tied(steps, observations, feature)
+        return placed(steps, observations, feature)
 
     def recorded(
         pair: PairGeometry, spline: Splines, uv_a: FloatArray, uv_b: FloatArray, options: FrontEndOptions
@@ -302,7 +304,7 @@ def small_run(small: tuple[Rendering, Traverse]) -> tuple[Traverse, Fitted, int]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_refine, "_refine_pair", recorded)
-        patch.setattr(_steps.Steps, "tied", counted)
+        patch.setattr(_steps.Steps, "placed", counted)
         return find_observations(small[1], QUICK), fitted, untied[0]
 
 

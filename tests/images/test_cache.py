@@ -60,7 +60,7 @@ def test_with_and_without_a_cache_the_same_bytes(
     scene: Traverse, plain: bytes, made: dict[str, int], tmp_path: Path
 ) -> None:
     assert run(scene, tmp_path) == plain
-    assert made == {"mask": 3, "features": 3, "matches": 3, "refined": 2}
+    assert made == {"mask": 3, "features": 3, "matches": 3, "tracks": 1, "refined": 2}
     made.clear()
     assert run(scene, tmp_path) == plain
     assert made == {}
@@ -89,7 +89,8 @@ def test_only_what_an_image_touches_is_made_anew(
 
 def test_options_rig_pointing_and_masks_are_seen(scene: Traverse) -> None:
     def keys(traverse: Traverse, options: FrontEndOptions = QUICK) -> list[str]:
-        return Steps(traverse, options, None, Cache(None)).feature_keys
+        steps = Steps(traverse, options, None, Cache(None))
+        return [steps.feature_key(row) for row in range(len(traverse.images))]
 
     before = keys(scene)
     assert keys(scene) == before
@@ -118,7 +119,7 @@ def test_another_version_of_a_library_is_seen(monkeypatch: pytest.MonkeyPatch) -
     assert digest("features", 1.0) != before
 
 
-KINDS = ("mask", "features", "matches", "refined", "terrain", "ties")
+KINDS = ("mask", "features", "matches", "tracks", "refined", "terrain", "ties")
 
 
 @pytest.mark.parametrize(
@@ -246,7 +247,7 @@ def test_an_interrupted_run_goes_on_where_it_was(
     assert made == {"mask": 3, "features": 3, "matches": 1}
     made.clear()
     assert run(scene, tmp_path) == plain
-    assert made == {"matches": 2, "refined": 2}
+    assert made == {"matches": 2, "tracks": 1, "refined": 2}
 
 
 def test_a_folder_with_nothing_but_a_cache_may_become_results(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from pancam_graph.cameras import Camera
 from pancam_graph.data import UNKNOWN_RAD, Frame, Traverse
 from pancam_graph.images._front_end_options import FrontEndOptions
 from pancam_graph.images._normalise import usable_mask
-from pancam_graph.images._read import Pictures, read_pictures
+from pancam_graph.images._read import PictureFiles, Pictures, read_pictures
 from pancam_graph.images.pointing._averaging import averaged, groups_of
 from pancam_graph.images.pointing._head_fit import HeadFit, HeadState, Points, Priors, agreeing, fit_head
 from pancam_graph.images.pointing._levelling import levelled
@@ -113,7 +113,7 @@ def find_pointing(
     tell = progress or (lambda stage, done, total: None)
     _require_gauge(traverse)
     pictures = read_pictures(traverse, partial(tell, "images"))
-    features = _features(pictures, options, tell)
+    features = _features(traverse, pictures, options, tell)
     if not any(map(len, features)):
         raise InputError(f"{traverse.name}: expected pictures with features, found none in any of them")
     if sum(map(bool, map(len, features))) < 2:
@@ -145,15 +145,19 @@ def _require_gauge(traverse: Traverse) -> None:
             )
 
 
-def _features(pictures: Pictures, options: FrontEndOptions, tell: Progress) -> list[StrongFeatures]:
+def _features(
+    traverse: Traverse, pictures: Pictures, options: FrontEndOptions, tell: Progress
+) -> list[StrongFeatures]:
+    files = PictureFiles(traverse, pictures)
+
     def find(row: int) -> StrongFeatures:
-        image, mask = pictures.images[row], pictures.user_masks[row]
-        if image is None:
+        if not pictures.has(row):
             return StrongFeatures.none()
+        image, mask = files.samples(row), files.user_mask(row)
         usable = usable_mask(image)
         return strong_features(image, usable if mask is None else usable & mask, options)
 
-    rows = range(len(pictures.images))
+    rows = range(len(traverse.images))
     return in_order(find, rows, lambda row, _: tell("features", row + 1, len(rows)))
 
 
