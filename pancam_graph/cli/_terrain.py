@@ -14,8 +14,10 @@ Make terrain of refined stereo frames: heights with sigmas, orthoimage, hillshad
 
 OUT is a folder of results. OUT/terrain gets terrain.json, dem.tif (bands height, sigma, count, disagreement),
 orthoimage.tif, hillshade.png, slope.png, mesh.glb and cloud.laz of the drive, OUT/terrain/STOP those of each
-stop, and terrain.html shows them; an older one is replaced once all is complete. terrain.json says by how
-much surfaces of frames differ where they see the same ground, with telemetry's and with the refined pointing.
+stop, and terrain.html shows them; an older one is replaced once all is complete. dem.tif is the ground near
+the masts; farther away cells are larger: dem_1.tif, dem_2.tif and so on, and dem.vrt shows all as one.
+terrain.json says by how much surfaces of frames differ where they see the same ground, with telemetry's and
+with the refined pointing.
 
 Needs the extra: pip install 'pancam-graph[terrain]'.
 
@@ -31,14 +33,21 @@ def _add_options(parser: CommandParser) -> None:
         "--cell",
         type=above_zero,
         metavar="M",
-        help="side of a cell, metres (default: as far as points lie apart on the ground 6 m away)",
+        help="side of a cell of the finest grid, metres (default: as far as points lie apart 6 m away)",
     )
     add(
         "--reach",
         type=above_zero,
-        default=25.0,
+        default=100.0,
         metavar="M",
         help="farthest ground from a mast, metres (%(default)s)",
+    )
+    add(
+        "--fill",
+        type=above_zero,
+        default=0.0,
+        metavar="M",
+        help="fill holes up to this width, metres, from what surrounds them; their count is 0 (none)",
     )
     add("--ply", action="store_true", help="write clouds as PLY too")
     add(
@@ -55,7 +64,9 @@ def _work(call: Invocation) -> int:
     from pancam_graph.terrain import TerrainOptions, require_extra
 
     arguments, progress = call.arguments, call.progress
-    options = TerrainOptions(cell_m=arguments.cell, reach_m=arguments.reach, ply=arguments.ply)
+    options = TerrainOptions(
+        cell_m=arguments.cell, reach_m=arguments.reach, fill_m=arguments.fill, ply=arguments.ply
+    )
     require_extra()
     with progress.shown(f"reading {arguments.out}"):
         drive = read_drive(arguments.out, arguments.images)

@@ -5,7 +5,7 @@ from pancam_graph.terrain._agreement import PairAgreement as PairAgreement
 from pancam_graph.terrain._drive import Drive as Drive
 from pancam_graph.terrain._drive import drive_of as drive_of
 from pancam_graph.terrain._extra import require_extra as require_extra
-from pancam_graph.terrain._make import Fused as Fused
+from pancam_graph.terrain._fused import Fused as Fused
 from pancam_graph.terrain._make import Terrain as Terrain
 from pancam_graph.terrain._make import make_terrain as make_terrain
 from pancam_graph.terrain._registration import Registration as Registration

@@ -8,7 +8,7 @@ import numpy as np
 from pancam_graph.base.geometry import IntArray
 from pancam_graph.terrain._grid import Layer
 
-__all__ = ["Agreement", "PairAgreement", "agreement_of"]
+__all__ = ["Agreement", "PairAgreement", "agreement_of", "finest_agreement"]
 
 _LEAST_CELLS = 100
 
@@ -27,6 +27,11 @@ class PairAgreement:
     refined_sigmas: float
     """Median of the absolute difference over its standard deviation; 0.67 where sigmas are right."""
 
+    @property
+    def compared(self) -> bool:
+        """Whether both numbers are known."""
+        return bool(np.isfinite([self.telemetry_m, self.refined_m]).all())
+
 
 @dataclass(frozen=True, kw_only=True)
 class Agreement:
@@ -39,7 +44,7 @@ class Agreement:
         both = [
             (p.telemetry_m, p.refined_m)
             for p in self.pairs
-            if np.isfinite([p.telemetry_m, p.refined_m]).all() and same_stop in {None, p.same_stop}
+            if p.compared and same_stop in {None, p.same_stop}
         ]
         return float(np.median([b[pointing == "refined"] for b in both])) if both else float("nan")
 
@@ -72,6 +77,17 @@ def agreement_of(refined: Sequence[Layer], telemetry: Sequence[Layer], frame_sto
                     )
                 )
     return Agreement(pairs=tuple(pairs))
+
+
+def finest_agreement(levels: Sequence[Agreement]) -> Agreement:
+    """Of each pair of frames what the finest level says that shows both; levels are the finest first."""
+    found = dict[tuple[int, int], PairAgreement]()
+    for level in levels:
+        for pair in level.pairs:
+            known = found.get(pair.frames)
+            if known is None or (pair.compared and not known.compared):
+                found[pair.frames] = pair
+    return Agreement(pairs=tuple(found[frames] for frames in sorted(found)))
 
 
 def _difference(a: Layer, b: Layer) -> tuple[int, float, float]:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray
 
-__all__ = ["Grid", "Layer", "grid_around"]
+__all__ = ["Grid", "Layer", "grid_around", "least_cell_m"]
 
 _MOST_CELLS = 60_000_000
 """Cells of the largest grid: four bands of it and an orthoimage take 1.2 GB."""
@@ -78,15 +78,20 @@ class Layer:
         return (own[0], own[1]), (theirs[0], theirs[1])
 
 
+def least_cell_m(centres_m: FloatArray, reach_m: float) -> float:
+    """Side of the smallest cell whose grid, within reach of places (n, 2 or 3), fits into memory."""
+    size = np.ptp(centres_m[:, :2], axis=0) + 2 * reach_m
+    return float(np.sqrt(np.prod(size) / _MOST_CELLS))
+
+
 def grid_around(centres_m: FloatArray, reach_m: float, cell_m: float) -> Grid:
     """The grid that holds everything within reach of some places (n, 2 or 3), on whole multiples of a cell.
 
     Raises InputError for a cell so small that the grid would not fit into memory, naming one that fits.
     """
     low, high = centres_m[:, :2].min(axis=0) - reach_m, centres_m[:, :2].max(axis=0) + reach_m
-    size = high - low
-    if np.prod(size / cell_m) > _MOST_CELLS:
-        fits = float(np.sqrt(np.prod(size) / _MOST_CELLS))
+    size, fits = high - low, least_cell_m(centres_m, reach_m)
+    if cell_m < fits:
         digits = 10.0 ** np.floor(np.log10(fits) - 1)
         fits = float(np.ceil(fits / digits) * digits)
         raise InputError(

@@ -1,6 +1,6 @@
 """The surface of a drive: frames matched one by one, drawn on one grid, and fused."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,43 +12,24 @@ from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.base.options import options_of
 from pancam_graph.base.threads import in_order
 from pancam_graph.images import ImageMask, Small, even_out, find_masks
-from pancam_graph.terrain import kernel
-from pancam_graph.terrain._agreement import Agreement, agreement_of
+from pancam_graph.terrain._agreement import Agreement, agreement_of, finest_agreement
 from pancam_graph.terrain._drive import Drive, Pair, stereo_pairs
-from pancam_graph.terrain._grid import Grid, Layer, grid_around
+from pancam_graph.terrain._fill import filled
+from pancam_graph.terrain._fused import Fused, fuse
+from pancam_graph.terrain._grid import Layer
+from pancam_graph.terrain._levels import Level, levels_around
 from pancam_graph.terrain._section import Section, section_of
-from pancam_graph.terrain._surface import Points, ground_spacing_m, surface_of
+from pancam_graph.terrain._surface import Points, surface_of
 from pancam_graph.terrain._terrain_options import TerrainOptions
 
-__all__ = ["Cloud", "Fused", "Terrain", "make_terrain"]
+__all__ = ["Cloud", "Terrain", "make_terrain"]
 
-_CELL_AT_M = 6.0
-"""Distance from the mast at which the cell is as wide as points lie apart."""
 _SHRINK = 4
 """One cell of so many along each axis is looked at for gains of brightness."""
 _BRIGHTEST = 250.0
 """Brightness that the gains are estimated at: that of 8 bits."""
-_ROWS = 64
-"""Rows of a grid that are fused at a time."""
 
 Progress = Callable[[str, int, int], None]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Fused:
-    """The surfaces of some frames as one, on the part of a grid that they cover; NaN where all is hidden."""
-
-    grid: Grid
-    height_m: NDArray[np.float32]
-    sigma_m: NDArray[np.float32]
-    count: NDArray[np.float32]
-    """How many frames see each cell."""
-    disagreement_m: NDArray[np.float32]
-    """Standard deviation between frames; NaN where fewer than two see the cell."""
-    grey: NDArray[np.float32]
-    """Brightness in samples of the pictures."""
-    telemetry_m: NDArray[np.float32]
-    """Height with telemetry's pointing; NaN where that is not known."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,10 +57,12 @@ class Terrain:
 
     def says(self) -> list[str]:
         """What was found, in sentences."""
+        first, last = (level.grid.cell_m for level in (self.drive.levels[0], self.drive.levels[-1]))
+        cells = f"{first:g} to {last:g}" if self.drive.coarser else f"{first:g}"
         sigma_mm = 1e3 * float(np.nanmedian(self.drive.sigma_m))
         lines = [
-            f"{len(self.pairs)} stereo frames of {len(self.stops)} stops, cells of "
-            f"{self.drive.grid.cell_m:g} m, heights known to {sigma_mm:.1f} mm (median of formal sigmas)"
+            f"{len(self.pairs)} stereo frames of {len(self.stops)} stops, cells of {cells} m, heights known "
+            f"to {sigma_mm:.1f} mm near the masts (median of formal sigmas)"
         ]
         before, after = (self.agreement.median_m(p) for p in ("telemetry", "refined"))
         if np.isfinite([before, after]).all():
@@ -95,8 +78,9 @@ class _Seen:
     """What one frame gave: its layer with each pointing, and its points."""
 
     pair: Pair
-    refined: Layer
-    telemetry: Layer | None
+    refined: tuple[Layer | None, ...]
+    """By level of the grid; None where the frame sees nothing of it."""
+    telemetry: tuple[Layer | None, ...]
     points: Points
 
 
@@ -123,9 +107,7 @@ def make_terrain(
     rows = np.array([p.left for p in pairs])
     centres = drive.world_t_camera[rows]
     focal_px = float(np.median([drive.cameras[r].pinhole.fx_px for r in rows]))
-    spacing = float(ground_spacing_m(np.array(_CELL_AT_M), traverse.rig.mast_height_m, focal_px))
-    cell_m = options.cell_m or _round(spacing)
-    grid = grid_around(centres, options.reach_m, cell_m)
+    levels = levels_around(centres, options.reach_m, options.cell_m, traverse.rig.mast_height_m, focal_px)
     masks = find_masks(traverse, progress=progress, cache=cache)
     telemetry = drive.telemetry()
     most = sum(drive.cameras[pair.left].width_px * drive.cameras[pair.left].height_px for pair in pairs)
@@ -139,17 +121,15 @@ def make_terrain(
             surface = surface_of(drive, pair, (left, right), options.reach_m)
         except ImageError as error:
             return f"terrain: frame {traverse.frames[pair.frame].id} is left out: {error}"
-        layer = surface.layer(grid, options.reach_m)
-        return (
-            None
-            if layer is None
-            else _Seen(
-                pair=pair,
-                refined=layer,
-                telemetry=surface.layer(grid, options.reach_m, _to_telemetry(drive, telemetry, pair)),
-                points=surface.points(options.reach_m, every),
-            )
+        to_telemetry = _to_telemetry(drive, telemetry, pair)
+        refined, before = (
+            tuple(surface.layer(level.grid, (level.nearest_m, level.farthest_m), move) for level in levels)
+            for move in (None, to_telemetry)
         )
+        if all(layer is None for layer in refined):
+            return None
+        points = surface.points(options.reach_m, every)
+        return _Seen(pair=pair, refined=refined, telemetry=before, points=points)
 
     def tell(number: int, _: _Seen | str | None) -> None:
         if progress is not None:
@@ -163,55 +143,80 @@ def make_terrain(
             "terrain: expected ground that two eyes see, found none: see the masks of the images"
         )
     frames = _evened(frames)
-    layers, before = [each.refined for each in frames], _telemetry_layers(frames)
     stop_of = [traverse.frames[each.pair.frame].stop for each in frames]
     of_stop = {
         stop.id: [each for each, own in zip(frames, stop_of, strict=True) if own == stop.id]
         for stop in traverse.stops
         if stop.id in stop_of
     }
-    agreement = agreement_of(layers, before, traverse.frame_stop)
+    by_level = [_layers(frames, k) for k in range(len(levels))]
+    agreements = [agreement_of(*layers, traverse.frame_stop) for layers in by_level]
+    finest = next(k for k, (refined, _) in enumerate(by_level) if refined)
     return Terrain(
-        drive=fuse(grid, layers, before),
-        stops={n: fuse(grid, [e.refined for e in of], _telemetry_layers(of)) for n, of in of_stop.items()},
+        drive=_surface(levels, frames, options),
+        stops={name: _surface(levels, of, options) for name, of in of_stop.items()},
         clouds={n: _cloud(of) for n, of in of_stop.items()},
-        agreement=agreement,
-        section=section_of(agreement, layers, before, grid),
+        agreement=finest_agreement(agreements),
+        section=section_of(agreements[finest], *by_level[finest], levels[finest].grid),
         pairs=tuple(e.pair for e in frames),
         warnings=tuple(warnings),
     )
 
 
+def _layers(frames: Sequence[_Seen], level: int) -> tuple[list[Layer], list[Layer]]:
+    """Layers of frames on one level, with the refined pointing and with telemetry's."""
+    return _known(e.refined[level] for e in frames), _known(e.telemetry[level] for e in frames)
+
+
+def _surface(levels: Sequence[Level], frames: Sequence[_Seen], options: TerrainOptions) -> Fused:
+    """The surface of some frames, its coarser levels with it; levels that none of them sees are left out."""
+    surfaces = list[Fused]()
+    for k, level in enumerate(levels):
+        refined, before = _layers(frames, k)
+        if refined:
+            fused = fuse(level.grid, refined, before)
+            surfaces.append(filled(fused, options.fill_m) if options.fill_m else fused)
+    return replace(surfaces[0], coarser=tuple(surfaces[1:]))
+
+
+def _known(layers: Iterable[Layer | None]) -> list[Layer]:
+    return [layer for layer in layers if layer is not None]
+
+
 def _evened(frames: Sequence[_Seen]) -> list[_Seen]:
-    """Frames of equal brightness: a gain of each, from what they show of the same cells."""
-    layers = [each.refined for each in frames]
-    brightest = max(float(np.nanmax(layer.grey)) for layer in layers)
+    """Frames of equal brightness: a gain of each, from what they show of the same cells.
+
+    Cells are of the finest level that every frame sees, else of the coarsest; a frame that does not see that
+    one keeps its brightness.
+    """
+    number = len(frames[0].refined)
+    level = next((k for k in range(number) if all(e.refined[k] is not None for e in frames)), number - 1)
+    shrink = max(1, _SHRINK >> level)
+    layers = {k: layer for k, e in enumerate(frames) if (layer := e.refined[level]) is not None}
+    brightest = max((float(np.nanmax(layer.grey)) for layer in layers.values()), default=0.0)
     scale, small = np.float32(_BRIGHTEST / max(brightest, 1e-6)), []
-    for k, layer in enumerate(layers):
+    for k, layer in layers.items():
         # Every n-th cell of the grid, the same ones of all layers.
-        top, left = -layer.first_row % _SHRINK, -layer.first_column % _SHRINK
-        grey = layer.grey[top::_SHRINK, left::_SHRINK] * scale
+        top, left = -layer.first_row % shrink, -layer.first_column % shrink
+        grey = layer.grey[top::shrink, left::shrink] * scale
         small.append(
             Small(
                 number=k,
-                left_px=(layer.first_column + left) // _SHRINK,
-                top_px=(layer.first_row + top) // _SHRINK,
+                left_px=(layer.first_column + left) // shrink,
+                top_px=(layer.first_row + top) // shrink,
                 grey=np.nan_to_num(grey),
                 chosen=np.isfinite(grey),
                 radius_squared=np.zeros(grey.shape, dtype=np.float32),
             )
         )
-    gain, evened = even_out(small).gain, []
+    gain, evened = even_out(small).gain if small else {}, []
     for k, each in enumerate(frames):
-        own, points = each.refined, each.points
-        factor = np.float32(gain[k])
-        evened.append(
-            replace(
-                each,
-                refined=replace(own, grey=own.grey * factor),
-                points=replace(points, grey=points.grey * factor),
-            )
+        factor = np.float32(gain.get(k, 1.0))
+        refined = tuple(
+            None if layer is None else replace(layer, grey=layer.grey * factor) for layer in each.refined
         )
+        points = replace(each.points, grey=each.points.grey * factor)
+        evened.append(replace(each, refined=refined, points=points))
     return evened
 
 
@@ -231,12 +236,6 @@ def _no_stereo(drive: Drive) -> str:
         f"traverse {traverse.name}: terrain: expected two eyes apart, alike in focal length and looking the "
         "same way, with pictures and poses of one frame, found no such frame"
     )
-
-
-def _round(cell_m: float) -> float:
-    """A cell of one significant digit, 1, 2 or 5."""
-    power = 10.0 ** np.floor(np.log10(cell_m))
-    return float(power * min((1.0, 2.0, 5.0, 10.0), key=lambda k: abs(np.log(k * power / cell_m))))
 
 
 def _usable(mask: ImageMask | None) -> BoolArray | None:
@@ -260,55 +259,3 @@ def _cloud(frames: Sequence[_Seen]) -> Cloud:
     }
     frame = np.repeat([each.pair.frame for each in frames], [len(p.sigma_m) for p in parts])
     return Cloud(points=Points(**joined), frame=frame)
-
-
-def _telemetry_layers(frames: Sequence[_Seen]) -> list[Layer]:
-    return [each.telemetry for each in frames if each.telemetry is not None]
-
-
-def fuse(grid: Grid, layers: Sequence[Layer], telemetry: Sequence[Layer] = ()) -> Fused:
-    """Fuse the layers of some frames on the part of the grid that they cover, and there telemetry's too."""
-    boxes = [layer.box for layer in layers]
-    box = tuple(
-        slice(min(s.start for s in along), max(s.stop for s in along)) for along in zip(*boxes, strict=True)
-    )
-    rows, columns = box
-    height, variance, count, disagreement, grey = _fused_bands(layers, (rows, columns), 5)
-    (before,) = _fused_bands(telemetry, (rows, columns), 1)
-    return Fused(
-        grid=grid.part(rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start),
-        height_m=height,
-        sigma_m=np.sqrt(variance),
-        count=count,
-        disagreement_m=disagreement,
-        grey=grey,
-        telemetry_m=before,
-    )
-
-
-def _fused_bands(layers: Sequence[Layer], box: tuple[slice, slice], bands: int) -> NDArray[np.float32]:
-    """The first bands (bands, rows, columns) of what layers are as one, in some rows and columns of the grid.
-
-    The bands are height, variance, count, disagreement, and grey. What layers have beyond is cut off.
-    """
-    (top, bottom), (left, right) = ((s.start, s.stop) for s in box)
-    fused = np.empty((bands, bottom - top, right - left), dtype=np.float32)
-    for begin in range(top, bottom, _ROWS):
-        end = min(begin + _ROWS, bottom)
-        here = [lay for lay in layers if lay.first_row < end and lay.box[0].stop > begin]
-        stack = np.full((3, max(len(here), 1), end - begin, right - left), np.nan, dtype=np.float32)
-        for k, layer in enumerate(here):
-            r, c = layer.box
-            first, last = max(r.start, begin), min(r.stop, end)
-            west, east = max(c.start, left), min(c.stop, right)
-            if west >= east:
-                continue
-            to = slice(first - begin, last - begin), slice(west - left, east - left)
-            part = slice(first - r.start, last - r.start), slice(west - c.start, east - c.start)
-            for band, values in enumerate((layer.height_m, layer.variance_m2, layer.grey)):
-                stack[(band, k, *to)] = values[part]
-        flat = stack.reshape(3, stack.shape[1], -1)
-        out = np.empty((5, flat.shape[2]), dtype=np.float32)
-        kernel.fuse_cells(flat[0], flat[1], flat[2], out)
-        fused[:, begin - top : end - top] = out[:bands].reshape(bands, end - begin, right - left)
-    return fused

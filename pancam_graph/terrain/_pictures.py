@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from pancam_graph.base.geometry import FloatArray
 from pancam_graph.charts import INK, STEPS, Axis, Picture, framed, write_over
-from pancam_graph.terrain._make import Fused
+from pancam_graph.terrain._fused import Fused
 
 __all__ = ["hillshade", "hillshade_grey", "hillshade_picture", "on_paper", "slope_deg", "slope_picture"]
 

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.data import MapImage, StopPlacement, Surface
-from pancam_graph.terrain._make import Fused
+from pancam_graph.terrain._fused import Fused
+from pancam_graph.terrain._levels import composed
 
 __all__ = ["Registration", "register_stop"]
 
@@ -32,6 +33,8 @@ _SECOND = 0.8
 """Share of the best correlation that another place may reach."""
 _APART_PX = 6
 """Pixels beyond which another place is not the same."""
+_CELLS_PER_PIXEL = 4
+"""Cells of a view along a pixel of the map, at least, where the view has several sizes of them."""
 _HIGH_PASS_PX = 8.0
 """Standard deviation of the blur that brightness is compared above of."""
 _REACH_PX = 10
@@ -108,6 +111,7 @@ def register_stop(
     """
     here = f"stop {stop}: map"
     pixel = float(np.abs(map_image.step_m).mean())
+    view = composed(view, pixel / _CELLS_PER_PIXEL)
     patch = _on_map(view, at_m, pixel)
     seen = np.isfinite(patch)
     if seen.sum() < _LEAST_CELLS:

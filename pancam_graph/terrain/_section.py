@@ -36,7 +36,7 @@ def section_of(
     It runs along the row or the column of the grid in which both frames see most cells with either pointing.
     None where no two frames do.
     """
-    pairs = [p for p in agreement.pairs if np.isfinite(p.telemetry_m) and np.isfinite(p.refined_m)]
+    pairs = [p for p in agreement.pairs if p.compared]
     if not pairs:
         return None
     middle = agreement.median_m("telemetry")

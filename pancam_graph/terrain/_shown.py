@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pancam_graph.charts import Picture, encoded
+from pancam_graph.terrain._fused import Fused
 from pancam_graph.terrain._grid import Grid
-from pancam_graph.terrain._make import Fused
 from pancam_graph.terrain._pictures import hillshade_grey, on_paper
 from pancam_graph.terrain._section import Section
 

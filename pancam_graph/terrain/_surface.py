@@ -85,20 +85,22 @@ class Surface:
         return np.asarray(np.hypot(self.points_m[..., 0] - origin[0], self.points_m[..., 1] - origin[1]))
 
     def layer(
-        self, grid: Grid, reach_m: float, move: tuple[FloatArray, FloatArray] | None = None
+        self, grid: Grid, ring_m: tuple[float, float], move: tuple[FloatArray, FloatArray] | None = None
     ) -> Layer | None:
         """The frame's surface on a grid; None where it sees nothing of it.
 
-        `move` (rotation, translation) is from the refined world to another; points farther than `reach_m`
-        from the camera along the ground are left out.
+        Points whose distances from the camera along the ground lie beyond those of `ring_m` are left out.
+        `move` (rotation, translation) is from the refined world to another.
         """
         _, origin = self.world_T_point
         with np.errstate(invalid="ignore"):
-            points = np.where((self.away_m <= reach_m)[..., None], self.points_m, np.nan)
+            within = (self.away_m >= ring_m[0]) & (self.away_m <= ring_m[1])
+        if not within.any():
+            return None
+        part = _box(within)
+        points = np.where(within[part][..., None], self.points_m[part], np.nan)
         if move is not None:
             points = points @ move[0].T + move[1]
-        if not np.isfinite(points[..., 2]).any():
-            return None
         places = grid.place(points)
         low = np.floor(np.nanmin(places, axis=(0, 1))[:2]).astype(int).clip(0)
         high = np.ceil(np.nanmax(places, axis=(0, 1))[:2]).astype(int) + 1
@@ -107,9 +109,11 @@ class Surface:
             return None
         places[..., :2] -= low
         total = np.zeros((5, high[1] - low[1], high[0] - low[0]), dtype=np.float32)
-        kernel.raster_quads(
-            places, self.height_variance_m2, self.grey, self.disparity_px, _JUMP_PX, _ALIKE, total
+        variance, grey, disparity = (
+            np.ascontiguousarray(band[part])
+            for band in (self.height_variance_m2, self.grey, self.disparity_px)
         )
+        kernel.raster_quads(places, variance, grey, disparity, _JUMP_PX, _ALIKE, total)
         seen = total[0] > 0
         height, grey = (np.where(seen, total[k], np.float32(np.nan)) for k in (1, 2))
         # An error of the pointing moves the whole frame: cells do not average it out.
@@ -161,6 +165,12 @@ class Surface:
             covariance_m2=covariance,
             grey=self.grey.ravel()[found].astype(float),
         )
+
+
+def _box(within: BoolArray) -> tuple[slice, slice]:
+    """Rows and columns around all that is true."""
+    rows, columns = (np.flatnonzero(within.any(axis=k)) for k in (1, 0))
+    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 
 
 def ground_spacing_m(away_m: FloatArray, stands_m: float, focal_px: float) -> FloatArray:

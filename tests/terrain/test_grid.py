@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from pancam_graph.base.errors import InputError
 from pancam_graph.terrain import Agreement, TerrainOptions
 from pancam_graph.terrain._agreement import agreement_of
+from pancam_graph.terrain._fused import fuse
 from pancam_graph.terrain._grid import Grid, Layer, grid_around
-from pancam_graph.terrain._make import fuse
 from pancam_graph.terrain.kernel import raster_quads
 
 GRID = Grid(left_m=0.0, top_m=2.0, cell_m=0.1, rows=20, columns=20)

@@ -162,18 +162,52 @@ def read_ply(path: Path) -> tuple[FloatArray, FloatArray]:
     return np.stack([vertex[k] for k in "xyz"], axis=1), np.asarray(vertex["sigma_m"], dtype=float)
 
 
+def assert_levels_are_one(folder: Path, files: dict[str, str], crs: str) -> None:
+    """What GDAL shows of the joined file: the finer level where it knows heights, else the coarser."""
+    rasterio = pytest.importorskip("rasterio")
+    with (
+        rasterio.open(folder / files["dem_whole"]) as whole,
+        rasterio.open(folder / files["dem"]) as fine,
+        rasterio.open(folder / files["dem_1"]) as coarse,
+    ):
+        assert whole.descriptions == fine.descriptions
+        assert whole.crs == rasterio.crs.CRS.from_wkt(crs)
+        # Of the finer file all that it knows, at its place.
+        east, south = (round(n) for n in ~whole.transform * (fine.transform.c, fine.transform.f))
+        window = rasterio.windows.Window(east, south, fine.width, fine.height)
+        known = np.isfinite(fine.read(1))
+        np.testing.assert_array_equal(whole.read(1, window=window)[known], fine.read(1)[known])
+        everything = whole.read(1)
+        assert np.abs(np.nanmedian(everything)) < 0.005  # the plane
+        row, column = np.argwhere(np.isfinite(coarse.read(1)))[0]
+        x, y = coarse.transform * (column + 0.5, row + 0.5)
+        ((seen, *_),) = whole.sample([(x, y)])
+        assert seen == coarse.read(1)[row, column]
+        filled = (fine.read(3) == 0) & known
+        assert filled.any()
+        assert (fine.read(2)[filled] > 0).all()
+    with rasterio.open(folder / files["orthoimage_whole"]) as picture:
+        assert picture.shape == everything.shape
+        np.testing.assert_array_equal(picture.read(1) > 0, np.isfinite(everything))
+
+
 def test_terrain_of_older_results_replaces_itself_and_nothing_else(
     results: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     results = Path(shutil.copytree(results, results.parent / "of older"))  # others look at the first ones
     before = (results / "solution.json").read_bytes()
-    assert main(["terrain", str(results), "--cell", "0.1", "--reach", "4", "--ply"]) == 0
+    assert main(["terrain", str(results), "--cell", "0.012", "--reach", "5", "--ply", "--fill", "0.1"]) == 0
     said = capsys.readouterr().out
-    assert "3 stereo frames of 1 stops, cells of 0.1 m" in said
+    assert "3 stereo frames of 1 stops, cells of 0.012 to 0.024 m" in said
     assert "surfaces of frames differ by" in said
     assert (results / "solution.json").read_bytes() == before
     index = json.loads((results / "terrain" / "terrain.json").read_text())
-    assert index["cell_m"] == 0.1
+    assert index["cell_m"] == 0.012
+    drive = index["products"][0]
+    assert drive["cells_filled"] > 0
+    (coarser,) = drive["coarser"]
+    assert coarser["cell_m"] == 0.024
+    assert_levels_are_one(results / "terrain", drive["files"], index["crs"]["wkt"])
     assert "Heights along the line" in (results / "terrain" / "terrain.html").read_text()
     xyz, sigma_m = read_ply(results / "terrain" / index["products"][0]["files"]["cloud_ply"])
     assert len(xyz) == index["products"][0]["points"] > 10000
