@@ -12,9 +12,9 @@ from pancam_graph.data import Site
 from pancam_graph.io import read_surface
 from pancam_graph.report import write_report
 from pancam_graph.results import read_solution_json, write_results
+from pancam_graph.terrain._fused import Fused
 from pancam_graph.terrain._geotiff import crs_wkt, write_dem
 from pancam_graph.terrain._grid import Grid
-from pancam_graph.terrain._fused import Fused
 from support.small_drives import HARD, near_part, simulated
 
 SITE = Site(body="Mars", latitude_deg=-4.5895, longitude_deg=137.4417, height_m=-4501.0, north_rad=0.3)
