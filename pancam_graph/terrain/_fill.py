@@ -60,11 +60,11 @@ def filled(fused: Fused, widest_m: float) -> Fused:
     return replace(fused, **bands)
 
 
-def _holes(fused: Fused, widest_m: float) -> tuple[NDArray[np.int32], int]:
+def _holes(fused: Fused, widest_m: float) -> tuple[IntArray, int]:
     """Numbers (rows, columns), from 1 on, of the holes that are small enough, 0 elsewhere; and how many."""
     unseen = ~np.isfinite(fused.height_m)
-    number, label = cv2.connectedComponents(unseen.astype(np.uint8), connectivity=4)
-    label = np.asarray(label, dtype=np.int32)
+    number, found = cv2.connectedComponents(unseen.astype(np.uint8), connectivity=4)
+    label: IntArray = found.astype(np.int64)
     # From the middle of a cell to that of the nearest seen one: half a cell is the seen one's.
     away = cv2.distanceTransform(unseen.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) - 0.5
     deepest = np.zeros(number)
@@ -73,7 +73,7 @@ def _holes(fused: Fused, widest_m: float) -> tuple[NDArray[np.int32], int]:
     kept[0] = False
     for edge in (label[0], label[-1], label[:, 0], label[:, -1]):
         kept[np.unique(edge)] = False
-    renumbered = np.where(kept, np.cumsum(kept), 0).astype(np.int32)
+    renumbered = np.where(kept, np.cumsum(kept), 0)
     return renumbered[label], int(kept.sum())
 
 

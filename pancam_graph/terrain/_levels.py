@@ -96,9 +96,16 @@ def composed(fused: Fused, cell_m: float) -> Fused:
     for level in reversed(levels):
         over = _on(level, grid)
         bands = np.where(np.isfinite(over[0]), over, bands)
-    bands[2] = np.nan_to_num(bands[2])
-    names = ("height_m", "sigma_m", "count", "disagreement_m", "grey", "telemetry_m")
-    return Fused(grid=grid, **dict(zip(names, bands, strict=True)))
+    height, sigma, count, disagreement, grey, telemetry = bands
+    return Fused(
+        grid=grid,
+        height_m=height,
+        sigma_m=sigma,
+        count=np.nan_to_num(count),
+        disagreement_m=disagreement,
+        grey=grey,
+        telemetry_m=telemetry,
+    )
 
 
 def _on(fused: Fused, grid: Grid) -> NDArray[np.float32]:

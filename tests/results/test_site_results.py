@@ -75,8 +75,15 @@ def test_heights_of_terrain_lie_where_they_are_on_the_planet(tmp_path: Path) -> 
     grid = Grid(left_m=12.0, top_m=30.0, cell_m=0.5, rows=40, columns=60)
     x, y = grid.middles()
     height = (0.1 * x + 0.05 * y[:, None]).astype(np.float32)
-    others = ("sigma_m", "count", "disagreement_m", "grey", "telemetry_m")
-    fused = Fused(grid=grid, height_m=height, **dict.fromkeys(others, height))
+    fused = Fused(
+        grid=grid,
+        height_m=height,
+        sigma_m=height,
+        count=height,
+        disagreement_m=height,
+        grey=height,
+        telemetry_m=height,
+    )
     write_dem(fused, tmp_path / "dem.tif", crs_wkt("a drive", SITE), SITE)
     with rasterio.open(tmp_path / "dem.tif") as file:
         east, north = file.xy(7, 11)

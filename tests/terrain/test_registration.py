@@ -57,8 +57,16 @@ def made_up(seed: int, noise: float = 1.0, n: int = 1600) -> tuple[Fused, MapIma
     shown &= scipy.ndimage.gaussian_filter(rng.normal(size=seen.shape), 6.0) > -0.04
     view = np.where(shown, grey, np.nan).astype(np.float32)
     height = np.where(shown, 0.02 * right, np.nan).astype(np.float32)
-    others = dict.fromkeys(("sigma_m", "count", "disagreement_m", "telemetry_m"), height)
-    return Fused(grid=grid, height_m=height, grey=view, **others), chart
+    fused = Fused(
+        grid=grid,
+        height_m=height,
+        sigma_m=height,
+        count=height,
+        disagreement_m=height,
+        grey=view,
+        telemetry_m=height,
+    )
+    return fused, chart
 
 
 def off(found: Registration) -> FloatArray:
