@@ -12,6 +12,8 @@ from pancam_graph.cameras._field import FIELD_COEFFICIENTS as FIELD_COEFFICIENTS
 from pancam_graph.cameras._field import FIELD_PER_COEFFICIENT as FIELD_PER_COEFFICIENT
 from pancam_graph.cameras._field import FIELD_SHAPE as FIELD_SHAPE
 from pancam_graph.cameras._field import Fields as Fields
+from pancam_graph.cameras._field import field_covariance as field_covariance
+from pancam_graph.cameras._field import without_affine as without_affine
 from pancam_graph.cameras._field_camera import FieldCamera as FieldCamera
 from pancam_graph.cameras._field_camera import fields_of as fields_of
 from pancam_graph.cameras._field_camera import with_added_field as with_added_field

@@ -2,25 +2,40 @@
 
 The field is added to where the camera model sees a point: pixel = model + field. It is evaluated at the pixel
 as measured, so it is linear in its coefficients, whatever the cameras are.
+
+A field has no affine part: shifts, stretches and shears of the image are the principal point's, the focal
+lengths', the skew's and the mount's, which have numbers of their own. What is free and what is drawn at
+random has none (`without_affine`, `field_covariance`); coefficients that somebody states may have one.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
 from pancam_graph.base.geometry import FloatArray, IntArray
 
-__all__ = ["FIELD_COEFFICIENTS", "FIELD_PER_COEFFICIENT", "FIELD_SHAPE", "Fields"]
+__all__ = [
+    "FIELD_COEFFICIENTS",
+    "FIELD_PER_COEFFICIENT",
+    "FIELD_SHAPE",
+    "Fields",
+    "field_covariance",
+    "without_affine",
+]
 
 _CELLS = 4
 """Cells of the spline along each side of an image."""
 FIELD_SHAPE = (2, _CELLS + 3, _CELLS + 3)
 """Coefficients of a field: those of u, then those of v, each by rows of the image and along them."""
 FIELD_COEFFICIENTS = int(np.prod(FIELD_SHAPE))
-FIELD_PER_COEFFICIENT = 151 / 315
+FIELD_PER_COEFFICIENT = 0.34899698800160045
 """Standard deviation of a field at a pixel (mean square over the image) whose coefficients are independent
-and have a standard deviation of 1: the mean of the sum of squares of the cubic B-splines along one side."""
+and have a standard deviation of 1, without its affine part."""
+_AFFINE_LEFT = 1e-3
+"""Standard deviation of the affine part of a field that is free, as a share of that of the rest: none, but
+for a covariance that can be inverted."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -101,3 +116,46 @@ def _slopes(t: FloatArray) -> FloatArray:
     """Derivatives (..., 4) of `_cubics` by t."""
     s = 1 - t
     return np.stack([-(s**2), 3 * t**2 - 4 * t, 4 * s - 3 * s**2, t**2], axis=-1) / 2
+
+
+def gram_along_side() -> FloatArray:
+    """(7, 7) mean over a side of the image of the products of each two of its splines."""
+    t, weight = np.polynomial.legendre.leggauss(4)  # exact for products of cubics
+    values = np.zeros((_CELLS, len(t), FIELD_SHAPE[1]))
+    for cell in range(_CELLS):
+        values[cell, :, cell : cell + 4] = _cubics((t + 1) / 2)
+    return np.asarray(np.einsum("k,cki,ckj->ij", weight / 2 / _CELLS, values, values))
+
+
+@cache
+def _affine() -> FloatArray:
+    """(49, 3) orthonormal: what coefficients of one component must be at right angles to.
+
+    The field that they make then has no shift and no slope along either side, in the least squares over the
+    image.
+    """
+    n, gram = FIELD_SHAPE[1], gram_along_side()
+    # Splines whose coefficients are 1, or rise evenly, are 1 and rise evenly.
+    level, rising = gram @ np.ones(n), gram @ (np.arange(n) - (n - 1) / 2)
+    parts = [np.kron(level, level), np.kron(level, rising), np.kron(rising, level)]
+    return np.asarray(np.linalg.qr(np.stack(parts, axis=1))[0])
+
+
+@cache
+def _free() -> FloatArray:
+    """(98, 98) projection of coefficients onto those without an affine part."""
+    one = np.eye(len(_affine())) - _affine() @ _affine().T
+    return np.asarray(np.kron(np.eye(FIELD_SHAPE[0]), one))
+
+
+def without_affine(coefficients_px: FloatArray) -> FloatArray:
+    """Fields (..., *FIELD_SHAPE) without their affine parts: the nearest coefficients that have none."""
+    flat = coefficients_px.reshape(-1, FIELD_COEFFICIENTS) @ _free()
+    return np.asarray(flat.reshape(coefficients_px.shape))
+
+
+def field_covariance(sigma_px: float) -> FloatArray:
+    """Covariance (98, 98) of the coefficients of a field, `sigma_px` at a pixel, without an affine part."""
+    free = _free()
+    unit = free + _AFFINE_LEFT**2 * (np.eye(len(free)) - free)
+    return np.asarray((sigma_px / FIELD_PER_COEFFICIENT) ** 2 * unit)

@@ -121,7 +121,7 @@ _DEFAULT_SIGMA = {
     # Our stated assumption for servos and potentiometers.
     **dict.fromkeys(("pan_scale", "tilt_scale"), 1e-2),
     # The fields of Navcams of Opportunity and Curiosity: docs/accuracy.md.
-    "field_px": 4e-5,
+    "field_px": 2.9e-5,
 }
 """Standard deviations of the priors; entries in pixels as shares of the focal length, factors as shares."""
 

@@ -21,7 +21,12 @@ from pancam_graph.base.geometry import (
     correction_twists,
     pose_arrays,
 )
-from pancam_graph.cameras import CALIBRATION_ENTRIES, FIELD_COEFFICIENTS, FIELD_PER_COEFFICIENT
+from pancam_graph.cameras import (
+    CALIBRATION_ENTRIES,
+    FIELD_COEFFICIENTS,
+    FIELD_PER_COEFFICIENT,
+    field_covariance,
+)
 from pancam_graph.data import (
     ENTRIES,
     Freedom,
@@ -284,8 +289,7 @@ class RigVariables:
             joint = [*self.keys, *self.field_keys]
         elif stop is None:
             for eye, key in enumerate(self.field_keys):
-                sigma = np.full(FIELD_COEFFICIENTS, self._own_sigma("field", "", eye))
-                noise = gtsam.noiseModel.Diagonal.Sigmas(sigma)
+                noise = gtsam.noiseModel.Gaussian.Covariance(self._field_covariance(eye))
                 out.append(gtsam.PriorFactorVector(key, np.zeros(FIELD_COEFFICIENTS), noise))
         out += self.joint_priors(joint, ())
         for v in self.of_stop(stop):
@@ -317,7 +321,20 @@ class RigVariables:
         rig = self.traverse.rig
         eyes = [None if e.camera is None else rig.eye_index(e.camera) for e in entries]
         sigma = [self._own_sigma(e.quantity, e.entry, eye) for e, eye in zip(entries, eyes, strict=True)]
-        return self.sharing.covariance.among(entries, np.array(sigma))
+        matrix = self.sharing.covariance.among(entries, np.array(sigma))
+        named = set(self.sharing.covariance.entries)
+        place = 0
+        for key in keys:
+            own = self._entries_of(key)
+            if kind_of(key) is Kind.FIELD and named.isdisjoint(own):
+                columns = slice(place, place + len(own))
+                matrix[columns, columns] = self._field_covariance(index_of(key))
+            place += len(own)
+        return matrix
+
+    def _field_covariance(self, eye: int) -> FloatArray:
+        """Covariance of the prior of an eye's field of which the rig's covariance says nothing."""
+        return field_covariance(self.sharing.field.sigma_of("field_px", self._focal_px(eye)))
 
     def _own_sigma(self, quantity: str, entry: str, eye: int | None) -> float:
         """Sigma of the prior of an entry by itself, whatever the covariance says."""
@@ -345,13 +362,14 @@ class RigVariables:
 
     def field_sigmas(self, changes_px: FloatArray) -> FloatArray:
         """Size of changes (eyes, ...) of fields' coefficients: RMS (eyes,) in sigmas of their priors."""
-        prior = self.sharing.covariance or RigCovariance(entries=(), matrix=np.zeros((0, 0)))
         out = []
         for key, change_px in zip(self.field_keys, changes_px.reshape(len(changes_px), -1), strict=True):
-            entries = self._entries_of(key)
-            own = np.full(len(entries), self._own_sigma("field", "", index_of(key)))
-            whitened = np.linalg.solve(np.linalg.cholesky(prior.among(entries, own)), change_px)
-            out.append(np.sqrt(np.mean(whitened**2)))
+            prior = (
+                self._field_covariance(index_of(key))
+                if self.sharing.covariance is None
+                else self._joint([key])
+            )
+            out.append(np.sqrt(np.mean(np.linalg.solve(np.linalg.cholesky(prior), change_px) ** 2)))
         return np.array(out)
 
     def prior_information(self) -> FloatArray:

@@ -15,7 +15,7 @@ __all__ = ["RigUncertainty"]
 
 _PRINCIPAL_POINT = 5e-3
 _SKEW = 2e-4
-_FIELD = 5e-5
+_FIELD = 3.6e-5
 """Usual sigmas of principal point, skew and smooth field, as shares of the image's longer side."""
 _NO_SIGMA = ("source", "covariance")
 """Fields that are no standard deviations."""
@@ -59,7 +59,8 @@ class RigUncertainty:
     tilt_scale: float = 0.0
     """Of the tilt, likewise; tilts count from the horizon of the mast."""
     field_px: float = _FIELD * 1024
-    """Of each component of each eye's smooth distortion field, at a pixel: what its lens leaves."""
+    """Of each component of each eye's smooth distortion field, at a pixel: what its lens leaves, without
+    shift, stretch and shear of the image, which are the calibration's."""
     source: str = "our stated assumption for a calibrated rig"
     """Where the numbers come from."""
     covariance: RigCovariance | None = None
@@ -114,8 +115,8 @@ class RigUncertainty:
 
         Principal point: 0.5 % of that side (the principal points of the two Mars 2020 Navcams differ by
         0.35 % of it, that of Opportunity's left Navcam is 1 % off its label). Skew: 0.02 % (image axes of
-        CAHV labels are off a right angle by up to 0.012 degrees). Smooth field: 0.005 %, with which images of
-        Navcams of Opportunity and Curiosity are likeliest (docs/accuracy.md).
+        CAHV labels are off a right angle by up to 0.012 degrees). Smooth field: 0.0036 %, with which images
+        of Navcams of Opportunity and Curiosity are likeliest (docs/accuracy.md).
         """
         return RigUncertainty(
             principal_point_px=_PRINCIPAL_POINT * side_px,

@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 
 from pancam_graph.base.geometry import FloatArray, corrected_poses, rz
-from pancam_graph.cameras import FIELD_PER_COEFFICIENT, FIELD_SHAPE
+from pancam_graph.cameras import FIELD_PER_COEFFICIENT, FIELD_SHAPE, without_affine
 from pancam_graph.rigs import RIG_ENTRIES, Rig, RigEntry
 
 __all__ = ["drawn_encoders", "drawn_fields", "drawn_flex", "drawn_rig", "wrong_rig"]
@@ -91,7 +91,7 @@ def drawn_encoders(rig: Rig, rng: np.random.Generator) -> FloatArray:
 def drawn_fields(rig: Rig, rng: np.random.Generator) -> FloatArray:
     """Coefficients (eyes, *FIELD_SHAPE) of smooth fields, as large as the rig's uncertainty says."""
     sigma = rig.uncertainty.field_px / FIELD_PER_COEFFICIENT
-    return np.asarray(sigma * rng.standard_normal((len(rig.eyes), *FIELD_SHAPE)))
+    return without_affine(sigma * rng.standard_normal((len(rig.eyes), *FIELD_SHAPE)))
 
 
 def _corrected(pose: gtsam.Pose3, correction: FloatArray) -> gtsam.Pose3:

@@ -6,7 +6,16 @@ from scipy.interpolate import BSpline
 
 from pancam_graph.base.errors import CameraError
 from pancam_graph.base.geometry import FloatArray
-from pancam_graph.cameras import FIELD_PER_COEFFICIENT, FIELD_SHAPE, Fields, Pinhole, with_field
+from pancam_graph.cameras import (
+    FIELD_PER_COEFFICIENT,
+    FIELD_SHAPE,
+    Fields,
+    Pinhole,
+    field_covariance,
+    with_field,
+    without_affine,
+)
+from pancam_graph.cameras._field import gram_along_side
 
 SIZE = np.array([[1024.0, 768.0], [640.0, 640.0]])
 
@@ -90,8 +99,31 @@ def test_equal_coefficients_are_a_shift() -> None:
     assert fields.at(np.arange(50) % 2, uv) == pytest.approx(0.3, abs=1e-12)
 
 
-def test_how_large_a_field_of_independent_coefficients_is() -> None:
-    grid = (np.arange(400) + 0.5) / 400 * 1024 - 0.5
+def on_a_grid(coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Pixels (n, 2) all over an image of 1024 x 768, and a field there (n, 2)."""
+    grid = (np.arange(100) + 0.5) / 100 * 1024 - 0.5
     uv = np.stack(np.meshgrid(grid, grid * 0.75), axis=-1).reshape(-1, 2)
-    _, weight = random_fields().basis(np.zeros(len(uv), dtype=int), uv)
-    assert np.sqrt(np.mean(np.sum(weight**2, axis=(1, 2)))) == pytest.approx(FIELD_PER_COEFFICIENT, rel=1e-4)
+    field = Fields(coefficients_px=coefficients[None], row=np.zeros(1, dtype=int), size_px=SIZE[:1])
+    return uv, field.at(np.zeros(len(uv), dtype=int), uv)
+
+
+def test_how_large_a_field_without_an_affine_part_is() -> None:
+    along = gram_along_side()
+    assert along.sum() == pytest.approx(1.0)  # of a field of ones
+    free = field_covariance(FIELD_PER_COEFFICIENT)[:49, :49]
+    assert np.sqrt(np.sum(np.kron(along, along) * free)) == pytest.approx(FIELD_PER_COEFFICIENT, rel=1e-5)
+    fields = without_affine(np.random.default_rng(3).normal(size=(300, *FIELD_SHAPE)))
+    size_px = np.sqrt(np.mean([np.mean(on_a_grid(field)[1] ** 2) for field in fields]))
+    assert size_px == pytest.approx(FIELD_PER_COEFFICIENT, rel=0.02)
+
+
+def test_a_free_field_has_no_shift_no_stretch_and_no_shear() -> None:
+    """In the least squares over the image, for what is drawn and for what a prior allows."""
+    root = np.linalg.cholesky(field_covariance(0.7))
+    for z in np.random.default_rng(4).normal(size=(3, len(root))):
+        allowed = (root @ z).reshape(FIELD_SHAPE)
+        for field, most in ((allowed, 5e-3), (without_affine(allowed), 2e-3)):
+            uv, at = on_a_grid(field)
+            assert np.sqrt(np.mean(at**2)) > 0.4
+            affine = np.column_stack([np.ones(len(uv)), uv / 1024])
+            assert np.abs(np.linalg.lstsq(affine, at, rcond=None)[0]).max() < most

@@ -32,7 +32,7 @@ _SCALE = 5e-3
 """Of pans and tilts over their readings, as a share: servos have one, gears with encoders do not."""
 _ASPECT = 2e-3
 """Of fy / fx, as a share: sensors have square pixels, pictures that were projected anew not always."""
-_PRINCIPAL_POINT, _FIELD = 1e-2, 1e-3
+_PRINCIPAL_POINT, _FIELD = 1e-2, 7e-4
 """Shares of the longer side of a picture: principal point, and what lens and processing distort."""
 _MOST_ARM_M = 100.0
 _CAMERA = "camera"
