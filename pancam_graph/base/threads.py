@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
-from threading import Lock, Thread, local
+from threading import Lock, local
 from typing import Any, TypeVar
 
-from threadpoolctl import ThreadpoolController
+from threadpoolctl import OpenBLASController, ThreadpoolController
 
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.lapack import lapack
@@ -172,14 +172,14 @@ class _Limit:
         with self._lock:
             self._users += 1
             if with_opencv not in self._limits:
-                _apart(lambda: self._limit(with_opencv))
+                _in_control(lambda: self._limit(with_opencv))
 
     def leave(self) -> None:
         """Restore what was before, unless another context needs the limit."""
         with self._lock:
             self._users -= 1
             if self._users == 0:
-                _apart(self._restore)
+                _in_control(self._restore)
 
     def _limit(self, with_opencv: bool) -> None:
         self._limits[with_opencv] = _blas(with_opencv, of_thread=False).limit(limits=1)
@@ -199,18 +199,16 @@ class _Limit:
 _LIMIT = _Limit()
 
 
-def _apart(work: Callable[[], None]) -> None:
-    """Do a little work in a thread that ends with it.
+def _in_control(work: Callable[[], None]) -> None:
+    """Change limits, which any thread may do afterwards.
 
-    threadpoolctl lets only one living thread change limits: whoever sets one would have to restore it.
+    threadpoolctl 3.8 lets only one living thread change them, until that one says that it is done: whoever
+    sets one would have to restore it.
     """
-    thread = Thread(target=work, name="pancam-graph-limit")
-    try:
-        thread.start()
-    except RuntimeError:  # no thread can be started, as at the end of the interpreter
-        work()
-    else:
-        thread.join()
+    work()
+    done = getattr(OpenBLASController, "clear_controlling_thread", None)
+    if done is not None:
+        done()
 
 
 @cache

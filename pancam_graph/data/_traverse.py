@@ -416,6 +416,11 @@ class Traverse:
         """(frames, 2) pan and tilt as telemetry gives them."""
         return np.array([[f.pan_rad, f.tilt_rad] for f in self.frames]).reshape(-1, 2)
 
+    @cached_property
+    def pan_tilt_sigmas_rad(self) -> FloatArray:
+        """(frames, 2) sigmas of pan and tilt; 0: telemetry holds it."""
+        return np.array([frame.sigmas_rad for frame in self.frames]).reshape(-1, 2)
+
     def camera_poses(
         self,
         world_T_mast: Sequence[gtsam.Pose3] | None = None,

@@ -414,17 +414,9 @@ class LandmarkSystem:
         sights = self._sights_at(posture.views)
 
         def work(begin: int, end: int) -> None:
-            which = np.arange(begin, end)
-            kernel.landmark_costs(
-                sights,
-                bearings,
-                which,
-                self.vector[begin:end],
-                self.origin_m,
-                loss.kind,
-                loss.width,
-                cost[begin:end],
-            )
+            which, vector = np.arange(begin, end), self.vector[begin:end]
+            of_loss = loss.kind, loss.width
+            kernel.landmark_costs(sights, bearings, which, vector, self.origin_m, *of_loss, cost[begin:end])
 
         in_parallel(work, len(cost), grain=_COST_GRAIN)
         return float(cost.sum())
@@ -437,7 +429,7 @@ class LandmarkSystem:
         """
         sights = self._sights_at(views)
         seen = self._seen_by(sights, bearings.cameras)
-        counts = np.diff(seen.begin)
+        counts = self._counts
         before, after = self.reduced.cost, self._moved_cost
         # A landmark whose cost hardly changes is placed as well as before, however large its cost.
         touched = np.abs(after - before) > _TOUCHED * before
@@ -492,6 +484,11 @@ class LandmarkSystem:
         """(landmarks + 1,) first observation of each landmark in the order of elimination, and n."""
         return self.sights.occurrence_begin[self.sights.landmark_begin]
 
+    @cached_property
+    def _counts(self) -> IntArray:
+        """(landmarks,) number of observations of each landmark in the order of elimination."""
+        return np.diff(self._begin)
+
     def _take_if_better(
         self, strays: IntArray, vector: FloatArray, sights: kernel.Sights, bearings: kernel.Bearings
     ) -> None:
@@ -521,6 +518,11 @@ class LandmarkSystem:
     def moved_cost(self) -> float:
         """Total cost of landmarks after the last step tried."""
         return float(self._moved_cost.sum())
+
+    @property
+    def linearised_cost(self) -> float:
+        """Total cost of landmarks at the last linearisation."""
+        return float(self.reduced.cost.sum())
 
     @property
     def gain_alone(self) -> float:

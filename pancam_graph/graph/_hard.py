@@ -57,9 +57,8 @@ class HardTemplate(FactorTemplate):
     def __init__(self, traverse: Traverse, sharing: Sharing | None = None) -> None:
         """Of `sharing` all but the radius counts; circles follow from the mounts."""
         super().__init__(traverse, "mast", replace(sharing or Sharing(), radius=FIXED))
-        sigmas = np.array([[f.sigma_pan_rad, f.sigma_tilt_rad] for f in traverse.frames]).reshape(-1, 2)
-        self._sigmas = sigmas
-        free = sigmas.any(axis=1)
+        self._sigmas = traverse.pan_tilt_sigmas_rad
+        free = self._sigmas.any(axis=1)
         self._frames = tuple(
             np.flatnonzero((traverse.frame_stop == stop) & free) for stop in range(len(traverse.stops))
         )

@@ -280,8 +280,7 @@ class FactorTemplate(ABC):
     @cached_property
     def angle_sigmas_rad(self) -> FloatArray:
         """(frames, 2) sigmas of the priors of pan and tilt, widened where heads flex; 0 where held."""
-        stated = np.array([frame.sigmas_rad for frame in self.traverse.frames]).reshape(-1, 2)
-        return self.head_flex.widened(stated)
+        return self.head_flex.widened(self.traverse.pan_tilt_sigmas_rad)
 
     def held_of_stops(self) -> dict[int, IntArray]:
         """`held_columns` of the masts."""

@@ -94,7 +94,7 @@ def make_corrections(solution: Solution) -> Figure:
     traverse = solution.traverse
     correction = 1e3 * wrap_angle(solution.correction_rad)
     sigma = 1e3 * solution.angle_sigma_rad
-    prior = 1e3 * np.array([[f.sigma_pan_rad, f.sigma_tilt_rad] for f in traverse.frames])
+    prior = 1e3 * traverse.pan_tilt_sigmas_rad
     number = np.arange(len(traverse.frames))
     names = [f"{escape(f.id)} at {escape(f.stop)}" for f in traverse.frames]
     traces: list[Json] = []

@@ -67,7 +67,7 @@ def traverse_source(traverse: Traverse) -> Source:
         residual_final_px=unknown,
         sigma_px=np.zeros(0) if traverse.observations is None else traverse.observations.sigma_px,
         stop_covariance=np.array([np.diag(stop.sigmas**2) for stop in traverse.stops]),
-        angle_sigma_rad=np.array([frame.sigmas_rad for frame in traverse.frames]),
+        angle_sigma_rad=traverse.pan_tilt_sigmas_rad,
     )
     return Source(
         solution=solution,

@@ -79,9 +79,10 @@ class JointSystem:
         """Index of the group that is not eliminated"""
         self._held = all_columns(link, self.template.held_by_group)
         self._posture = self.template.posture(self.values)
-        self.cost = system.cost_at(self._posture) + self.factors.error(self.values)
-        """Cost at these values"""
         self._forget()
+        self.panels()  # the first step needs them too
+        self.cost = system.linearised_cost + self.factors.error(self.values)
+        """Cost at these values"""
 
     def _forget(self) -> None:
         self._panels: Panels | None = None

@@ -62,12 +62,14 @@ def most_let_go(traverse: Traverse) -> int:
 
 def parts_let_go(traverse: Traverse, let_go: LetGo, state: State) -> list[Part]:
     """What was let go, at a state; stops whose positions were let go one after the other are one part."""
+    if not let_go:
+        return []
     return [*_angles(traverse, let_go, state), *_stops(traverse, let_go, state)]
 
 
 def _angles(t: Traverse, let_go: LetGo, state: State) -> Iterator[Part]:
     moved = np.asarray(wrap_angle(state.pan_tilt_rad - t.pan_tilt_rad))
-    sigmas = np.array([f.sigmas_rad for f in t.frames]).reshape(-1, 2)
+    sigmas = t.pan_tilt_sigmas_rad
     for k, name in enumerate(("pan", "tilt")):
         for f in np.flatnonzero(let_go.angles_rad[:, k]):
             yield Part(

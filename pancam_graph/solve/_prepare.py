@@ -290,7 +290,7 @@ def _measure(
     SolveError where no track is seen twice.
     """
     *_, valid = lines_of_sight(observations.image, observations.uv_px, views)
-    order = _by_track(observations, len(views.world_t_camera))
+    order = _by_track(observations)
     tracks, valid = observations.track[order], valid[order]
     number: IntArray = np.cumsum(np.diff(tracks, prepend=tracks[:1]) > 0, dtype=np.int64)
     seen = np.bincount(number, valid)
@@ -319,13 +319,29 @@ def _measure(
     return measurements, tracks[measurements.starts], reason, warnings
 
 
-def _by_track(observations: Observations, n_images: int) -> IntArray:
+def _by_track(observations: Observations) -> IntArray:
     """Rows of observations (n,) sorted by track, and by image within a track."""
     track, image = observations.track, observations.image
-    if len(track) and int(track.max()) - int(track.min()) < np.iinfo(np.int64).max // n_images:
-        # One number for both sorts in half the time.
-        return np.argsort((track - track.min()) * n_images + image, kind="stable")
-    return np.lexsort((image, track))
+    if np.all(image[1:] >= image[:-1]):
+        return _ascending(track)
+    by_image = _ascending(image)
+    return by_image[_ascending(track[by_image])]
+
+
+def _ascending(numbers: IntArray) -> IntArray:
+    """Rows (n,) of whole numbers in ascending order, those of equal ones as they come.
+
+    By 16 bits at a time, which NumPy sorts by counting: in a third of the time of comparisons.
+    """
+    if not len(numbers):
+        return np.zeros(0, dtype=np.int64)
+    # Unsigned differences are right whatever the numbers are.
+    above = numbers.astype(np.uint64) - np.uint64(int(numbers.min()) % 2**64)
+    order: IntArray = np.argsort(above.astype(np.uint16), kind="stable")
+    for shift in range(16, int(above.max()).bit_length(), 16):
+        digit = (above[order] >> np.uint64(shift)).astype(np.uint16)
+        order = order[np.argsort(digit, kind="stable")]
+    return order
 
 
 def _extent_m(centre_m: FloatArray, track: IntArray, n_tracks: int) -> FloatArray:

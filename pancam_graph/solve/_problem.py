@@ -208,8 +208,7 @@ def reach_m(problem: Problem, of: BoolArray | None = None) -> FloatArray:
 
 def _resolution(problem: Problem) -> float:
     """Focal length over the typical sigma of a pixel: one over the angle, radians, of that sigma."""
-    focal_px = float(np.median(problem.views.calibration[:, 0, 0]))
-    return focal_px / problem.measurements.typical_sigma_px
+    return problem.views.typical_focal_px / problem.measurements.typical_sigma_px
 
 
 class Solver(ABC):

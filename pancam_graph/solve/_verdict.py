@@ -412,8 +412,7 @@ def _held_against(at: Optimum) -> str:
     The others then agree with each other and not with it, and it may as well be the one that is wrong.
     """
     t, common = at.traverse, at.fitted.problem.template.let_go.common_rad
-    sigmas = np.array([frame.sigmas_rad for frame in t.frames]).reshape(-1, 2)
-    for row, k in np.argwhere((sigmas == 0) & (common[t.frame_stop] > 0)):
+    for row, k in np.argwhere((t.pan_tilt_sigmas_rad == 0) & (common[t.frame_stop] > 0)):
         return f"the {('pan', 'tilt')[k]} of {t.frames[row].id}"
     return ""
 
