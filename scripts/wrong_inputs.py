@@ -397,7 +397,7 @@ GROUPS: dict[str, dict[str, Case]] = {
             fault=_stop_pans(1.0, 0.077), drive={"sigma_stop_rad": 1e-3}
         ),
         "the same, headings known to 0.6 degrees only": Case(fault=_stop_pans(1.0, 0.077)),
-        "a leg off by 5 sigma": Case(fault=_leg(5.0), drive=_SEVERAL),
+        **{f"a leg off by 5 sigma, {n} stops": Case(fault=_leg(5.0), drive={"stops": n}) for n in (2, 4, 6)},
         **{
             f"each of 5 legs off by {k:g} sigma, the same way": Case(fault=_adding_up(k), drive={"stops": 6})
             for k in (0.5, 1.0)

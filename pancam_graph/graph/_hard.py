@@ -77,8 +77,6 @@ class HardTemplate(FactorTemplate):
         """The same variables, with these sensors behind the images."""
         other = copy(self)
         other.sensors = sensors
-        # A point that follows its variable over a long step leaves it by more than they may be apart.
-        other.refines_landmarks = sensors is not None and len(sensors.track) > 0
         for of_linkage in ("linkage", "held_by_group"):
             other.__dict__.pop(of_linkage, None)
         return other

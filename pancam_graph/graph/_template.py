@@ -31,8 +31,6 @@ __all__ = ["FactorTemplate", "diagonal_noise"]
 class FactorTemplate(ABC):
     """Factors and variables of a traverse's rig for one model; landmarks are separate."""
 
-    refines_landmarks = False
-    """Whether landmarks are optimised with cameras held after every step, besides back substitution."""
     sensors: Sensors | None = None
     """Sensors behind the images in `linkage` and `posture`; None: there are none."""
 
@@ -49,6 +47,16 @@ class FactorTemplate(ABC):
         other = copy(self)
         other.let_go = let_go
         return other
+
+    @property
+    def refines_landmarks(self) -> bool:
+        """Whether landmarks are optimised with cameras held after every step, besides back substitution.
+
+        Where telemetry holds no scale, steps are long for points that follow them to first order alone; and a
+        tied point that follows its variable over a long step leaves it by more than they may be apart.
+        """
+        tied = self.sensors is not None and len(self.sensors.track) > 0
+        return tied or bool(self.let_go.stops[:, 3:].any())
 
     @property
     @abstractmethod

@@ -1,4 +1,4 @@
-"""Errors of telemetry that grow along a drive: one wrong scale of all lengths, or errors that add up.
+"""Errors of telemetry that grow along a drive: a wrong scale, a wrong direction, or errors that add up.
 
 Single legs may each be within their sigmas where all are off in the same way. Let a = A v be the change of
 all whitened residuals r of telemetry and of constraints on stops (Jacobian A) where stops move along v. An
@@ -21,14 +21,14 @@ __all__ = ["GrowingErrors", "growing_errors"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GrowingErrors:
-    """What a solution says of a wrong scale, and of drifts along the world's x, y and z, in this order."""
+    """What a solution says of a scale, of a turn, and of drifts along the world's x, y, z, in this order."""
 
     pull: FloatArray
-    """(4,) a'r"""
+    """(5,) a'r"""
     shown: FloatArray
-    """(4, 4) covariance of `pull` if all errors are as stated."""
+    """(5, 5) covariance of `pull` if all errors are as stated."""
     told: FloatArray
-    """(4,) what `shown` would have on its diagonal if images told all, a'a."""
+    """(5,) what `shown` would have on its diagonal if images told all, a'a."""
     least: float
     """Share of an error that shows, below which images say nothing of it."""
 
@@ -38,10 +38,18 @@ class GrowingErrors:
 
         A standard normal number if all is as stated. None where images say nothing of it.
         """
-        shown = float(self.shown[0, 0])
-        if shown <= self.least * self.told[0]:
+        return self._single(0)
+
+    @property
+    def turn(self) -> tuple[float, float] | None:
+        """By how much the drive came out turned, radians anticlockwise from above; else as `scale`."""
+        return self._single(1)
+
+    def _single(self, k: int) -> tuple[float, float] | None:
+        pull, shown = float(self.pull[k]), float(self.shown[k, k])
+        if shown <= self.least * self.told[k]:
             return None
-        return float(self.pull[0]) / shown, abs(float(self.pull[0])) / float(np.sqrt(shown))
+        return pull / shown, abs(pull) / float(np.sqrt(shown))
 
     @property
     def drift(self) -> tuple[FloatArray, float, int] | None:
@@ -49,30 +57,29 @@ class GrowingErrors:
 
         The test is chi-square of so many degrees of freedom, the last number. None where images say nothing.
         """
-        unit = np.sqrt(self.told[1:])
+        unit = np.sqrt(self.told[2:])
         if not unit.all():
             return None
-        values, vectors = np.linalg.eigh(self.shown[1:, 1:] / np.outer(unit, unit))
+        values, vectors = np.linalg.eigh(self.shown[2:, 2:] / np.outer(unit, unit))
         shows = values > self.least
         if not shows.any():
             return None
-        along = vectors[:, shows].T @ (self.pull[1:] / unit)
+        along = vectors[:, shows].T @ (self.pull[2:] / unit)
         size = vectors[:, shows] @ (along / values[shows]) / unit
         return size, float(np.sum(along**2 / values[shows])), int(shows.sum())
 
     @property
-    def square(self) -> float:
-        """Square of the larger of both tests, less what the further degrees of freedom add by chance."""
-        scale, drift = self.scale, self.drift
-        of_scale = 0.0 if scale is None else scale[1] ** 2
-        return of_scale if drift is None else max(of_scale, drift[1] - drift[2] + 1)
+    def square_of_images(self) -> float:
+        """Square of the larger test of the errors that images have too: a scale (baseline), a turn (pans)."""
+        return max(0.0 if found is None else found[1] ** 2 for found in (self.scale, self.turn))
 
 
 def growing_errors(problem: Problem, root: Root, least: float) -> GrowingErrors | None:
     """Those of a problem at its optimum; `root` is that of its system, `least` as in `GrowingErrors`.
 
-    Stops are scaled from the mean of those whose place telemetry holds, or of all where it holds none; a
-    drift grows from the first stop on, in the order of the stops. None where all places are held.
+    Stops are scaled from, and turned about, the mean of those whose place telemetry holds, or of all where it
+    holds none; a drift grows from the first stop on, in the order of the stops. None where all places are
+    held.
     """
     template, values = problem.template, problem.values
     stops, link = template.traverse.stops, template.linkage
@@ -83,15 +90,17 @@ def growing_errors(problem: Problem, root: Root, least: float) -> GrowingErrors 
     place = np.array([pose.translation() for pose in masts])
     from_centre = place - place[free if free.all() else ~free].mean(axis=0)
     driven = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(place, axis=0), axis=1))])
-    moves = np.concatenate([from_centre[:, :, None], driven[:, None, None] * np.eye(3)], axis=2)
-    # By the key of a mast, how its tangent moves (6, 4).
+    aside = np.cross([0.0, 0.0, 1.0], from_centre)
+    drifts = driven[:, None, None] * np.eye(3)
+    moves = np.concatenate([from_centre[:, :, None], aside[:, :, None], drifts], axis=2)
+    # By the key of a mast, how its tangent moves (6, 5).
     along = {
-        key_of(Kind.MAST, s): np.vstack([np.zeros((3, 4)), masts[s].rotation().matrix().T @ moves[s]])
+        key_of(Kind.MAST, s): np.vstack([np.zeros((3, 5)), masts[s].rotation().matrix().T @ moves[s]])
         for s in np.flatnonzero(free).tolist()
     }
     begin = np.concatenate([[0], np.cumsum(root.structure.dim)])
-    nothing = np.zeros((1, 4))
-    pull, inner, columns = np.zeros(4), np.zeros((4, 4)), np.zeros((int(begin[-1]), 4))
+    nothing = np.zeros((1, 5))
+    pull, inner, columns = np.zeros(5), np.zeros((5, 5)), np.zeros((int(begin[-1]), 5))
     for factor in (*problem.factors.telemetry, *problem.factors.seated):
         keys = list(factor.keys())
         if along.keys().isdisjoint(keys):

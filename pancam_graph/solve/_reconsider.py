@@ -29,6 +29,11 @@ _AS_LIKELY = 15.0
 """Another error explains the corrections as well if its squared test is not less by more than this ..."""
 _ALIKE = 0.5
 """... and if its correlation with the largest is at least this."""
+_CLEARLY = 10.0
+"""Difference of squared tests by which a wrong leg must explain more than a wrong scale, or a turn, does. If
+the scale is wrong by whatever size, the leg does so in less than one of a thousand drives: the difference is
+normal, with the mean -d^2 and the sigma 2 d, and exceeds c with the chance of (d^2 + c) / (2 d) sigmas, which
+are the root of c or more."""
 _SETTLED_BY = 1e-3
 """Factor on the relative decrease at which iterations end."""
 _OF_FRAME = 5.0
@@ -43,8 +48,8 @@ def reconsidered(judged: Judged) -> Judged:
     of a stop's heading and one of all its pans look alike. What is left is then judged and solved again. A
     constraint that is further off than any telemetry is let go alone; where another error explains the
     corrections as well, nothing is.
-    Where more than a few parts of telemetry would have to go, or where another rig, another scale of all
-    lengths or a drift would explain more, none is: the verdict says why.
+    Where more than a few parts of telemetry would have to go, or where another rig explains more, or another
+    scale of all lengths or a turn of the drive about as much, none is: the verdict says why.
     """
     now, traverse = judged, judged.fitted.screened.prepared.traverse
     most, n_constraints = most_let_go(traverse), len(traverse.constraints)
@@ -110,16 +115,16 @@ def _is_of_rig(error: Correction, judged: Judged) -> bool:
 
 
 def _grows(error: Correction, suspected: Suspected) -> bool:
-    """Whether an error that grows along the drive explains more than one of a stop's place, or of a leg.
+    """Whether images may be wrong in place of a stop's telemetry, or of a leg's: by their scale, or turned.
 
-    In all three directions, less what two more directions add by chance.
+    They are not if the error explains clearly more, in all three directions less what two more add by chance.
     """
     is_leg = error.entry.startswith("leg")
     if suspected.growing is None or not (is_leg or error.entry in _PLACES):
         return False
     names = {f"leg {name}" if is_leg else name for name in _PLACES}
     alike = [c.sigmas**2 for c in suspected.stops if c.stop == error.stop and c.entry in names]
-    return sum(alike) - len(alike) + 1 < suspected.growing.square
+    return sum(alike) - len(alike) + 1 < suspected.growing.square_of_images + _CLEARLY
 
 
 def _fitted_again(fitted: Fitted, let_go: LetGo) -> Fitted:

@@ -97,7 +97,8 @@ class Optimum:
 def verdict(at: Optimum) -> Verdict:
     """All tests of a fit."""
     residuals = Residuals.of(at.fitted.problem)
-    tests = [_converged(at), _finite(residuals), _cost(at), _optimum(at), *shares_in_use(at.fitted.problem)]
+    tests = [_converged(at), _finite(residuals), _cost(at), _optimum(at)]
+    tests += shares_in_use(at.fitted.problem, at.fitted.screened.by_chance)
     if residuals.n_observations:
         tests += _noise(at, residuals)
     tests += [
@@ -336,7 +337,7 @@ def _telemetry(at: Optimum) -> Iterator[VerdictTest]:
 
 
 def _growing(found: GrowingErrors) -> Iterator[VerdictTest]:
-    """Errors of telemetry that grow along the drive: one scale of all lengths, and drifts."""
+    """Errors of telemetry that grow along the drive: one scale of all lengths, a turn, and drifts."""
     if found.scale is not None:
         share, sigmas = found.scale
         says = (
@@ -350,6 +351,20 @@ def _growing(found: GrowingErrors) -> Iterator[VerdictTest]:
             says,
             f"{says}: the distance of the eyes (baseline) or odometry is wrong, and images cannot say which; "
             "check both, or state larger sigmas (rig: uncertainty, mount_m; sigma_translation_m)",
+        )
+    if found.turn is not None:
+        turn, sigmas = found.turn
+        says = (
+            f"the drive came out turned by {np.degrees(turn):+.3g} degrees against telemetry, {sigmas:.3g} "
+            "times what sigmas allow"
+        )
+        yield VerdictTest.of(
+            "turn",
+            sigmas,
+            two_sided_limit(1, CHANCE),
+            says,
+            f"{says}: pans are off in common, or odometry or the first heading is wrong, and images cannot "
+            "say which; check these, or state larger sigmas (sigma_pan_rad, sigma_translation_m)",
         )
     if found.drift is not None:
         per_m, square, freedom = found.drift
@@ -397,13 +412,23 @@ def _let_go(at: Optimum) -> VerdictTest:
 
 
 def _no_place_left(at: Optimum) -> bool:
-    """Whether the places of all stops that telemetry does not hold were let go.
+    """Whether the places of all stops that telemetry does not hold were let go, and not by one common shift.
 
-    Odometry may then as well be right, and what the places were compared with is wrong.
+    Odometry may then as well be right, and what the places were compared with is wrong. Where all went along
+    with the first leg, their places among each other still speak for the rest.
     """
-    free = np.array([s.sigma_translation_m > 0 for s in at.traverse.stops])
-    went = np.any(at.fitted.problem.template.let_go.stops[free, 3:], axis=1)
-    return bool(free.any() and np.all(went))
+    stops = at.traverse.stops
+    free = np.flatnonzero([s.sigma_translation_m > 0 for s in stops])
+    if not len(free) or not at.fitted.problem.template.let_go.stops[free, 3:].any(axis=1).all():
+        return False
+    if len(free) < 2 or len(free) == len(stops):
+        return True
+    found = at.fitted.problem.template.masts(at.fitted.problem.values)
+    shift = np.array([found[s].translation() - stops[s].world_T_mast.translation() for s in free])
+    weight = np.array([stops[s].sigma_translation_m ** -2.0 for s in free])
+    apart = shift - weight @ shift / weight.sum()
+    freedom = 3 * (len(free) - 1)
+    return bool(np.sqrt(weight @ (apart**2).sum(axis=1) / freedom) > rms_limit(freedom, CHANCE))
 
 
 def _held_against(at: Optimum) -> str:
