@@ -5,7 +5,15 @@ The text of an error says where (file and entry), what was expected and what was
 
 from pancam_graph.base.text import shortened, visible
 
-__all__ = ["CameraError", "GeometryError", "ImageError", "InputError", "PancamGraphError", "SolveError"]
+__all__ = [
+    "CameraError",
+    "ClusterError",
+    "GeometryError",
+    "ImageError",
+    "InputError",
+    "PancamGraphError",
+    "SolveError",
+]
 
 
 class PancamGraphError(Exception):
@@ -38,3 +46,7 @@ class ImageError(InputError):
 
 class SolveError(PancamGraphError):
     """A problem that cannot be posed or factorised (no usable observations, a free direction)."""
+
+
+class ClusterError(PancamGraphError):
+    """Workers or a scheduler that cannot do the work, or do it no more. What they have found is kept."""

@@ -15,7 +15,7 @@ from threadpoolctl import OpenBLASController, ThreadpoolController
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.lapack import lapack
 
-__all__ = ["blas_on_one_thread", "each", "in_order", "in_parallel", "n_workers"]
+__all__ = ["blas_on_one_thread", "each", "in_order", "in_parallel", "in_this_thread", "n_workers"]
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -47,6 +47,19 @@ def n_workers() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+@contextmanager
+def in_this_thread() -> Iterator[None]:
+    """A context in which `in_parallel` calls its function in the caller's thread alone.
+
+    It is for work that others do at the same time, as many as there are cores.
+    """
+    was_busy, _THREAD.is_busy = _THREAD.is_busy, True
+    try:
+        yield
+    finally:
+        _THREAD.is_busy = was_busy
 
 
 def in_parallel(function: Callable[[int, int], None], n: int, *, grain: int) -> None:

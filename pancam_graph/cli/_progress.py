@@ -35,6 +35,8 @@ class Event:
     """How many steps it has; None where that is not known."""
     seconds_left: float | None = None
     """How long the rest of the stage takes, if its steps take as long as those before; None: not known."""
+    per_second: float | None = None
+    """Steps in a second since the stage began; None: not known."""
     detail: str = ""
     """What else there is to say."""
 
@@ -45,6 +47,13 @@ class Event:
         if self.done is not None and self.total is not None:
             counted = f" {self.done} of {self.total}"
         return f"{self.stage}{counted}{', ' if self.detail else ''}{self.detail}"
+
+    @property
+    def pace(self) -> str:
+        """How quickly it goes and how long that takes, as the end of a sentence; empty where not known."""
+        quick = "" if self.per_second is None else f", {self.per_second:.2g} a second"
+        left = "" if self.seconds_left is None else f", about {_duration(self.seconds_left)} left"
+        return f"{quick}{left}"
 
 
 class Display(Protocol):
@@ -92,7 +101,7 @@ class TerminalLine:
         from pancam_graph.cli._terminal import words
 
         if self._status is not None:
-            self._status.update(words(event.text))
+            self._status.update(words(f"{event.text}{event.pace}"))
 
     def end(self) -> None:
         """Take the line away."""
@@ -131,13 +140,12 @@ class PlainLines:
         while not self._over.wait(self._period_s):
             event = self._latest
             if event is not None:
-                left = "" if event.seconds_left is None else f", about {_duration(event.seconds_left)} left"
                 since = _duration(time.monotonic() - self._begun_s)
-                write("stderr", f"{event.text} ({since} since the beginning{left})")
+                write("stderr", f"{event.text} ({since} since the beginning{event.pace})")
 
 
 class JsonLines:
-    """Every event as a line of JSON with the keys stage, done, total, seconds_left; null: not known."""
+    """Every event as a line of JSON: stage, done, total, seconds_left, per_second; null: not known."""
 
     def begin(self) -> None:
         """Do nothing."""
@@ -145,7 +153,14 @@ class JsonLines:
     def show(self, event: Event) -> None:
         """Write the event."""
         left = None if event.seconds_left is None else round(event.seconds_left, 1)
-        entry = {"stage": event.stage, "done": event.done, "total": event.total, "seconds_left": left}
+        pace = None if event.per_second is None else float(f"{event.per_second:.3g}")
+        entry = {
+            "stage": event.stage,
+            "done": event.done,
+            "total": event.total,
+            "seconds_left": left,
+            "per_second": pace,
+        }
         write("stderr", json.dumps(entry))
 
     def end(self) -> None:
@@ -187,8 +202,7 @@ class Progress:
 
     def counted(self, what: str, done: int, total: int) -> None:
         """So many of a stage's steps are done."""
-        left = self._seconds_left(what, done, total)
-        self._display.show(Event(stage=what, done=done, total=total, seconds_left=left))
+        self._display.show(self._timed(what, done, total))
 
     def iteration(self, iteration: "Iteration") -> None:
         """The solve has made a step."""
@@ -198,8 +212,7 @@ class Progress:
     def stop(self, update: "Update", total: int | None = None) -> None:
         """A stop was added: an event, and a line on standard output, which a terminal or a file shows."""
         self._stops += 1
-        left = None if total is None else self._seconds_left("adding stops", self._stops, total)
-        self._display.show(Event(stage="adding stops", done=self._stops, total=total, seconds_left=left))
+        self._display.show(self._timed("adding stops", self._stops, total))
         if self._quiet:
             return
         closed = "".join(f", closes a loop to {c.other}" for c in update.closures if c.accepted)
@@ -209,15 +222,18 @@ class Progress:
             f"{update.blocks} blocks, {update.relinearised} relinearised, {update.seconds:.3f} s{closed}",
         )
 
-    def _seconds_left(self, stage: str, done: int, total: int) -> float | None:
-        """Time for the steps to come, at the pace since the first event of the stage."""
+    def _timed(self, stage: str, done: int, total: int | None) -> Event:
+        """An event with the pace since the first event of the stage, and the time for the steps to come."""
         now_s = time.monotonic()
         if stage != self._stage:
             self._stage, self._first = stage, (done, now_s)
         first, begun_s = self._first
-        if done >= total:
-            return 0.0
-        return (now_s - begun_s) / (done - first) * (total - done) if done > first else None
+        known = done > first and now_s > begun_s
+        pace = (done - first) / (now_s - begun_s) if known else None
+        left = None if total is None or pace is None else (total - done) / pace
+        if total is not None and done >= total:
+            left = 0.0
+        return Event(stage=stage, done=done, total=total, seconds_left=left, per_second=pace)
 
 
 def _duration(seconds: float) -> str:

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterable
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -153,6 +154,13 @@ def _add_options(parser: CommandParser) -> None:
         help="write heights, an orthoimage, a mesh and a cloud of the ground that stereo frames see; needs "
         "the extra: pip install 'pancam-graph[terrain]'",
     )
+    add(
+        "--cluster",
+        metavar="ADDRESS",
+        help="share the work on pictures among workers of a Dask cluster: tcp://HOST:PORT of its scheduler, "
+        "local for a process a core of this machine, local:N for N; workers need FOLDER and OUT on a file "
+        "system in common; needs the extra: pip install 'pancam-graph[cluster]'",
+    )
     add("--csv", action=Flag, help="write residuals.csv too, a line for each observation")
     add(
         "--plots",
@@ -197,7 +205,12 @@ def _work(call: Invocation) -> int:
         from pancam_graph.results import check_plots
 
         check_plots(arguments.plots)
-    with progress.shown(f"reading {arguments.folder}"), resumable(arguments.out):
+    with progress.shown(f"reading {arguments.folder}"), resumable(arguments.out), ExitStack() as clients:
+        client = None
+        if arguments.cluster is not None:
+            from pancam_graph.cluster import connected
+
+            client = clients.enter_context(connected(arguments.cluster))
         traverse = read_input(arguments.folder)
         if arguments.use_rig is not None:
             traverse = use_rig(traverse, arguments.use_rig)
@@ -211,8 +224,9 @@ def _work(call: Invocation) -> int:
             from pancam_graph.images import cache_folder
 
             traverse = find_observations(
-                traverse, progress=progress.counted, cache=cache_folder(arguments.out)
+                traverse, progress=progress.counted, cache=cache_folder(arguments.out), client=client
             )
+        clients.close()  # the adjustment has all cores of this machine
         read_s = time.perf_counter() - begin
         if must_compile():
             progress.say(COMPILING)

@@ -11,6 +11,7 @@ from importlib.metadata import PackageNotFoundError, version
 from io import BytesIO
 from pathlib import Path
 from shutil import rmtree
+from socket import gethostname
 from tempfile import mkdtemp
 from threading import Lock
 from typing import Any
@@ -21,14 +22,14 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from pancam_graph.base.errors import InputError
+from pancam_graph.base.errors import ClusterError, InputError
 from pancam_graph.base.regular_files import is_missing
 from pancam_graph.base.whole_files import whole_file
 from pancam_graph.images._cache_folder import begin_cache
 from pancam_graph.images._held import Held
 from pancam_graph.io import NpzFile, prefixed
 
-__all__ = ["Cache", "digest"]
+__all__ = ["Cache", "digest", "libraries"]
 
 _LOG = logging.getLogger(__name__)
 _SUFFIX = ".npz"
@@ -50,9 +51,13 @@ class Cache:
     goes into a temporary one, which is deleted with this object.
     """
 
-    def __init__(self, folder: Path | None, most_bytes: int = _HELD_BYTES) -> None:
-        """Keep files in `folder`, which is made when the first is written; None: there is no such folder."""
+    def __init__(self, folder: Path | None, most_bytes: int = _HELD_BYTES, must_keep: bool = False) -> None:
+        """Keep files in `folder`, which is made when the first is written; None: there is no such folder.
+
+        Where a file cannot be written, a warning is logged; with `must_keep`, `recall` raises ClusterError.
+        """
         self._folder = folder
+        self._must_keep = must_keep
         self._used: set[Path] = set()
         self._begun = False
         self._beginning = Lock()
@@ -75,9 +80,10 @@ class Cache:
 
         return dict(self._held.get(f"{kind} {key}", find_or_make))
 
-    def __reduce__(self) -> tuple[type["Cache"], tuple[Path | None]]:
-        """Another process gets the folder, and nothing of what memory holds."""
-        return Cache, (self._folder,)
+    def __reduce__(self) -> tuple[type["Cache"], tuple[Path | None, int, bool]]:
+        """Another process gets the folder, in which it must keep all, and nothing of what memory holds."""
+        folder = None if self._folder is None else self._folder.resolve()
+        return Cache, (folder, _HELD_BYTES, True)
 
     def _found(self, kind: str, key: str) -> Arrays | None:
         """The arrays of a file in the folder or the temporary one, if there are any."""
@@ -99,8 +105,13 @@ class Cache:
                         begin_cache(self._folder)
                         self._begun = True
                 _write(path, key, arrays)
-            except OSError as error:  # without a cache the step works too
-                _LOG.warning("%s: not kept: %s", path, error)
+            except OSError as error:
+                if self._must_keep:
+                    raise ClusterError(
+                        f"{path}: expected room for what a worker on {gethostname()} has found, found none: "
+                        f"{error.strerror}"
+                    ) from error
+                _LOG.warning("%s: not kept: %s", path, error)  # the step works without a cache too
         return arrays
 
     def _put_aside(self, name: str, arrays: Arrays) -> None:
@@ -171,7 +182,7 @@ def digest(*parts: Any) -> str:
 
     Takes arrays, numbers, text, None, poses, dataclasses, and lists and dictionaries of them; all bits count.
     """
-    running = hashlib.sha256(_machine().encode())
+    running = hashlib.sha256(json.dumps(libraries()).encode())
     _feed(running, parts)
     return running.hexdigest()
 
@@ -209,10 +220,10 @@ def _feed(running: Any, value: Any) -> None:
 
 
 @cache
-def _machine() -> str:
+def libraries() -> Mapping[str, str]:
     """The versions of the libraries that steps run through, and what the processor can do."""
     versions = {name: _version(name) for name in ("gtsam", "numba", "numpy", "scipy")}
-    return json.dumps([versions, cv2.__version__, cv2.getCPUFeaturesLine()])
+    return {**versions, "OpenCV": cv2.__version__, "features of the processor": cv2.getCPUFeaturesLine()}
 
 
 def _version(name: str) -> str:

@@ -4,7 +4,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import overload
+from typing import Any, overload
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from pancam_graph.images._cache import Cache
 from pancam_graph.images._front_end_options import FrontEndOptions
 from pancam_graph.images._masks import ImageMask, Reason
 from pancam_graph.images._match_pair import PairMatches
+from pancam_graph.images._on_workers import Helpers, helped
 from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._read import image_name, listed
 from pancam_graph.images._steps import Progress, Steps
@@ -44,6 +45,7 @@ def find_observations(
     *,
     progress: Progress | None = None,
     cache: Path | None = None,
+    client: Any = None,
 ) -> Traverse:
     """Find the same terrain points in the image files of a traverse.
 
@@ -62,16 +64,31 @@ def find_observations(
     folder in which each part is kept: a part whose inputs have not changed since an earlier run, even an
     interrupted one, is taken from there. The result is the same to the last bit.
 
+    `client`, a distributed.Client, shares the work among the workers of a Dask cluster, which need the files
+    of the traverse and the folder `cache` at the same paths. The result is the same to the last bit, whatever
+    becomes of them.
+
     Returns the traverse with observations of origin "images", in place of any that it had, and with
     warnings for images without observations, or whose file cannot be used (missing, truncated, of another
     size than its camera), over-exposed or there twice, and for pairs of images that
     overlap, and of stops that are near, but give no matches.
 
-    Raises InputError if no image has a file or nothing is found, ImageError naming the file if none can be
-    used, and for a mask that cannot.
+    Raises InputError if no image has a file or nothing is found, and for a client without a cache, ImageError
+    naming the file if none can be used, and for a mask that cannot; ClusterError for workers that cannot do
+    the work, and where the scheduler or all workers are gone.
     """
     options = options_of(FrontEndOptions, options, "find_observations")
     work = Steps(traverse, options, progress, Cache(cache))
+    with helped(client, work, cache) as helpers:
+        return _found(work, helpers)
+
+
+def _found(work: Steps, helpers: Helpers | None) -> Traverse:
+    """The traverse with observations; what helpers do before is not done here."""
+    traverse, options = work.traverse, work.options
+    if helpers is not None:
+        work.plan()
+        helpers.within_stops(work)
     _make_masks(work)
     work.plan()
     warnings = [*work.pictures.warnings, *_over_exposed(work)]
@@ -102,7 +119,7 @@ def find_observations(
     observations, feature = _within_stops(work)
     stops: list[StopMatching] = []
     if work.stop_pairs:
-        observations, stops = _between_stops(work, observations, feature)
+        observations, stops = _between_stops(work, helpers, observations, feature)
         untied = {(a, b) for a, b in work.stop_pairs} - {tuple(sorted((s.a, s.b))) for s in stops if s.kept}
         warnings += [
             f"stops {traverse.stops[a].id} and {traverse.stops[b].id}: no ties, although they may see the "
@@ -211,7 +228,7 @@ def _within_stops(work: Steps) -> tuple[Observations, IntArray]:
 
 
 def _between_stops(
-    work: Steps, observations: Observations, feature: IntArray
+    work: Steps, helpers: Helpers | None, observations: Observations, feature: IntArray
 ) -> tuple[Observations, list[StopMatching]]:
     """Observations within stops with ties between stops added, and a report of each pair of stops.
 
@@ -220,6 +237,8 @@ def _between_stops(
     """
     placed = work.placed(observations, feature)
     directed = [d for a, b in work.stop_pairs for d in ((a, b), (b, a))]
+    if helpers is not None:
+        helpers.between_stops(work, observations, feature, directed)
 
     def tell(k: int, tied: StopTies) -> None:
         report = tied.report

@@ -14,6 +14,7 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -112,9 +113,14 @@ class Steps:
         self.wanted, self.groups, self._spline, self._usable  # noqa: B018  made when asked for
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but the caller's progress and what memory holds."""
+        """All but the caller's progress and what memory holds, with paths that hold in any folder."""
         left = ("_files", "_spline", "_usable")
-        return {**{k: v for k, v in vars(self).items() if k not in left}, "progress": None}
+        state = {**{k: v for k, v in vars(self).items() if k not in left}, "progress": None}
+        state["traverse"] = replace(self.traverse, folder=(self.traverse.folder or Path()).resolve())
+        if "pictures" in state:
+            masks = tuple(None if path is None else path.resolve() for path in self.pictures.masks)
+            state["pictures"] = replace(self.pictures, masks=masks)
+        return state
 
     @cached_property
     def pictures(self) -> Pictures:

@@ -385,8 +385,9 @@ def test_progress_as_json(tmp_path: Path, capsys: Captured) -> None:
     out, err = capsys.readouterr()
     assert "converged" in out
     events = [json.loads(line) for line in err.splitlines()]
-    assert all(list(event) == ["stage", "done", "total", "seconds_left"] for event in events)
-    assert events[0] == {"stage": f"reading {made}", "done": None, "total": None, "seconds_left": None}
+    keys = ["stage", "done", "total", "seconds_left", "per_second"]
+    assert all(list(event) == keys for event in events)
+    assert events[0] == {**dict.fromkeys(keys), "stage": f"reading {made}"}
     stops = [e for e in events if e["stage"] == "adding stops"]
     assert [(e["done"], e["total"]) for e in stops] == [(1, 3), (2, 3), (3, 3)]
     assert stops[0]["seconds_left"] is None
@@ -413,7 +414,9 @@ def test_time_left_is_at_the_pace_of_the_stage(monkeypatch: pytest.MonkeyPatch) 
         now_s[0] += passing_s
         progress.counted("matching", done, 10)
     progress.counted("masks", 1, 2)
-    assert [e.seconds_left for e in shown] == [None, 15.0, 6.0, 0.0, None]
+    assert [e.seconds_left for e in shown] == pytest.approx([None, 15.0, 6.0, 0.0, None])
+    assert [e.per_second for e in shown] == pytest.approx([None, 1 / 3, 1 / 2, 2 / 3, None])
+    assert [e.pace for e in shown[:2]] == ["", ", 0.33 a second, about 15 s left"]
     assert [e.text for e in shown[:2]] == ["matching 4 of 10", "matching 5 of 10"]
 
 

@@ -115,7 +115,7 @@ def test_options_rig_pointing_and_masks_are_seen(scene: Traverse) -> None:
 def test_another_version_of_a_library_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     before = digest("features", 1.0)
     assert digest("features", 1.0) == before
-    monkeypatch.setattr("pancam_graph.images._cache._machine", lambda: "another")
+    monkeypatch.setattr("pancam_graph.images._cache.libraries", lambda: {"gtsam": "another"})
     assert digest("features", 1.0) != before
 
 

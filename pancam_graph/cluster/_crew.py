@@ -1,0 +1,304 @@
+"""The client's side of work on a cluster: checks of the workers, tasks, and what becomes of their faults."""
+
+import hashlib
+import logging
+import pickle
+import queue
+import secrets
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from heapq import heapify, heappop, heappush
+from importlib.util import find_spec
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from pancam_graph import __version__
+from pancam_graph.base.errors import ClusterError
+from pancam_graph.base.whole_files import whole_file
+from pancam_graph.cluster._worker import Parcel, Probe, look_around, run_batch
+
+__all__ = ["Crew", "Job"]
+
+_LOG = logging.getLogger(__name__)
+_POLL_S = 1.0
+_WAIT_FOR_WORKERS_S = 60.0
+_LOOK_AGAIN_S = 0.05
+_AHEAD = 4
+"""Batches that the scheduler has, per thread of a worker: enough that no thread waits for the client."""
+_SHARE = 8
+"""Batches per thread that ready items are split into, so that the last ones end at about the same time."""
+_MOST_IN_BATCH = 16
+_TRIES = 3
+_PROBE_FILES = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """One kind of work: a function of a module, called on workers as function(shared, item)."""
+
+    function: Callable[[Any, Any], Any]
+    shared: Any
+    """What all items need; goes to a worker once, by a file in the shared folder."""
+    name: Callable[[Any], str]
+    """What an item is, for people."""
+
+
+@dataclass
+class _Batch:
+    """Items of one task."""
+
+    numbers: list[int]
+    tries: int = 0
+
+
+class Crew:
+    """The workers of a client, and the folder that they have in common with it."""
+
+    def __init__(self, client: Any, *, folder: Path, machine: Callable[[], Mapping[str, str]]) -> None:
+        """`client` is a distributed.Client; `folder` exists; `machine` is a function of a module.
+
+        It is called here and on workers, and returns what must be the same everywhere.
+        """
+        self.client = client
+        self._folder = folder.resolve()
+        self._machine = machine, dict(machine())
+        self._files: list[tuple[Path, int]] = []
+        self._parcels = set[Path]()
+
+    @contextmanager
+    def at_work(self, files: Iterable[Path] = ()) -> Iterator[None]:
+        """A context in which the workers are known to be able to do the work; `files` are some they read.
+
+        Raises ClusterError naming a worker that has another version, other sources or libraries or another
+        kind of processor, that lacks the package, or does not see the folder or a file; and where no worker
+        comes within a minute.
+        """
+        known = islice((path.resolve() for path in files if path.is_file()), _PROBE_FILES)
+        self._files = [(path, path.stat().st_size) for path in known]
+        begun_s = time.monotonic()
+        while not self.n_threads():
+            if time.monotonic() - begun_s > _WAIT_FOR_WORKERS_S:
+                raise self.broken(f"expected workers, found none in {_WAIT_FOR_WORKERS_S:.0f} s")
+            time.sleep(_LOOK_AGAIN_S)
+        self.check()
+        try:
+            yield
+        finally:
+            for path in self._parcels:
+                with suppress(OSError):
+                    path.unlink(missing_ok=True)
+
+    @property
+    def dashboard(self) -> str | None:
+        """The address of the scheduler's page of progress, if it has one."""
+        with suppress(Exception):  # what there is depends on the kind of client and cluster
+            link = self.client.dashboard_link
+            return str(link) if link and self.client.run_on_scheduler(_has_page) else None
+        return None
+
+    def n_threads(self) -> int:
+        """Threads of all workers that the scheduler knows. Raises ClusterError where it is gone."""
+        try:
+            return sum(self.client.nthreads().values())
+        except Exception as error:  # which one depends on how it went
+            raise self.gone() from error
+
+    def broken(self, what: str) -> ClusterError:
+        """An error of the cluster, with the sentence that what was found is kept."""
+        scheduler = getattr(self.client.scheduler, "address", "")
+        return ClusterError(
+            f"cluster{scheduler and ' '}{scheduler}: {what}; what was found so far is in {self._folder}: run "
+            "the same command again to go on from there"
+        )
+
+    def gone(self) -> ClusterError:
+        """The error of a scheduler that is gone."""
+        return self.broken("the scheduler is gone")
+
+    def check(self) -> None:
+        """Raise ClusterError for the first worker, by address, that cannot do the work."""
+        probe = self._folder / f"probe-{secrets.token_hex(4)}"
+        content = secrets.token_bytes(32)
+        whole_file(probe, content)
+        try:
+            answers = self.client.run(
+                look_around,
+                self._machine,
+                Probe(path=probe, content=content, files=self._files),
+                on_error="return",
+            )
+        finally:
+            probe.unlink(missing_ok=True)
+        for address in sorted(answers):
+            answer = answers[address]
+            if isinstance(answer, ImportError | AttributeError):
+                answer = f"expected pancam_graph {__version__} as on the machine that asks, found: {answer}"
+            elif isinstance(answer, Exception):
+                answer = f"expected an answer, found {type(answer).__name__}: {answer}"
+            if answer is not None:
+                raise ClusterError(f"worker {address}: {answer}")
+
+    def share(
+        self,
+        job: Job,
+        items: Sequence[Any],
+        after: Sequence[Sequence[int]] | None = None,
+        done: Callable[[int, int], None] | None = None,
+    ) -> None:
+        """Call job.function(job.shared, item) on workers for all items; results are dropped.
+
+        An item begins once the items whose numbers `after` has for it are done; earlier ones first. `done`
+        is called with how many items are done, and how many there are. A task whose worker dies runs on
+        another one; one that raises runs again twice. An item that still raises is left to the caller, with
+        those that come after it: the caller meets the same error where it does them itself, and the log has a
+        warning.
+
+        Raises ClusterError for an item on which each worker that tries it dies, where the scheduler is gone
+        or no worker is left for a minute, and as `at_work` does for workers that have come since.
+        """
+        if items:
+            _Run(self, job, items, after or [()] * len(items), done).finish()
+
+    def parcel(self, shared: Any) -> Parcel:
+        """A file of what a job shares, written unless it is there."""
+        content = pickle.dumps(shared, protocol=pickle.HIGHEST_PROTOCOL)
+        digest = hashlib.sha256(content).hexdigest()
+        path = self._folder / f"parcel-{digest[:40]}.pickle"
+        if path not in self._parcels:
+            whole_file(path, content)
+            self._parcels.add(path)
+        return Parcel(path=path, digest=digest)
+
+    def submit(self, run: Callable[..., None], *arguments: Any) -> Any:
+        """A future of run(machine, *arguments)."""
+        try:
+            return self.client.submit(run, self._machine, *arguments, pure=False)
+        except Exception as error:  # whatever a client raises that has lost its scheduler
+            raise self.gone() from error
+
+
+class _Run:
+    """A job under way."""
+
+    def __init__(
+        self,
+        crew: Crew,
+        job: Job,
+        items: Sequence[Any],
+        after: Sequence[Sequence[int]],
+        done: Callable[[int, int], None] | None,
+    ) -> None:
+        self._crew = crew
+        self._job = job
+        self._items = items
+        self._tell = done
+        self._parcel = crew.parcel(job.shared)
+        self._threads = max(1, crew.n_threads())
+        self._waits_for = [len(set(before)) for before in after]
+        self._next: list[list[int]] = [[] for _ in items]
+        for number, before in enumerate(after):
+            for earlier in set(before):
+                self._next[earlier].append(number)
+        self._ready = [number for number, waits_for in enumerate(self._waits_for) if not waits_for]
+        heapify(self._ready)
+        self._again = deque[_Batch]()
+        self._running = dict[Any, _Batch]()
+        self._ended = queue.SimpleQueue[Any]()
+        self._over = set[int]()
+
+    def finish(self) -> None:
+        """Do all items."""
+        lonely_since_s: float | None = None
+        try:
+            while len(self._over) < len(self._items):
+                self._begin()
+                try:
+                    future = self._ended.get(timeout=_POLL_S)
+                except queue.Empty:
+                    lonely_since_s = self._lonely(lonely_since_s)
+                else:
+                    lonely_since_s = None
+                    self._end(future, self._running.pop(future))
+        finally:
+            if self._running:
+                with suppress(Exception):  # a scheduler that is gone has nothing to cancel
+                    self._crew.client.cancel(list(self._running), force=True)
+
+    def _begin(self) -> None:
+        """Hand batches to the scheduler until it has enough."""
+        while len(self._running) < _AHEAD * self._threads and (self._again or self._ready):
+            if self._again:
+                batch = self._again.popleft()
+            else:
+                size = max(1, min(_MOST_IN_BATCH, len(self._ready) // (_SHARE * self._threads)))
+                batch = _Batch([heappop(self._ready) for _ in range(size)])
+            batch.tries += 1
+            items = [self._items[number] for number in batch.numbers]
+            future = self._crew.submit(run_batch, self._job.function, self._parcel, items)
+            self._running[future] = batch
+            future.add_done_callback(self._ended.put)
+
+    def _lonely(self, since_s: float | None) -> float | None:
+        """Since when there is no worker; None: there is one."""
+        if self._crew.n_threads():
+            return None
+        now_s = time.monotonic()
+        if since_s is not None and now_s - since_s > _WAIT_FOR_WORKERS_S:
+            raise self._crew.broken(f"no worker is left, and none came in {_WAIT_FOR_WORKERS_S:.0f} s")
+        return now_s if since_s is None else since_s
+
+    def _end(self, future: Any, batch: _Batch) -> None:
+        """A task has ended: go on after its items, or have them done again, or leave them to the client."""
+        if future.status == "finished":
+            for number in batch.numbers:
+                self._go_on_after(number)
+            self._count(batch.numbers)
+            return
+        if future.status != "error":  # cancelled or lost: by nobody else than a scheduler that went
+            raise self._crew.gone()
+        error = future.exception()
+        if isinstance(error, ClusterError):
+            raise error
+        is_killed = type(error).__name__ == "KilledWorker"  # of an extra
+        names = ", ".join(self._job.name(self._items[number]) for number in batch.numbers)
+        if is_killed and len(batch.numbers) == 1 and batch.tries > 1:
+            raise self._crew.broken(f"all workers that tried {names} died")
+        if isinstance(error, ImportError):
+            self._crew.check()  # a worker that came later lacks something; it is named here
+        if len(batch.numbers) > 1:
+            self._again.extend(_Batch([number], batch.tries) for number in batch.numbers)
+        elif is_killed or batch.tries < _TRIES:
+            self._again.append(batch)
+        else:
+            _LOG.warning("%s: no worker could do it: %s: %s", names, type(error).__name__, error)
+            self._count(self._all_after(batch.numbers))
+
+    def _go_on_after(self, number: int) -> None:
+        for later in self._next[number]:
+            self._waits_for[later] -= 1
+            if not self._waits_for[later] and later not in self._over:
+                heappush(self._ready, later)
+
+    def _all_after(self, numbers: Iterable[int]) -> set[int]:
+        """Items, and all that wait for them, directly or not."""
+        found, waiting = set[int](), list(numbers)
+        while waiting:
+            number = waiting.pop()
+            if number not in found:
+                found.add(number)
+                waiting += self._next[number]
+        return found
+
+    def _count(self, numbers: Iterable[int]) -> None:
+        self._over.update(numbers)
+        if self._tell is not None:
+            self._tell(len(self._over), len(self._items))
+
+
+def _has_page() -> bool:
+    """Whether the scheduler that runs this can show its page."""
+    return find_spec("bokeh") is not None
