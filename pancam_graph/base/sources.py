@@ -12,14 +12,13 @@ from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
-from threading import Lock
 from typing import Any
+
+from pancam_graph.base.parsing import PARSING
 
 __all__ = ["modules_behind", "source_digest", "source_of"]
 
 _DOOR = "__init__.py"
-_PARSING = Lock()
-"""Held while a text is parsed: Python 3.11 confuses the depths of parsers in several threads."""
 
 
 def source_digest(*functions: Callable[..., Any], alone: Iterable[str] = ()) -> str:
@@ -76,7 +75,7 @@ def _from_statements(name: str) -> tuple[tuple[str, str, str], ...]:
     path, text = source_of(name)
     package = name if path.name == _DOOR else name.rpartition(".")[0]
     imports: list[tuple[str, str, str]] = []
-    with _PARSING:
+    with PARSING:
         tree = ast.parse(text)
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):

@@ -1,5 +1,6 @@
 """The connection to a scheduler, or to workers of this machine that live as long as it."""
 
+import logging
 import os
 import re
 from collections.abc import Iterator
@@ -61,7 +62,11 @@ def _as_client(distributed: Any, cluster: Any) -> Iterator[Any]:
 def _own_workers(distributed: Any, n: int) -> Iterator[Any]:
     """Processes of this machine, begun here and not waited for."""
     cluster = distributed.LocalCluster(
-        n_workers=0, threads_per_worker=1, processes=True, dashboard_address=":0"
+        n_workers=0,
+        threads_per_worker=1,
+        processes=True,
+        dashboard_address=":0",
+        silence_logs=logging.CRITICAL,  # a worker that dies is replaced; what matters is raised
     )
     try:
         cluster.scale(n)

@@ -16,9 +16,9 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from pancam_graph import __version__
 from pancam_graph.base.errors import ClusterError
 from pancam_graph.base.whole_files import whole_file
+from pancam_graph.cluster._machine import PACKAGE, package_version
 from pancam_graph.cluster._worker import Parcel, Probe, look_around, run_batch
 
 __all__ = ["Crew", "Job"]
@@ -136,7 +136,9 @@ class Crew:
         for address in sorted(answers):
             answer = answers[address]
             if isinstance(answer, ImportError | AttributeError):
-                answer = f"expected pancam_graph {__version__} as on the machine that asks, found: {answer}"
+                answer = (
+                    f"expected {PACKAGE} {package_version()} as on the machine that asks, found: {answer}"
+                )
             elif isinstance(answer, Exception):
                 answer = f"expected an answer, found {type(answer).__name__}: {answer}"
             if answer is not None:

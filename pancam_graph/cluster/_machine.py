@@ -2,16 +2,16 @@
 
 import os
 import platform
+import sys
 from collections.abc import Iterator, Mapping
 from functools import cache
 from hashlib import sha256
 from importlib.util import find_spec
 from pathlib import Path
 
-from pancam_graph import __version__
+__all__ = ["PACKAGE", "difference", "machine", "package_version"]
 
-__all__ = ["difference", "machine"]
-
+PACKAGE = "pancam_graph"
 _DIGITS = 12
 """Of a digest, as a sentence shows it."""
 
@@ -20,11 +20,16 @@ _DIGITS = 12
 def machine() -> Mapping[str, str]:
     """Names and values: version and sources of this package, Python's version, the kind of processor."""
     return {
-        "pancam_graph": __version__,
+        PACKAGE: package_version(),
         "sources of pancam_graph": _package_digest()[:_DIGITS],
         "Python": ".".join(platform.python_version_tuple()[:2]),
         "processor": platform.machine(),
     }
+
+
+def package_version() -> str:
+    """The version of this package, which the rooms below its top do not import."""
+    return str(sys.modules[PACKAGE].__version__)
 
 
 def difference(here: Mapping[str, str], there: Mapping[str, str]) -> str | None:
@@ -46,7 +51,7 @@ def _package_digest() -> str:
 
 def _modules() -> Iterator[tuple[str, Path]]:
     # In a checkout the room of factors is another folder, and perhaps a link to it.
-    for room, skipped in (("pancam_graph", {"factors"}), ("pancam_graph.factors", set[str]())):
+    for room, skipped in ((PACKAGE, {"factors"}), (f"{PACKAGE}.factors", set[str]())):
         spec = find_spec(room)
         assert spec is not None  # it is this package
         assert spec.origin is not None  # it has a door

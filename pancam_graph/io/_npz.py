@@ -11,6 +11,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from pancam_graph.base.errors import InputError
+from pancam_graph.base.parsing import PARSING
 from pancam_graph.io._json import read_bytes
 
 __all__ = ["NpzFile"]
@@ -64,7 +65,8 @@ class NpzFile:
             raise InputError(f"{name}: expected an array, found other bytes")
         stream = io.BytesIO(content)
         try:
-            shape, by_columns, dtype = _HEADERS[npy.read_magic(stream)](stream)
+            with PARSING:
+                shape, by_columns, dtype = _HEADERS[npy.read_magic(stream)](stream)
             size = math.prod(shape) * dtype.itemsize
         except Exception as error:  # NumPy raises many kinds at headers that are none
             raise InputError(f"{name}: expected a whole array, found one with a damaged header") from error
