@@ -220,7 +220,7 @@ def _matched(
             valid=sought.usable,
         )
         of_terrain = features(sought.own).select(feature_of[terrain.row[sought.rows]])
-        theirs = np.flatnonzero(terrain.image == sought.image)
+        theirs = terrain.rows_of[sought.image]
         other = features(sought.image).select(feature_of[terrain.row[theirs]])
         matches = match_in_windows(of_terrain, other, segments, options)
         parts.append(
@@ -255,8 +255,8 @@ def _windows(
     terrain: StopTerrain, stops: tuple[int, int], at: Alignment, options: FrontEndOptions
 ) -> Iterator[_Windows]:
     """The windows of all pairs of images of two stops that may share enough points."""
-    rows_of = {i: np.flatnonzero(terrain.image == i) for i in np.unique(terrain.image).tolist()}
-    ours, theirs = ([i for i in rows_of if terrain.traverse.image_stop[i] == s] for s in stops)
+    rows_of, stop = terrain.rows_of, terrain.traverse.image_stop
+    ours, theirs = ([i for i in np.flatnonzero(stop == s).tolist() if i in rows_of] for s in stops)
     for i in ours:
         for j in theirs:
             seen = terrain.sighting(rows_of[i], j, at.world_T_mast)

@@ -28,7 +28,7 @@ from pancam_graph.images._masks import pixels_at
 from pancam_graph.images._patch_noise import patch_covariance_px2
 from pancam_graph.images._patches import MAX_REACH_PX, QUALITIES, Coefficients, align_patches
 from pancam_graph.images._splines import Splines
-from pancam_graph.images._terrain import Sighting, StopTerrain
+from pancam_graph.images._terrain import Sighting, StopTerrain, rows_by_image
 
 __all__ = ["StopMatcher", "StopTies", "agreeing", "joined", "on_terrain", "stereo_stops"]
 
@@ -122,7 +122,7 @@ class StopMatcher:
             return _nothing(self.terrain, (one, other), _Sought(), alignment)
         t = self.terrain.traverse
         ours, theirs = (np.flatnonzero(t.image_stop == s).tolist() for s in (one, other))
-        rows_of = {i: np.flatnonzero(self._chosen & (self.terrain.image == i)) for i in ours}
+        rows_of = {i: rows[self._chosen[rows]] for i, rows in self.terrain.rows_of.items() if i in ours}
         # Images of the second stop in the outer loop: each is blurred to several levels, and each level once.
         parts = [
             _found(self.terrain, self.spline, rows, j, alignment, self.options)
@@ -216,8 +216,7 @@ class _Sought:
 def on_terrain(usable: Callable[[int], BoolArray], image: IntArray, uv_px: FloatArray) -> BoolArray:
     """Which pixels (n, 2) of images (n,) show terrain."""
     shows = np.zeros(len(image), dtype=bool)
-    for i in np.unique(image).tolist():
-        rows = image == i
+    for i, rows in rows_by_image(image).items():
         shows[rows] = pixels_at(usable(i), uv_px[rows])
     return shows
 

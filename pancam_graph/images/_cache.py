@@ -51,7 +51,7 @@ class Cache:
     goes into a temporary one, which is deleted with this object.
     """
 
-    def __init__(self, folder: Path | None, most_bytes: int = _HELD_BYTES, must_keep: bool = False) -> None:
+    def __init__(self, folder: Path | None, most_bytes: int | None = None, must_keep: bool = False) -> None:
         """Keep files in `folder`, which is made when the first is written; None: there is no such folder.
 
         Where a file cannot be written, a warning is logged; with `must_keep`, `recall` raises ClusterError.
@@ -61,10 +61,8 @@ class Cache:
         self._used: set[Path] = set()
         self._begun = False
         self._beginning = Lock()
-        self._held = Held[str, Arrays](most_bytes, _n_bytes, self._put_aside)
-        self._aside: Path | None = None
-        self._no_room: dict[str, Arrays] = {}
-        """What could not be written to the temporary folder."""
+        self._aside = _Aside(folder)
+        self._held = Held[str, Arrays](most_bytes or _HELD_BYTES, _n_bytes, self._aside.put)
 
     def recall(self, kind: str, key: str, make: Callable[[], Mapping[str, NDArray[Any]]]) -> Arrays:
         """The arrays kept under a key, or else those that `make` returns, which then are kept.
@@ -80,20 +78,15 @@ class Cache:
 
         return dict(self._held.get(f"{kind} {key}", find_or_make))
 
-    def __reduce__(self) -> tuple[type["Cache"], tuple[Path | None, int, bool]]:
+    def __reduce__(self) -> tuple[type["Cache"], tuple[Path | None, None, bool]]:
         """Another process gets the folder, in which it must keep all, and nothing of what memory holds."""
         folder = None if self._folder is None else self._folder.resolve()
-        return Cache, (folder, _HELD_BYTES, True)
+        return Cache, (folder, None, True)
 
     def _found(self, kind: str, key: str) -> Arrays | None:
-        """The arrays of a file in the folder or the temporary one, if there are any."""
-        if (kept := self._no_room.get(f"{kind} {key}")) is not None:
-            return kept
-        for folder in (self._folder, self._aside):
-            arrays = None if folder is None else _read(folder / _file_name(kind, key), key)
-            if arrays is not None:
-                return arrays
-        return None
+        """The arrays of a file, if there is any."""
+        arrays = None if self._folder is None else _read(self._folder / _file_name(kind, key), key)
+        return self._aside.get(f"{kind} {key}") if arrays is None else arrays
 
     def _made(self, kind: str, key: str, make: Callable[[], Mapping[str, NDArray[Any]]]) -> Arrays:
         arrays = dict(make())
@@ -114,22 +107,6 @@ class Cache:
                 _LOG.warning("%s: not kept: %s", path, error)  # the step works without a cache too
         return arrays
 
-    def _put_aside(self, name: str, arrays: Arrays) -> None:
-        """Write what memory has no room for to the temporary folder, unless there is a file of it."""
-        kind, key = name.split(" ")
-        file = _file_name(kind, key)
-        if any(folder is not None and (folder / file).is_file() for folder in (self._folder, self._aside)):
-            return
-        try:
-            if self._aside is None:
-                self._aside = Path(mkdtemp(prefix="pancam-graph-"))
-                finalize(self, rmtree, self._aside, ignore_errors=True)
-            _write(self._aside / file, key, arrays)
-        except OSError as error:
-            if not self._no_room:
-                _LOG.warning("memory holds what has no room in a temporary folder: %s", error)
-            self._no_room[name] = arrays
-
     def forget_others(self) -> None:
         """Delete the cache's files whose keys were not asked for since this object was made."""
         if self._folder is not None and self._folder.is_dir():
@@ -137,6 +114,40 @@ class Cache:
                 if path not in self._used:
                     with suppress(OSError):  # a folder of such a name, or no right to delete
                         path.unlink()
+
+
+class _Aside:
+    """Arrays that memory has no room for and no other folder has: in a temporary folder, gone with this."""
+
+    def __init__(self, kept: Path | None) -> None:
+        """What has a file in the folder `kept` needs none here."""
+        self._kept = kept
+        self._folder: Path | None = None
+        self._no_room: dict[str, Arrays] = {}
+        """What could not be written."""
+
+    def put(self, name: str, arrays: Arrays) -> None:
+        """Take arrays by kind and key; memory holds on to what cannot be written."""
+        kind, key = name.split(" ")
+        file = _file_name(kind, key)
+        if any(folder is not None and (folder / file).is_file() for folder in (self._kept, self._folder)):
+            return
+        try:
+            if self._folder is None:
+                self._folder = Path(mkdtemp(prefix="pancam-graph-"))
+                finalize(self, rmtree, self._folder, ignore_errors=True)
+            _write(self._folder / file, key, arrays)
+        except OSError as error:
+            if not self._no_room:
+                _LOG.warning("memory holds what has no room in a temporary folder: %s", error)
+            self._no_room[name] = arrays
+
+    def get(self, name: str) -> Arrays | None:
+        """The arrays of a kind and key, if they were put here."""
+        kind, key = name.split(" ")
+        if self._folder is None or name in self._no_room:
+            return self._no_room.get(name)
+        return _read(self._folder / _file_name(kind, key), key)
 
 
 def _file_name(kind: str, key: str) -> str:

@@ -88,16 +88,18 @@ def _cones_meet(traverse: Traverse, options: FrontEndOptions) -> BoolArray:
         direction = camera.unproject(np.column_stack([u.ravel(), v.ravel()])).direction @ R[a].T
         points = (centre[a] + depths[:, None, None] * direction).reshape(-1, 3)
         gap = half[a] / (_GRID - 1)
-        close = near[stop[a], stop]
-        to_point = points[:, None] - centre
+        close = np.flatnonzero(near[stop[a], stop])
+        to_point, from_a = points[:, None] - centre[close], points - centre[a]
         range_m = np.maximum(np.linalg.norm(to_point, axis=2), 1e-6)
-        angle = np.arccos(np.clip(np.einsum("kni,ni->kn", to_point, axis) / range_m, -1.0, 1.0))
-        spread = slack + slack[a] + np.sqrt(3) * np.where(stop == stop[a], 0.0, shift + shift[a]) / range_m
-        inside = angle < half + gap + options.search_sigmas * spread
-        turned = np.einsum("kni,ki->kn", to_point, to_point[:, a]) / (range_m * range_m[:, [a]])
-        zoom = range_m / range_m[:, [a]]
+        range_a = np.maximum(np.linalg.norm(from_a, axis=1), 1e-6)[:, None]
+        angle = np.arccos(np.clip(np.einsum("kni,ni->kn", to_point, axis[close]) / range_m, -1.0, 1.0))
+        shifts = np.where(stop[close] == stop[a], 0.0, shift[close] + shift[a])
+        spread = slack[close] + slack[a] + np.sqrt(3) * shifts / range_m
+        inside = angle < half[close] + gap + options.search_sigmas * spread
+        turned = np.einsum("kni,ki->kn", to_point, from_a) / (range_m * range_a)
+        zoom = range_m / range_a
         alike = (turned > np.cos(MAX_TURN_RAD + gap)) & (np.abs(np.log(zoom)) < np.log(2 * MAX_ZOOM))
-        meet[a] = close & np.any(inside & alike, axis=0)
+        meet[a, close] = np.any(inside & alike, axis=0)
     return np.asarray(meet | meet.T)
 
 

@@ -84,18 +84,18 @@ def rover_partners(traverse: Traverse, row: int, *, available: BoolArray) -> lis
 def find_rover(
     traverse: Traverse,
     row: int,
+    image: NDArray[Any],
     samples: Callable[[int], NDArray[Any]],
     partners: Sequence[int],
     options: FrontEndOptions,
 ) -> BoolArray:
     """Which pixels of an image (height, width) show the rover, its shadow, or dust on the lens.
 
-    `samples` gives the samples of an image by row. Each partner (see `rover_partners`) is laid over the image
+    `samples` gives the samples of partners by row. Each partner (see `rover_partners`) is laid over the image
     as if the rover had not moved. Where the two then look alike, window by window, what they show moved
     along. No pixel is called rover where terrain would look alike too: within 3 degrees of the horizontal and
     above, and where ground 0.8 to 3 m below the eye would hardly move in the image between the two stops.
     """
-    image = samples(row)
     rover = np.zeros(image.shape, dtype=bool)
     for partner in partners:
         pair = PairGeometry(traverse, row, partner, options.mount_sigma_rad)

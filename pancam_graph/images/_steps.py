@@ -219,9 +219,9 @@ class Steps:
     def _mask_arrays(self, row: int) -> Arrays:
         def make() -> Arrays:
             automatic, samples = self.options.masks == "automatic", self._files.samples
-            elevation = elevation_rad(self.traverse, row)
-            alone = mask_image(samples(row), self._files.user_mask(row), elevation, automatic=automatic)
-            rover = find_rover(self.traverse, row, samples, self._partners(row), self.options)
+            elevation, image = elevation_rad(self.traverse, row), samples(row)
+            alone = mask_image(image, self._files.user_mask(row), elevation, automatic=automatic)
+            rover = find_rover(self.traverse, row, image, samples, self._partners(row), self.options)
             mask = alone.with_rover(rover)
             digests = (mask.reasons, *(mask.usable(between_stops=between) for between in (False, True)))
             return {

@@ -13,7 +13,7 @@ from pancam_graph.cameras import Camera
 from pancam_graph.data import Observations, Solution, Traverse
 from pancam_graph.images._local_map import HALF_WIDTH_PX, local_map
 
-__all__ = ["Sighting", "StopTerrain", "terrain_arrays", "terrain_from"]
+__all__ = ["Sighting", "StopTerrain", "rows_by_image", "terrain_arrays", "terrain_from"]
 
 _NEAREST_INVERSE_M = 1e-7
 _NEIGHBOURS = 12
@@ -87,6 +87,11 @@ class StopTerrain:
         return np.asarray(self.observations.image[self.row])
 
     @cached_property
+    def rows_of(self) -> dict[int, IntArray]:
+        """Rows of the points that were first seen in an image, ascending, by the images that have some."""
+        return rows_by_image(self.image)
+
+    @cached_property
     def uv_px(self) -> FloatArray:
         """(n, 2) pixel of each point in that image."""
         return np.asarray(self.observations.uv_px[self.row])
@@ -116,8 +121,7 @@ class StopTerrain:
     def _world_m(self) -> FloatArray:
         """(n, 3) all points."""
         points = np.empty((len(self.row), 3))
-        for i in np.unique(self.image):
-            rows = np.flatnonzero(self.image == i)
+        for rows in self.rows_of.values():
             points[rows] = self.points_m(rows)
         return points
 
@@ -201,6 +205,13 @@ class StopTerrain:
         return np.array([e.camera.pinhole.calibration_matrix[0, 0] for e in self.traverse.rig.eyes])
 
 
+def rows_by_image(image: IntArray) -> dict[int, IntArray]:
+    """Rows (ascending) of a column of images (n,), by the image."""
+    order = np.argsort(image, kind="stable")
+    images, begin = np.unique(image[order], return_index=True)
+    return dict(zip(images.tolist(), np.split(order, begin)[1:], strict=True))
+
+
 def terrain_arrays(solution: Solution) -> dict[str, FloatArray | IntArray]:
     """What `terrain_from` needs to build the terrain of a solution of single stops."""
     t, final = solution.traverse, solution.final
@@ -274,8 +285,7 @@ def terrain_from(
         return terrain
     slopes = terrain.slope.copy()
     world_R_camera, _ = terrain.traverse.camera_poses()
-    for i in np.unique(terrain.image):
-        rows = np.flatnonzero(terrain.image == i)
+    for i, rows in terrain.rows_of.items():
         slopes[rows] = _slopes(terrain, rows, world_R_camera[i])
     return replace(terrain, slope=slopes)
 
