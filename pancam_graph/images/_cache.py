@@ -34,7 +34,7 @@ __all__ = ["Cache", "digest", "libraries"]
 _LOG = logging.getLogger(__name__)
 _SUFFIX = ".npz"
 _KEY = "key"
-_HELD_BYTES = 256 << 20
+_HELD_BYTES = 128 << 20
 
 Arrays = dict[str, NDArray[Any]]
 

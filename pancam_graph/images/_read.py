@@ -27,7 +27,7 @@ from pancam_graph.io import (
 __all__ = ["PictureFiles", "Pictures", "image_name", "listed", "read_pictures"]
 
 _NAMED = 3
-_HELD_BYTES = 256 << 20
+_HELD_BYTES = 128 << 20
 _HELD_MASK_BYTES = 32 << 20
 
 

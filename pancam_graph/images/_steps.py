@@ -95,6 +95,7 @@ class Steps:
     _mask_keys: dict[int, str] = field(default_factory=dict)
     _figures: dict[int, MaskFigures] = field(default_factory=dict)
     _feature_keys: dict[int, str] = field(default_factory=dict)
+    _track_keys: dict[int, str] = field(default_factory=dict)
 
     def tell(self, stage: str, done: int, total: int) -> None:
         """Tell the caller that so many of the items of a stage are done."""
@@ -324,8 +325,9 @@ class Steps:
     def tracks(self, group: int) -> Arrays:
         """Tracks of the features of a group (see `groups`), as columns sorted by track, then image.
 
-        `image`, `feature` (row among the image's features), `track` from 0 on, `uv_px` (n, 2) and `size_px`;
-        and `seen`: rows of all images with features that another one shares, also where no track was kept.
+        `image`, `feature` (row among the image's features), `track` from 0 on, `origin` (the image in which
+        the track begins), `uv_px` (n, 2) and `size_px`; and `seen`: rows of all images with features that
+        another one shares, also where no track was kept.
         """
         pairs, options = [self.pairs[k] for k in self.groups[group]], self.options
 
@@ -342,22 +344,24 @@ class Steps:
             extent_px = np.array([[c.width_px, c.height_px] for c in cameras])
             spread = spread_tracks(image[kept], track[kept], uv_px[kept], extent_px, options.max_ties)
             kept = kept[spread]
+            own = np.unique(track[kept], return_inverse=True)[1]
             return {
                 "image": image[kept],
                 "feature": feature[kept],
-                "track": np.unique(track[kept], return_inverse=True)[1],
+                "track": own,
+                "origin": image[kept][np.searchsorted(own, own)],
                 "uv_px": uv_px[kept],
                 "size_px": size_px[kept],
                 "seen": seen,
             }
 
-        return self.cache.recall("tracks", step_key("tracks", [self.match_key(pair) for pair in pairs]), make)
+        if group not in self._track_keys:
+            self._track_keys[group] = step_key("tracks", [self.match_key(pair) for pair in pairs])
+        return self.cache.recall("tracks", self._track_keys[group], make)
 
     def origins(self, group: int) -> list[int]:
         """Rows of the images of a group in which tracks begin."""
-        tracks = self.tracks(group)
-        first = np.searchsorted(tracks["track"], tracks["track"])
-        return [int(row) for row in np.unique(tracks["image"][first])]
+        return [int(row) for row in np.unique(self.tracks(group)["origin"])]
 
     def refined(self, group: int, origin: int) -> Arrays:
         """The tracks of a group that begin in an image, after least-squares matching; see `refine_tracks`.
@@ -365,15 +369,15 @@ class Steps:
         Columns of `RefinedTracks`, and `row`: the rows of their observations among the group's.
         """
         tracks = self.tracks(group)
-        image, track = tracks["image"], tracks["track"]
-        rows = np.flatnonzero(image[np.searchsorted(track, track)] == origin)
-        own = np.unique(track[rows], return_inverse=True)[1]
-        columns = image[rows], own, tracks["uv_px"][rows], self._as_found_px(tracks)[rows]
+        rows = np.flatnonzero(tracks["origin"] == origin)
+        own = {name: tracks[name][rows] for name in ("image", "track", "uv_px", "size_px")}
+        number = np.unique(own["track"], return_inverse=True)[1]
+        columns = own["image"], number, own["uv_px"], self._as_found_px(own)
 
         def make() -> Arrays:
             return vars(refine_tracks(self.traverse, self._spline, *columns, self.options))
 
-        pictures = [self.picture_keys[i] for i in np.unique(image[rows])]
+        pictures = [self.picture_keys[i] for i in np.unique(own["image"])]
         return {**self.cache.recall("refined", step_key("refined", pictures, columns), make), "row": rows}
 
     def _as_found_px(self, tracks: Arrays) -> Any:
