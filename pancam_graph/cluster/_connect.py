@@ -1,9 +1,11 @@
 """The connection to a scheduler, or to workers of this machine that live as long as it."""
 
+import asyncio
 import logging
 import os
 import re
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -39,18 +41,33 @@ def connected(address: str) -> Iterator[Any]:
         with _own_workers(distributed, int(local[1] or _cores())) as cluster:
             yield from _as_client(distributed, cluster)
     else:
+        _must_answer(distributed, address)
         yield from _as_client(distributed, address)
+
+
+def _must_answer(distributed: Any, address: str) -> None:
+    """Raise ClusterError unless a scheduler answers: a client would wait for ever for somebody else."""
+
+    async def asked() -> Any:
+        async with distributed.rpc(address) as somebody:
+            return await somebody.identity()
+
+    async def answered() -> Any:
+        return await asyncio.wait_for(asked(), _CONNECT_S)
+
+    try:
+        # In a thread of its own: that of the caller may have a loop already, as in a notebook.
+        with ThreadPoolExecutor(1) as pool:
+            found = str(pool.submit(asyncio.run, answered()).result()["type"])
+    except Exception as error:  # whatever Dask makes of what somebody says who is no scheduler
+        found = f"none in {_CONNECT_S:.0f} s ({type(error).__name__})"
+    if found != "Scheduler":
+        raise ClusterError(f"cluster {address}: expected a Dask scheduler that listens there, found {found}")
 
 
 def _as_client(distributed: Any, cluster: Any) -> Iterator[Any]:
     """A client of a cluster, or of the address of a scheduler, until it is closed."""
-    try:
-        client = distributed.Client(cluster, timeout=_CONNECT_S, set_as_default=False)
-    except (OSError, ValueError, RuntimeError) as error:
-        raise ClusterError(
-            f"cluster {cluster}: expected a Dask scheduler that listens there, found none in "
-            f"{_CONNECT_S:.0f} s ({' '.join(str(error).split())})"
-        ) from error
+    client = distributed.Client(cluster, timeout=_CONNECT_S, set_as_default=False)
     try:
         yield client
     finally:
@@ -61,19 +78,23 @@ def _as_client(distributed: Any, cluster: Any) -> Iterator[Any]:
 @contextmanager
 def _own_workers(distributed: Any, n: int) -> Iterator[Any]:
     """Processes of this machine, begun here and not waited for."""
-    cluster = distributed.LocalCluster(
-        n_workers=0,
-        threads_per_worker=1,
-        processes=True,
-        dashboard_address=":0",
-        silence_logs=logging.CRITICAL,  # a worker that dies is replaced; what matters is raised
-    )
-    try:
-        cluster.scale(n)
-        yield cluster
-    finally:
-        with suppress(Exception):
-            cluster.close()
+    # Dask has workers give memory back at once: the system then clears each page of each array anew.
+    held = {"distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": None}
+    with needed("dask", EXTRA).config.set(held):
+        cluster = distributed.LocalCluster(
+            n_workers=0,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address=":0",
+            silence_logs=logging.CRITICAL,  # a worker that dies is replaced; what matters is raised
+        )
+        try:
+            # A nanny begins a worker again that was killed, but none that was killed while it began.
+            cluster.adapt(minimum=n, maximum=n)
+            yield cluster
+        finally:
+            with suppress(Exception):
+                cluster.close()
 
 
 def _cores() -> int:

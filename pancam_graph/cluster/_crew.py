@@ -135,12 +135,9 @@ class Crew:
             probe.unlink(missing_ok=True)
         for address in sorted(answers):
             answer = answers[address]
-            if isinstance(answer, ImportError | AttributeError):
-                answer = (
-                    f"expected {PACKAGE} {package_version()} as on the machine that asks, found: {answer}"
-                )
-            elif isinstance(answer, Exception):
-                answer = f"expected an answer, found {type(answer).__name__}: {answer}"
+            if isinstance(answer, Exception):  # most often it has no such module
+                expected = f"{PACKAGE} {package_version()} as on the machine that asks"
+                answer = f"expected {expected}, found {type(answer).__name__}: {answer}"
             if answer is not None:
                 raise ClusterError(f"worker {address}: {answer}")
 
@@ -269,13 +266,12 @@ class _Run:
         names = ", ".join(self._job.name(self._items[number]) for number in batch.numbers)
         if is_killed and len(batch.numbers) == 1 and batch.tries > 1:
             raise self._crew.broken(f"all workers that tried {names} died")
-        if isinstance(error, ImportError):
-            self._crew.check()  # a worker that came later lacks something; it is named here
         if len(batch.numbers) > 1:
             self._again.extend(_Batch([number], batch.tries) for number in batch.numbers)
         elif is_killed or batch.tries < _TRIES:
             self._again.append(batch)
         else:
+            self._crew.check()  # a worker that came later may lack something, and is named here
             _LOG.warning("%s: no worker could do it: %s: %s", names, type(error).__name__, error)
             self._count(self._all_after(batch.numbers))
 
