@@ -1,8 +1,8 @@
 """The subcommand refine: adjust a traverse and write a folder of results."""
 
 import time
-from collections.abc import Iterable
-from contextlib import ExitStack
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -208,9 +208,7 @@ def _work(call: Invocation) -> int:
     with progress.shown(f"reading {arguments.folder}"), resumable(arguments.out), ExitStack() as clients:
         client = None
         if arguments.cluster is not None:
-            from pancam_graph.cluster import connected
-
-            client = clients.enter_context(connected(arguments.cluster))
+            client = clients.enter_context(_workers(call))
         traverse = read_input(arguments.folder)
         if arguments.use_rig is not None:
             traverse = use_rig(traverse, arguments.use_rig)
@@ -267,6 +265,20 @@ def _work(call: Invocation) -> int:
             write_plots(solution, arguments.plots)
     print_summary(solution, str(arguments.out), quiet=arguments.quiet)
     return 0 if solution.passed else 1
+
+
+@contextmanager
+def _workers(call: Invocation) -> Iterator[Any]:
+    """A client of the cluster that the user names; its page is told, and with --log each worker has a log."""
+    from pancam_graph.cluster import connected, dashboard, log_workers
+
+    with connected(call.arguments.cluster) as client:
+        page = dashboard(client)
+        if page is not None:
+            call.say(f"the cluster's own page of progress: {page}")
+        if call.arguments.log is not None:
+            log_workers(client, call.arguments.log.with_name(f"{call.arguments.log.name}.workers"))
+        yield client
 
 
 def started(traverse: "Traverse", path: Path, *, incremental: bool) -> "tuple[Traverse, Start]":

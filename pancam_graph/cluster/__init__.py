@@ -5,6 +5,8 @@ asked for.
 """
 
 from pancam_graph.cluster._connect import connected as connected
+from pancam_graph.cluster._connect import dashboard as dashboard
+from pancam_graph.cluster._connect import log_workers as log_workers
 from pancam_graph.cluster._crew import Crew as Crew
 from pancam_graph.cluster._crew import Job as Job
 from pancam_graph.cluster._machine import machine as machine

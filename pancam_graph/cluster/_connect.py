@@ -7,17 +7,22 @@ import re
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 from pancam_graph.base.errors import ClusterError
 from pancam_graph.base.extras import needed
 
-__all__ = ["EXTRA", "connected"]
+__all__ = ["connected", "dashboard", "log_workers"]
 
 EXTRA = "cluster"
 _LOCAL = re.compile(r"local(?::([1-9][0-9]{0,3}))?")
 _REMOTE = re.compile(r"(?:tcp|tls|ucx|ws|wss)://[^\s/]+:[0-9]+")
 _CONNECT_S = 10.0
+_MEMORY = {"MALLOC_TRIM_THRESHOLD_": 256 << 20, "MALLOC_MMAP_THRESHOLD_": 32 << 20}
+"""What a worker keeps of memory that it has freed, bytes. By Dask's choice (64 kB) the system clears each
+page of each array anew, which takes nearly as long as the work on pictures."""
 
 
 @contextmanager
@@ -78,9 +83,8 @@ def _as_client(distributed: Any, cluster: Any) -> Iterator[Any]:
 @contextmanager
 def _own_workers(distributed: Any, n: int) -> Iterator[Any]:
     """Processes of this machine, begun here and not waited for."""
-    # Dask has workers give memory back at once: the system then clears each page of each array anew.
-    held = {"distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": None}
-    with needed("dask", EXTRA).config.set(held):
+    environment = {f"distributed.nanny.pre-spawn-environ.{name}": value for name, value in _MEMORY.items()}
+    with needed("dask", EXTRA).config.set(environment):
         cluster = distributed.LocalCluster(
             n_workers=0,
             threads_per_worker=1,
@@ -95,6 +99,30 @@ def _own_workers(distributed: Any, n: int) -> Iterator[Any]:
         finally:
             with suppress(Exception):
                 cluster.close()
+
+
+def dashboard(client: Any) -> str | None:
+    """The address of the scheduler's own page of progress, if it has one."""
+    with suppress(Exception):  # what there is depends on the kind of client and cluster
+        if client.run_on_scheduler(_has_page):
+            return str(client.dashboard_link)
+    return None
+
+
+def _has_page() -> bool:
+    """Whether the scheduler that runs this can draw its page."""
+    return find_spec("bokeh") is not None
+
+
+def log_workers(client: Any, folder: Path) -> None:
+    """Have each worker, also those to come, write a log of its own into a folder, which is made.
+
+    Raises OSError where it cannot be made.
+    """
+    from pancam_graph.cluster._worker_log import WorkerLog  # noqa: PLC0415  it needs the extra
+
+    folder.mkdir(parents=True, exist_ok=True)
+    client.register_plugin(WorkerLog(folder.resolve()))
 
 
 def _cores() -> int:

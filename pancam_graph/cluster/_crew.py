@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from heapq import heapify, heappop, heappush
-from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -91,14 +90,6 @@ class Crew:
             for path in self._parcels:
                 with suppress(OSError):
                     path.unlink(missing_ok=True)
-
-    @property
-    def dashboard(self) -> str | None:
-        """The address of the scheduler's page of progress, if it has one."""
-        with suppress(Exception):  # what there is depends on the kind of client and cluster
-            link = self.client.dashboard_link
-            return str(link) if link and self.client.run_on_scheduler(_has_page) else None
-        return None
 
     def n_threads(self) -> int:
         """Threads of all workers that the scheduler knows. Raises ClusterError where it is gone."""
@@ -295,8 +286,3 @@ class _Run:
         self._over.update(numbers)
         if self._tell is not None:
             self._tell(len(self._over), len(self._items))
-
-
-def _has_page() -> bool:
-    """Whether the scheduler that runs this can show its page."""
-    return find_spec("bokeh") is not None

@@ -1,9 +1,11 @@
 """What runs on a worker: what it is and sees, and the tasks of a job."""
 
 import hashlib
+import logging
 import os
 import pickle
 import secrets
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -16,6 +18,7 @@ from pancam_graph.cluster._machine import difference
 
 __all__ = ["Machine", "Parcel", "Probe", "look_around", "run_batch", "worker_name"]
 
+_LOG = logging.getLogger(__name__)
 _PARCELS = 2
 """How many unpacked parcels a worker holds: that of a step, and that of the step before."""
 
@@ -90,10 +93,11 @@ def run_batch(
     other = difference(machine[1], machine[0]())
     if other is not None:  # a worker that came after the client had looked
         raise ClusterError(f"worker {worker_name()}: {other}")
-    shared = _unpacked(parcel)
+    shared, begun_s = _unpacked(parcel), time.perf_counter()
     with blas_on_one_thread(), in_this_thread():
         for item in items:
             function(shared, item)
+    _LOG.info("%.3f s: %s", time.perf_counter() - begun_s, items)
 
 
 @lru_cache(maxsize=_PARCELS)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from pancam_graph.base.errors import ClusterError, InputError
-from pancam_graph.cluster import Crew, Job, _machine, connected
+from pancam_graph.cluster import Crew, Job, _machine, connected, dashboard, log_workers
 from support import cluster_jobs
 from support.cluster_jobs import Folder, mark, mark_after, mark_but_for_seven, same
 
@@ -152,3 +152,17 @@ def test_what_comes_after_a_failure_is_left_too(client: Any, tmp_path: Path) -> 
         crew.share(job(mark_but_for_seven, tmp_path), range(11), after, lambda done, _: told.append(done))
     assert set(marks(tmp_path)) == {*range(7), 10}
     assert told[-1] == 11
+
+
+def test_each_worker_has_a_log(client: Any, tmp_path: Path) -> None:
+    logs, cache = tmp_path / "run.log.workers", tmp_path / "cache"
+    cache.mkdir()
+    log_workers(client, logs)
+    crew = Crew(client, folder=cache, machine=same)
+    with crew.at_work():
+        crew.share(job(mark, cache), range(4))
+    client.unregister_worker_plugin("pancam-graph-log")
+    text = [path.read_text() for path in sorted(logs.iterdir())]
+    assert len(text) == 2
+    assert all(f"{item}" in "".join(text) for item in range(4))
+    assert dashboard(client) is None or str(dashboard(client)).startswith("http")
