@@ -1,7 +1,7 @@
 """Which pictures are the same: alike in every sample, or one taken for two by all but its encoding."""
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +21,8 @@ _ALIKE = 0.98
 """Correlation of thumbnails from which pictures show the same; two views of one scene stay below 0.5."""
 _LEAST_CELLS = _SIDE**2 // 4
 """Cells that two pictures must both have."""
+_AT_ONCE = 512
+"""Pictures of which all pairs are compared at a time: memory does not grow with all pairs of a drive."""
 _SAME_POINTING_PX = 10.0
 """How far apart two pointings may be for pictures that are alike to be two exposures of one view."""
 
@@ -96,25 +98,40 @@ def same_looks(traverse: Traverse, looks: Mapping[int, Look]) -> dict[int, int]:
         if not look.blank and first.setdefault(look.digest, row) != row:
             same[row] = first[look.digest]
     rows = [row for row, look in sorted(looks.items()) if not look.blank and row not in same]
-    alike = _correlation([looks[row] for row in rows]) > _ALIKE if rows else np.zeros((0, 0), dtype=bool)
-    for one, other in np.argwhere(np.triu(alike, 1)).tolist():
+    for one, other in _alike([looks[row] for row in rows]):
         a, b = rows[one], rows[other]
         if a not in same and b not in same and _look_apart(traverse, a, b):
             same[b] = a
     return same
 
 
-def _correlation(looks: list[Look]) -> FloatArray:
-    """(n, n) correlations of thumbnails over the cells that both have; 0 where these are too few."""
-    x = np.array([look.thumbnail.ravel() for look in looks], dtype=float).reshape(len(looks), -1)
-    v = np.array([look.valid.ravel() for look in looks], dtype=float).reshape(len(looks), -1)
-    n = np.maximum(v @ v.T, 1.0)
-    mean = (x @ v.T) / n  # of each row's picture over the cells of the column's
-    variance = (x**2 @ v.T) / n - mean**2
-    covariance = (x @ x.T) / n - mean * mean.T
-    scale = np.sqrt(np.maximum(variance * variance.T, 0.0))
+def _alike(looks: Sequence[Look]) -> list[tuple[int, int]]:
+    """Pairs of looks that show the same, the first before the second, sorted; some of them at a time."""
+    pairs: list[tuple[int, int]] = []
+    for top in range(0, len(looks), _AT_ONCE):
+        for left in range(top, len(looks), _AT_ONCE):
+            correlation = _correlation(looks[top : top + _AT_ONCE], looks[left : left + _AT_ONCE])
+            close = np.argwhere(correlation > _ALIKE) + np.array([top, left])
+            pairs += [(one, other) for one, other in close.tolist() if one < other]
+    return sorted(pairs)
+
+
+def _correlation(first: Sequence[Look], second: Sequence[Look]) -> FloatArray:
+    """(n, m) correlations of thumbnails over the cells that both have; 0 where these are too few."""
+    (x, v), (y, w) = (_columns(looks) for looks in (first, second))
+    n = np.maximum(v @ w.T, 1.0)
+    mean_x, mean_y = (x @ w.T) / n, (v @ y.T) / n  # of each picture over the cells of the other
+    variance_x, variance_y = (x**2 @ w.T) / n - mean_x**2, (v @ (y**2).T) / n - mean_y**2
+    covariance = (x @ y.T) / n - mean_x * mean_y
+    scale = np.sqrt(np.maximum(variance_x * variance_y, 0.0))
     told = (n >= _LEAST_CELLS) & (scale > 0)
     return np.where(told, covariance / np.where(told, scale, 1.0), 0.0)
+
+
+def _columns(looks: Sequence[Look]) -> tuple[FloatArray, FloatArray]:
+    """Thumbnails (n, 4096), and 1 where they have data."""
+    thumbnails, valid = ([getattr(look, name).ravel() for look in looks] for name in ("thumbnail", "valid"))
+    return np.array(thumbnails, dtype=float), np.array(valid, dtype=float)
 
 
 def _look_apart(traverse: Traverse, a: int, b: int) -> bool:

@@ -286,6 +286,16 @@ def test_a_picture_encoded_anew_and_taken_for_another_view_is_the_same(tmp_path:
     assert same_pictures(pictured(tmp_path, "a.png", name, "c.png")) == {1: 0}
 
 
+@pytest.mark.parametrize("at_once", [1, 2, 512])
+def test_copies_are_found_however_far_apart_they_are_in_a_drive(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at_once: int
+) -> None:
+    monkeypatch.setattr("pancam_graph.io._looks._AT_ONCE", at_once)
+    for name, seed in (("a.png", 1), ("b.png", 2), ("c.webp", 1), ("d.jpg", 1)):
+        save(tmp_path / name, scene(seed))
+    assert same_pictures(pictured(tmp_path, "a.png", "b.png", "c.webp", "d.jpg")) == {2: 0, 3: 0}
+
+
 def test_two_exposures_of_one_pointing_are_two_pictures_and_their_copies_are_not(tmp_path: Path) -> None:
     noise = np.random.default_rng(3).normal(0, 1.5, (48, 64))
     save(tmp_path / "a.png", scene(1))
