@@ -114,6 +114,13 @@ def _add_options(parser: CommandParser) -> None:
         "CAHVOR files, in any world and scale, or a .nav of marsnav; priors stay those of the traverse",
     )
     add(
+        "--ties",
+        type=Path,
+        metavar="FILE",
+        help="ties to what is known, beside those of the traverse: a file that register wrote, or "
+        "constraints as traverse.json has them",
+    )
+    add(
         "--field",
         choices=("auto", "estimated", "held"),
         default="auto",
@@ -179,7 +186,7 @@ def _work(call: Invocation) -> int:
         from pancam_graph.cli._resumable import resumable
         from pancam_graph.cli._summary import print_summary
         from pancam_graph.data import parse_sharing
-        from pancam_graph.io import use_rig
+        from pancam_graph.io import read_ties, use_rig
         from pancam_graph.landmarks.kernel import must_compile
         from pancam_graph.results import check_exports, check_out, write_results
         from pancam_graph.solve import COMPILING, criteria
@@ -212,6 +219,8 @@ def _work(call: Invocation) -> int:
         traverse = read_input(arguments.folder)
         if arguments.use_rig is not None:
             traverse = use_rig(traverse, arguments.use_rig)
+        if arguments.ties is not None:
+            traverse = read_ties(arguments.ties, traverse)
         start = None
         if arguments.start is not None:
             traverse, start = started(traverse, arguments.start, incremental=arguments.incremental)

@@ -9,6 +9,7 @@ from pancam_graph.cli._convert import CONVERT
 from pancam_graph.cli._drive import DRIVE
 from pancam_graph.cli._init import INIT
 from pancam_graph.cli._refine import REFINE
+from pancam_graph.cli._register import REGISTER
 from pancam_graph.cli._render import RENDER
 from pancam_graph.cli._simulate import SIMULATE
 from pancam_graph.cli._terrain import TERRAIN
@@ -16,5 +17,5 @@ from pancam_graph.cli._terrain import TERRAIN
 __all__ = ["COMMANDS"]
 
 COMMANDS: Mapping[str, Command] = {
-    c.name: c for c in (REFINE, INIT, CHECK, TERRAIN, CONVERT, SIMULATE, RENDER, DRIVE, COMPLETION)
+    c.name: c for c in (REFINE, INIT, CHECK, TERRAIN, REGISTER, CONVERT, SIMULATE, RENDER, DRIVE, COMPLETION)
 }

@@ -50,6 +50,8 @@ from pancam_graph.io._schema import TraverseFile as TraverseFile
 from pancam_graph.io._seen_pictures import picture_digests as picture_digests
 from pancam_graph.io._surfaces import read_map_image as read_map_image
 from pancam_graph.io._surfaces import read_surface as read_surface
+from pancam_graph.io._ties_file import read_ties as read_ties
+from pancam_graph.io._ties_file import write_ties as write_ties
 from pancam_graph.io._traverse_json import read_traverse as read_traverse
 from pancam_graph.io._traverse_json import traverse_entries as traverse_entries
 from pancam_graph.io._traverse_json import traverse_of as traverse_of

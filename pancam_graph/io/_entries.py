@@ -17,6 +17,7 @@ __all__ = [
     "RIG_FORMAT",
     "SOLUTION_FORMAT",
     "TERRAIN_FORMAT",
+    "TIES_FORMAT",
     "TRAVERSE_FORMAT",
     "VERSION",
     "Entry",
@@ -31,6 +32,7 @@ RIG_FORMAT = "pancam-graph/rig"
 SOLUTION_FORMAT = "pancam-graph/solution"
 MOSAIC_FORMAT = "pancam-graph/mosaics"
 TERRAIN_FORMAT = "pancam-graph/terrain"
+TIES_FORMAT = "pancam-graph/ties"
 VERSION = 1
 
 Text = Annotated[str, Field(min_length=0)]

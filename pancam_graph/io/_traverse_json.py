@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path
 
 import numpy as np
 
@@ -14,7 +14,8 @@ from pancam_graph.data import Frame, NamedPoints, Observations, Stop, Surface, T
 from pancam_graph.io._constraint_entries import constraint_entry, points_csv, read_points, surface_files
 from pancam_graph.io._entries import TRAVERSE_FORMAT, VERSION, PoseEntry
 from pancam_graph.io._input_format import InputFormat
-from pancam_graph.io._json import prefixed, read_json, refused_by_schema, short, validated
+from pancam_graph.io._inside import inside
+from pancam_graph.io._json import prefixed, read_json, refused_by_schema, validated
 from pancam_graph.io._mask_files import mask_file, read_mask
 from pancam_graph.io._observations import observations_npz, read_observations
 from pancam_graph.io._pictures import left_out, read_picture
@@ -28,7 +29,8 @@ from pancam_graph.io._schema import (
     rig_entry,
 )
 from pancam_graph.io._seen_pictures import require_other_pictures
-from pancam_graph.io._surfaces import read_surface, write_surface
+from pancam_graph.io._surfaces import write_surface
+from pancam_graph.io._ties_file import constraints_of
 
 __all__ = ["TRAVERSE_FOLDER", "read_traverse", "traverse_entries", "traverse_of", "write_traverse"]
 
@@ -59,7 +61,7 @@ def read_traverse(folder: Path | str) -> Traverse:
     entries = validated(TraverseFile, read_json(path, TRAVERSE_FORMAT, VERSION), path)
     with prefixed(path):
         files = [
-            [_inside(folder, name, f"images[{row}].{entry}") for entry, name in i.named_files.items()]
+            [inside(folder, name, f"images[{row}].{entry}") for entry, name in i.named_files.items()]
             for row, i in enumerate(entries.images)
         ]
         if entries.observations is None and not any(files):
@@ -68,11 +70,11 @@ def read_traverse(folder: Path | str) -> Traverse:
             )
         for row, image in enumerate(entries.images):
             if image.mask is not None:
-                _inside(folder, image.mask, f"images[{row}].mask")
+                inside(folder, image.mask, f"images[{row}].mask")
         source = None
         if entries.observations is not None:
-            source = _inside(folder, entries.observations, "observations")
-        marks = None if entries.points is None else _inside(folder, entries.points, "points")
+            source = inside(folder, entries.observations, "observations")
+        marks = None if entries.points is None else inside(folder, entries.points, "points")
     observations = None if source is None else read_observations(source)
     points = None if marks is None else read_points(marks, [i.id for i in entries.images])
     traverse = _checked(entries, path, observations, source, points)
@@ -173,14 +175,7 @@ def traverse_of(
     if entries.site is not None:
         with prefixed("site"):
             site = entries.site.site()
-    constraints = []
-    surfaces: dict[str, Surface] = {}
-    for i, entry in enumerate(entries.constraints):
-        with prefixed(f"constraints[{i}] ({entry.kind})"):
-            if isinstance(file := getattr(entry, "file", None), str) and file not in surfaces:
-                places = np.array([s.world_T_mast.translation()[:2] for s in stops])
-                surfaces[file] = read_surface(_inside(folder, file, "file"), places, site)
-            constraints.append(entry.constraint(surfaces))
+    places = np.array([s.world_T_mast.translation()[:2] for s in stops])
     return Traverse(
         name=entries.name if entries.name is not None else visible(folder.resolve().name),
         rig=entries.rig.rig(),
@@ -190,7 +185,7 @@ def traverse_of(
         observations=None if observations is None else observations.with_points(points),
         sharing=None if entries.sharing is None else entries.sharing.sharing(),
         folder=folder,
-        constraints=tuple(constraints),
+        constraints=constraints_of(entries.constraints, folder, places, site),
         points=points,
         site=site,
     )
@@ -236,22 +231,6 @@ def traverse_entries(traverse: Traverse) -> TraverseFile:
 TRAVERSE_FOLDER = InputFormat(
     needs=_TRAVERSE_JSON, matches=lambda names: _TRAVERSE_JSON in names, read=read_traverse
 )
-
-
-def _inside(folder: Path, name: str, entry: str) -> Path:
-    """Path of a file that an entry names. Raises InputError unless it lies in the folder, links followed."""
-    expected = f"{entry}: expected a path inside the traverse folder"
-    for kind in (PurePosixPath, PureWindowsPath):
-        pure = kind(name)
-        if pure.is_absolute() or pure.drive or ".." in pure.parts:
-            raise InputError(f"{expected}, found {short(name)}")
-    try:
-        inside = (folder / name).resolve().is_relative_to(folder.resolve())
-    except (OSError, RuntimeError, ValueError) as error:  # a ring of links, a NUL in the name
-        raise InputError(f"{expected}, found {short(name)} ({error})") from error
-    if not inside:
-        raise InputError(f"{expected}, found {short(name)}, a link that leads out of it")
-    return folder / name
 
 
 def _unusable_images(files: list[list[Path]], traverse: Traverse) -> dict[str, ImageError]:
@@ -313,7 +292,7 @@ def _copies(traverse: Traverse, folder: Path) -> list[tuple[Path, Path]]:
         for kind, name in (*((f"file {file}", file) for file in i.files), ("mask", i.mask))
         if name is not None
     ]
-    files = {folder / name: _inside(traverse.folder, name, entry) for entry, name in named}
+    files = {folder / name: inside(traverse.folder, name, entry) for entry, name in named}
     for row in range(len(traverse.images)):
         mask = mask_file(traverse, row)  # also a mask that no entry names
         if mask is not None:

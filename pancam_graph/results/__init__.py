@@ -26,13 +26,17 @@ if TYPE_CHECKING:
     from pancam_graph.results._plots import check_plots as check_plots
     from pancam_graph.results._plots import write_plots as write_plots
     from pancam_graph.results._refined_drive import read_drive as read_drive
+    from pancam_graph.results._register import Registered as Registered
+    from pancam_graph.results._register import register as register
     from pancam_graph.results._terrain import write_terrain_of as write_terrain_of
 else:
     _LATE = {
         "Converted": "_convert",
+        "Registered": "_register",
         "check_plots": "_plots",
         "convert": "_convert",
         "read_drive": "_refined_drive",
+        "register": "_register",
         "write_plots": "_plots",
         "write_terrain_of": "_terrain",
     }

@@ -30,6 +30,10 @@ _ACROSS_PX = 0.05
 """Standard deviation of where a pixel looks, across its line of sight."""
 _ALIKE = 2.0
 """Points of a frame in one cell of which one counts as a measurement: windows of neighbours overlap."""
+_UNSEEN = 0.04
+"""Standard deviation of a cell's height about what points of the frame show of it, over the distance of
+neighbouring rows along the ground: what lies between rows is not seen, and hollows are hidden. From rendered
+ground (docs/terrain.md)."""
 _JUMP_PX = 0.6
 """Difference of two neighbours' disparities between which something is hidden: on level ground it is the
 baseline over the mast's height, 0.13."""
@@ -120,7 +124,8 @@ class Surface:
         x, y = grid.part(int(low[1]), int(low[0]), *seen.shape).middles()
         centre = origin if move is None else move[0] @ origin + move[1]
         away2 = (x - centre[0]) ** 2 + ((y - centre[1]) ** 2)[:, None]
-        whole = total[4] + np.float32(self.tilt_sigma_rad**2) * away2.astype(np.float32)
+        unseen_m = _UNSEEN * ground_spacing_m(np.sqrt(away2), self.stands_m, self.focal_px)
+        whole = total[4] + (self.tilt_sigma_rad**2 * away2 + unseen_m**2).astype(np.float32)
         return Layer(
             frame=self.pair.frame,
             first_row=int(low[1]),
