@@ -59,8 +59,8 @@ def test_python_m_is_the_command() -> None:
     [
         (
             [],
-            "expected a subcommand (refine, init, check, terrain, convert, simulate, render, drive, "
-            "completion), found none",
+            "expected a subcommand (refine, init, check, terrain, register, convert, simulate, render, "
+            "drive, completion), found none",
         ),
         (["refin"], "found 'refin'; is 'refine' meant?"),
         (["--vers"], "expected one of its options, found --vers; is '--version' meant?"),
