@@ -17,6 +17,7 @@ from benchmarks.cases import CASES, DEFAULT_CASES, chosen_cases
 from benchmarks.engines import ENGINES
 from benchmarks.report import against_baseline, read_baseline, write_baseline
 from benchmarks.running import prepare, run_cases
+from benchmarks.terrain import measure_terrain, table
 from pancam_graph.base.errors import InputError
 from pancam_graph.cli import ScriptParser, run, show_log
 
@@ -39,9 +40,22 @@ def main() -> int:
     add("--ceres", type=Path, help="compiled program (compiled from ../shared/bench where that is possible)")
     add("--json", type=Path, help="file to write; must be new (out/benchmark-TIME.json)")
     add("--tolerance", type=float, default=0.25, help="how much worse a ratio may get (%(default)s)")
+    add(
+        "--terrain",
+        nargs=2,
+        action="append",
+        metavar=("RIG", "SEED"),
+        help="instead of solving: render, refine and make terrain of this drive, each as a process, and "
+        "compare with the rendering's truth; may be repeated",
+    )
     add("--write-baseline", action="store_true", help=f"renew the measured ratios in {BASELINE.name}")
     a = parser.parse_args()
     show_log(verbose=a.verbose)
+    if a.terrain:
+        with tempfile.TemporaryDirectory(prefix="pancam-graph-benchmark-") as work:
+            found = [measure_terrain(rig, _whole(seed), Path(work)) for rig, seed in a.terrain]
+        print(table(found))
+        return 0
     path = a.json or Path("out") / f"benchmark-{time.strftime('%Y%m%d-%H%M%S')}.json"
     if path.exists():
         raise InputError(f"{path}: expected a new file, found one that is there")
@@ -62,6 +76,13 @@ def main() -> int:
     path.write_text(report.to_json(), encoding="utf-8")
     print(report.text([*changes, f"all figures: {path}"], faults))
     return 1 if faults else 0
+
+
+def _whole(text: str) -> int:
+    """A seed. Raises InputError for what is no whole number."""
+    if not text.isdecimal():
+        raise InputError(f"--terrain: expected a seed of 0 or more, found {text}")
+    return int(text)
 
 
 if __name__ == "__main__":

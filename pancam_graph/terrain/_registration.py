@@ -4,8 +4,8 @@ Pictures from orbit and from the ground differ in light and contrast. What they 
 changes, and along which direction: gradients over their own length, with small ones faded out (orientation
 correlation: Fitch, Kadyrov, Christmas and Kittler 2002), are correlated by FFT over all shifts, at turns in
 even steps and then in steps four times as fine. From the best, least squares of brightness finds
-the rest of shift and turn. Its errors hang together from pixel to pixel; the covariance (H^-1 B H^-1) counts
-them as the residuals say they do.
+the rest of shift and turn, and by how much the view lies farther out than the map. Its errors hang together
+from pixel to pixel; the covariance (H^-1 B H^-1) counts parts of the view as independent, not pixels.
 """
 
 from dataclasses import dataclass
@@ -37,12 +37,15 @@ _CELLS_PER_PIXEL = 4
 """Cells of a view along a pixel of the map, at least, where the view has several sizes of them."""
 _HIGH_PASS_PX = 8.0
 """Standard deviation of the blur that brightness is compared above of."""
-_REACH_PX = 10
-"""Pixels over which residuals are taken to hang together."""
+_SECTORS, _RINGS = 12, 2
+"""Parts of a view whose residuals are taken to be independent of each other."""
 _ROUNDS = 30
-_SHAPE_PX = 0.05
-"""Sigma, pixels, of what shapes seen from the side and from above differ by, which no residual's covariance
-knows: measured on four rendered stops, whose squared errors without it are 5 times the variances."""
+_SHAPE_PX = 0.06
+"""Sigma, pixels, of what shapes seen from the side and from above differ by all around, which no residual
+tells: slopes that face the camera count more, and where the sun lights them the whole view seems to move
+towards it. From four rendered stops (docs/terrain.md)."""
+_OUTWARD_PX, _OUTWARD_SHARE = 0.3, 0.005
+"""Sigmas, pixels and a share of the distance, of how much farther out things seem to stand from the side."""
 _FINE = 4
 _LOOSE_RAD, _LOOSE_M = 1.0, 100.0
 """Sigmas of what a map from above does not tell: roll and pitch, and height without a surface."""
@@ -283,7 +286,9 @@ def _refined(
 ) -> tuple[float, FloatArray, FloatArray]:
     """Turn, shift (2,) right and down, and their covariance (3, 3), by least squares of brightness.
 
-    The model: the view is a x map + b at each place, both without what is broader than some pixels.
+    The model: the view is a x map + b at each place, both without what is broader than some pixels. The view
+    may lie farther out than the map, by a number of pixels and by a share of the distance, both known to be
+    small: what is seen from the side seems to stand elsewhere, by as much all around.
     """
     seen = np.isfinite(patch)
     inner = scipy.ndimage.binary_erosion(seen, iterations=2, border_value=0)
@@ -293,13 +298,23 @@ def _refined(
     middle = (patch.shape[0] - 1) / 2
     row, column = np.nonzero(inner)
     u, v = column - middle, row - middle  # right and down
-    state = np.array([peak.turn_rad, *peak.shift_px], dtype=float)
-    residual, jacobian = np.zeros(len(u)), np.zeros((len(u), 3))
+    far = np.hypot(u, v)
+    outward = np.stack([u, v]) / np.maximum(far, 1.0)
+    state = np.array([peak.turn_rad, *peak.shift_px, 0.0, 0.0], dtype=float)
+    residual, both = np.zeros(len(u)), np.zeros((len(u), 6))
+    prior = np.array([_OUTWARD_PX, _OUTWARD_SHARE]) ** 2
     for _ in range(_ROUNDS):
         c, s = np.cos(state[0]), np.sin(state[0])
         # Anticlockwise from above with v down: right' = c u + s v, down' = -s u + c v.
         x, y = c * u + s * v, -s * u + c * v
-        place = np.array([y + state[2], x + state[1]]) + middle + margin
+        out_x, out_y = c * outward[0] + s * outward[1], -s * outward[0] + c * outward[1]
+        place = np.array(
+            [
+                y + state[2] + state[3] * out_y + state[4] * y,
+                x + state[1] + state[3] * out_x + state[4] * x,
+            ]
+        )
+        place += middle + margin
         value = scipy.ndimage.map_coordinates(coefficients, place, prefilter=False)
         h = 0.5
         down, right = (
@@ -313,16 +328,22 @@ def _refined(
         gain = float(value @ high) / float(value @ value)
         residual = high - gain * value
         # Of right' by the turn it is y, of down' it is -x.
-        jacobian = gain * np.column_stack([right * y - down * x, right, down])
-        both = np.column_stack([jacobian, value])
-        step = np.linalg.lstsq(both, residual, rcond=None)[0][:3]
+        turned, along = right * y - down * x, right * out_x + down * out_y
+        both = np.column_stack(
+            [gain * np.stack([turned, right, down, along, right * x + down * y], 1), value]
+        )
+        step = np.linalg.lstsq(both, residual, rcond=None)[0][:5]
         state = state + step
-        if np.abs(step / [1 / max(middle, 1.0), 1.0, 1.0]).max() < 1e-4:
+        if np.abs(step[:3] / [1 / max(middle, 1.0), 1.0, 1.0]).max() < 1e-4:
             break
-    shape = np.diag([1 / np.sqrt(np.mean(u * u + v * v)), 1.0, 1.0]) * _SHAPE_PX
     normal = np.linalg.inv(both.T @ both)
-    covariance = normal @ _meat(both, residual, inner) @ normal
-    return float(state[0]), state[1:], covariance[:3, :3] + shape @ shape
+    covariance = (normal @ _meat(both, residual, inner, (u, v)) @ normal)[:5, :5]
+    # What is known of the last two changes the others as far as they hang together.
+    share = covariance[:, 3:] @ np.linalg.inv(covariance[3:, 3:] + np.diag(prior))
+    state, covariance = state - share @ state[3:], covariance - share @ covariance[3:]
+    # Of the whole circle or of a part of it, a shift of _SHAPE_PX looks like a turn at the mean distance.
+    shape = np.diag([1 / np.sqrt(np.mean(far * far)), 1.0, 1.0]) * _SHAPE_PX
+    return float(state[0]), state[1:3], covariance[:3, :3] + shape @ shape
 
 
 def _high_pass(grey: FloatArray, seen: BoolArray) -> FloatArray:
@@ -332,34 +353,25 @@ def _high_pass(grey: FloatArray, seen: BoolArray) -> FloatArray:
     return np.where(seen, np.nan_to_num(grey) - mean, 0.0)
 
 
-def _meat(jacobian: FloatArray, residual: FloatArray, inner: BoolArray) -> FloatArray:
-    """J' C J, C being the covariance of residuals: that of their distance, as they have it on average."""
-    shape, n = inner.shape, jacobian.shape[1]
-    fields = np.zeros((n + 1, *shape))
-    fields[:n, inner], fields[n, inner] = jacobian.T, residual
-    size = tuple(scipy.fft.next_fast_len(s + 2 * _REACH_PX) for s in shape)
-    spectra = scipy.fft.rfft2(fields, size)
-    of_mask = scipy.fft.rfft2(inner.astype(float), size)
+def _meat(
+    jacobian: FloatArray, residual: FloatArray, inner: BoolArray, offset_px: tuple[FloatArray, FloatArray]
+) -> FloatArray:
+    """J' C J, C being the covariance of the residuals: from the sums of J' r over parts of the view.
 
-    def lags(power: FloatArray) -> FloatArray:
-        every = scipy.fft.irfft2(power, size)
-        return np.asarray(every)
-
-    pairs = lags(np.abs(of_mask) ** 2).clip(1.0)
-    covariance = lags(np.abs(spectra[n]) ** 2) / pairs
-    rows = np.minimum(np.arange(size[0]), size[0] - np.arange(size[0]))
-    columns = np.minimum(np.arange(size[1]), size[1] - np.arange(size[1]))
-    distance = np.hypot(rows[:, None], columns)
-    # A window that falls to 0 keeps the sum positive (Bartlett's, over the distance).
-    window = np.clip(1 - distance / _REACH_PX, 0, None)
-    weight = covariance * window
-    out = np.zeros((n, n))
-    for i in range(n):
-        for j in range(i, n):
-            out[i, j] = out[j, i] = np.sum(weight * lags(spectra[i] * np.conj(spectra[j])))
-    values, vectors = np.linalg.eigh(out)
-    least = float(residual @ residual) / len(residual) * np.linalg.eigvalsh(jacobian.T @ jacobian)[0]
-    return np.asarray((vectors * values.clip(least)) @ vectors.T)
+    Within a part (a sector and a ring) residuals may hang together in any way; parts count as independent
+    (Liang and Zeger 1986), and few of them as few.
+    """
+    azimuth, distance = np.arctan2(offset_px[1], offset_px[0]), np.hypot(*offset_px)
+    sector, ring = (
+        np.searchsorted(np.quantile(values, np.arange(1, n) / n), values)
+        for values, n in ((azimuth, _SECTORS), (distance, _RINGS))
+    )
+    part = sector * _RINGS + ring
+    sums = np.stack(
+        [np.bincount(part, weights=j * residual, minlength=_SECTORS * _RINGS) for j in jacobian.T]
+    )
+    used = int(np.count_nonzero(np.bincount(part)))
+    return np.asarray(sums @ sums.T * (used / (used - jacobian.shape[1])))
 
 
 def _height(
