@@ -21,6 +21,9 @@ from pancam_graph.io._surfaces import read_surface
 __all__ = ["constraints_of", "read_ties", "write_ties"]
 
 
+_FREE_RAD, _FREE_M = 1.0, 100.0
+
+
 class _TiesFile(Entry):
     format: Literal["pancam-graph/ties"] = "pancam-graph/ties"
     version: Literal[1] = 1
@@ -30,6 +33,9 @@ class _TiesFile(Entry):
 def read_ties(path: Path | str, traverse: Traverse) -> Traverse:
     """The traverse with the ties of a file beside its own; surfaces lie in the folder of that file.
 
+    A stop that the traverse holds (sigma 0: the world frame is that of it) and that has a tie of its pose here
+    is held by the tie instead, its own sigmas become 1 rad and 100 m.
+
     Raises InputError naming file and entry: for what `traverse.json` would be refused for too.
     """
     path = Path(path)
@@ -37,7 +43,14 @@ def read_ties(path: Path | str, traverse: Traverse) -> Traverse:
     places = np.array([stop.world_T_mast.translation()[:2] for stop in traverse.stops])
     with prefixed(path):
         ties = constraints_of(entries.constraints, path.parent, places, traverse.site)
-        return replace(traverse, constraints=(*traverse.constraints, *ties))
+        placed = {tie.stop for tie in ties if isinstance(tie, StopPlacement)}
+        stops = tuple(
+            replace(stop, sigma_rotation_rad=_FREE_RAD, sigma_translation_m=_FREE_M)
+            if stop.id in placed and not stop.sigmas.any()
+            else stop
+            for stop in traverse.stops
+        )
+        return replace(traverse, stops=stops, constraints=(*traverse.constraints, *ties))
 
 
 def write_ties(ties: Sequence[StopPlacement], path: Path | str) -> None:

@@ -28,7 +28,7 @@ class Registered:
 
     found: tuple[Registration, ...]
     ties: tuple[StopPlacement, ...]
-    """One a stop that was found."""
+    """One a stop that was found; of a stop that the traverse holds (sigma 0) with its roll and pitch."""
     missing: tuple[str, ...]
     """A sentence for each stop that was not."""
 
@@ -79,5 +79,8 @@ def register(
             progress("registering", number + 1, len(terrain.stops))
     if not found:
         raise InputError(f"{map_file}: {missing[0]}")
-    ties = tuple(one.constraint(poses[one.stop]) for one in found)
+    held = {stop.id for stop in drive.traverse.stops if not stop.sigmas.any()}
+    ties = tuple(
+        one.constraint(poses[one.stop], held=one.stop in held, robust=one.stop not in held) for one in found
+    )
     return Registered(found=tuple(found), ties=ties, missing=tuple(missing))

@@ -49,6 +49,8 @@ _OUTWARD_PX, _OUTWARD_SHARE = 0.3, 0.005
 _FINE = 4
 _LOOSE_RAD, _LOOSE_M = 1.0, 100.0
 """Sigmas of what a map from above does not tell: roll and pitch, and height without a surface."""
+_HELD = 1e-5
+"""The same, radians and metres, where the world frame is that of the stop: as good as exact."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -72,8 +74,14 @@ class Registration:
     second: float
     """Largest correlation at another place, as a share of the best."""
 
-    def constraint(self, world_T_mast: gtsam.Pose3, *, robust: bool = True) -> StopPlacement:
-        """The tie of a stop whose pose was this when its view was made, for another solve."""
+    def constraint(
+        self, world_T_mast: gtsam.Pose3, *, robust: bool = True, held: bool = False
+    ) -> StopPlacement:
+        """The tie of a stop whose pose was this when its view was made, for another solve.
+
+        `held`: roll and pitch, and without a surface the height, are those of this pose, as for a stop that
+        the world frame is that of; else nothing is said of them.
+        """
         rotation, place = world_T_mast.rotation().matrix(), world_T_mast.translation()
         up = 0.0 if self.height_m is None else self.height_m
         moved = gtsam.Pose3(
@@ -83,8 +91,8 @@ class Registration:
         world = np.zeros((6, 6))  # of turns and shifts along the world's axes
         known = np.array([2, 3, 4])
         world[np.ix_(known, known)] = self.covariance
-        world[[0, 1], [0, 1]] = _LOOSE_RAD**2
-        world[5, 5] = (self.sigma_height_m or _LOOSE_M) ** 2
+        world[[0, 1], [0, 1]] = (_HELD if held else _LOOSE_RAD) ** 2
+        world[5, 5] = (self.sigma_height_m or (_HELD if held else _LOOSE_M)) ** 2
         body = np.kron(np.eye(2), (gtsam.Rot3.Rz(self.turn_rad).matrix() @ rotation).T)
         covariance = body @ world @ body.T
         return StopPlacement(

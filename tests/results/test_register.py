@@ -61,11 +61,9 @@ def write_map(
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Results of a stop whose place is known to a metre, beside the drive that was refined."""
+    """Results of a stop that is held where telemetry has it, beside the drive that was refined."""
     folder = tmp_path_factory.mktemp("plane")
     solution: Solution = solved(SCENE, folder)
-    loose = replace(solution.traverse.stops[0], sigma_translation_m=1.0, sigma_rotation_rad=0.05)
-    solution = replace(solution, traverse=replace(solution.traverse, stops=(loose,)))
     write_traverse(solution.traverse, folder)
     write_results(solution, folder / "out", report=False)
     return folder / "out"
@@ -82,7 +80,7 @@ def test_a_stop_goes_where_the_map_has_it(
     assert main(["register", str(results), *words, "--dem", str(dem)]) == 0
     assert "stop A/1: moves by +0.4" in capsys.readouterr().out
     entry = json.loads(ties.read_text())["constraints"][0]
-    assert (entry["kind"], entry["stop"], entry["robust"]) == ("stop-position", "A/1", True)
+    assert (entry["kind"], entry["stop"], "robust" in entry) == ("stop-position", "A/1", False)  # it is held
     traverse = read_ties(ties, read_traverse(results.parent))
     (tie,) = traverse.constraints
     assert isinstance(tie, StopPlacement)
@@ -132,7 +130,10 @@ def test_ties_of_a_file_are_those_of_the_traverse_beside_its_own(tmp_path: Path)
         stop=stop.id, world_T_mast=stop.world_T_mast, covariance=np.eye(6) * 1e-4, robust=True
     )
     write_ties([tie], tmp_path / "ties.json")
-    (read,) = read_ties(tmp_path / "ties.json", traverse).constraints
+    tied = read_ties(tmp_path / "ties.json", traverse)
+    assert (stop.sigmas == 0).all()
+    assert (tied.stops[0].sigmas > 0).all()  # held by the tie now
+    (read,) = tied.constraints
     assert isinstance(read, StopPlacement)
     np.testing.assert_allclose(read.world_T_mast.matrix(), tie.world_T_mast.matrix(), atol=1e-12)
     np.testing.assert_array_equal(read.covariance, tie.covariance)
