@@ -33,7 +33,7 @@ class _TiesFile(Entry):
 def read_ties(path: Path | str, traverse: Traverse) -> Traverse:
     """The traverse with the ties of a file beside its own; surfaces lie in the folder of that file.
 
-    A stop that the traverse holds (sigma 0: the world frame is that of it) and that has a tie of its pose here
+    A stop that the traverse holds (sigma 0: the world frame is its own) and that has a tie of its pose here
     is held by the tie instead, its own sigmas become 1 rad and 100 m.
 
     Raises InputError naming file and entry: for what `traverse.json` would be refused for too.
