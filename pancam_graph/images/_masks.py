@@ -55,7 +55,13 @@ class ImageMask:
 
     def share(self, reason: Reason) -> float:
         """Share of the image's pixels that are left out for a reason."""
-        return float(np.mean(self.reasons & np.uint8(reason) > 0))
+        return self.shares()[reason]
+
+    def shares(self) -> dict[Reason, float]:
+        """Share of the image's pixels that are left out, by the reason."""
+        count = np.bincount(self.reasons.ravel())
+        sums = np.arange(len(count))
+        return {reason: float(count[sums & reason > 0].sum() / self.reasons.size) for reason in Reason}
 
     def with_rover(self, rover: BoolArray) -> "ImageMask":
         """This mask with the rover's pixels added."""

@@ -228,7 +228,7 @@ class Steps:
             return {
                 "reasons": np.frombuffer(zlib.compress(mask.reasons.tobytes(), 1), dtype=np.uint8),
                 "digests": np.array([digest(each) for each in digests]),
-                "share": np.array([mask.share(reason) for reason in Reason]),
+                "share": np.array(list(mask.shares().values())),
             }
 
         if row not in self._mask_keys:
