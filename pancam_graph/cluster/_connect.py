@@ -20,9 +20,14 @@ EXTRA = "cluster"
 _LOCAL = re.compile(r"local(?::([1-9][0-9]{0,3}))?")
 _REMOTE = re.compile(r"(?:tcp|tls|ucx|ws|wss)://[^\s/]+:[0-9]+")
 _CONNECT_S = 10.0
-_MEMORY = {"MALLOC_TRIM_THRESHOLD_": 256 << 20, "MALLOC_MMAP_THRESHOLD_": 32 << 20}
-"""What a worker keeps of memory that it has freed, bytes. By Dask's choice (64 kB) the system clears each
-page of each array anew, which takes nearly as long as the work on pictures."""
+_ENVIRONMENT = {
+    "PANCAM_GRAPH_THREADS": 1,
+    "MALLOC_TRIM_THRESHOLD_": 256 << 20,
+    "MALLOC_MMAP_THRESHOLD_": 32 << 20,
+}
+"""Of workers. What they hold in memory is by the number of threads. The other two are what they keep of
+memory that they have freed, bytes: by Dask's choice (64 kB) the system clears each page of each array anew,
+which takes nearly as long as the work on pictures."""
 
 
 @contextmanager
@@ -83,7 +88,9 @@ def _as_client(distributed: Any, cluster: Any) -> Iterator[Any]:
 @contextmanager
 def _own_workers(distributed: Any, n: int) -> Iterator[Any]:
     """Processes of this machine, begun here and not waited for."""
-    environment = {f"distributed.nanny.pre-spawn-environ.{name}": value for name, value in _MEMORY.items()}
+    environment = {
+        f"distributed.nanny.pre-spawn-environ.{name}": value for name, value in _ENVIRONMENT.items()
+    }
     with needed("dask", EXTRA).config.set(environment):
         cluster = distributed.LocalCluster(
             n_workers=0,

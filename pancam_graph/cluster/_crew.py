@@ -26,7 +26,7 @@ _LOG = logging.getLogger(__name__)
 _POLL_S = 1.0
 _WAIT_FOR_WORKERS_S = 60.0
 _LOOK_AGAIN_S = 0.05
-_AHEAD = 4
+_AHEAD = 8
 """Batches that the scheduler has, per thread of a worker: enough that no thread waits for the client."""
 _SHARE = 8
 """Batches per thread that ready items are split into, so that the last ones end at about the same time."""
@@ -163,10 +163,12 @@ class Crew:
             self._parcels.add(path)
         return Parcel(path=path, digest=digest)
 
-    def submit(self, run: Callable[..., None], *arguments: Any) -> Any:
-        """A future of run(machine, *arguments)."""
+    def submit(self, job: Job, parcel: Parcel, batches: Sequence[Sequence[Any]]) -> Any:
+        """A future of each batch of items."""
         try:
-            return self.client.submit(run, self._machine, *arguments, pure=False)
+            return self.client.map(
+                run_batch, batches, machine=self._machine, function=job.function, parcel=parcel, pure=False
+            )
         except Exception as error:  # whatever a client raises that has lost its scheduler
             raise self.gone() from error
 
@@ -219,18 +221,23 @@ class _Run:
                     self._crew.client.cancel(list(self._running), force=True)
 
     def _begin(self) -> None:
-        """Hand batches to the scheduler until it has enough."""
-        while len(self._running) < _AHEAD * self._threads and (self._again or self._ready):
+        """Hand batches to the scheduler, many at once, where it has little left."""
+        most, batches = _AHEAD * self._threads, list[_Batch]()
+        if len(self._running) > most // 2:
+            return
+        while len(self._running) + len(batches) < most and (self._again or self._ready):
             if self._again:
                 batch = self._again.popleft()
             else:
                 size = max(1, min(_MOST_IN_BATCH, len(self._ready) // (_SHARE * self._threads)))
                 batch = _Batch([heappop(self._ready) for _ in range(size)])
             batch.tries += 1
-            items = [self._items[number] for number in batch.numbers]
-            future = self._crew.submit(run_batch, self._job.function, self._parcel, items)
-            self._running[future] = batch
-            future.add_done_callback(self._ended.put)
+            batches.append(batch)
+        if batches:
+            items = [[self._items[number] for number in batch.numbers] for batch in batches]
+            for future, batch in zip(self._crew.submit(self._job, self._parcel, items), batches, strict=True):
+                self._running[future] = batch
+                future.add_done_callback(self._ended.put)
 
     def _lonely(self, since_s: float | None) -> float | None:
         """Since when there is no worker; None: there is one."""

@@ -19,8 +19,6 @@ from pancam_graph.cluster._machine import difference
 __all__ = ["Machine", "Parcel", "Probe", "look_around", "run_batch", "worker_name"]
 
 _LOG = logging.getLogger(__name__)
-_PARCELS = 2
-"""How many unpacked parcels a worker holds: that of a step, and that of the step before."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +82,7 @@ def look_around(machine: Machine, probe: Probe) -> str | None:
 
 
 def run_batch(
-    machine: Machine, function: Callable[[Any, Any], Any], parcel: Parcel, items: Sequence[Any]
+    items: Sequence[Any], machine: Machine, function: Callable[[Any, Any], Any], parcel: Parcel
 ) -> None:
     """Call function(shared, item) for items one by one, each in this thread alone.
 
@@ -100,7 +98,7 @@ def run_batch(
     _LOG.info("%.3f s: %s", time.perf_counter() - begun_s, items)
 
 
-@lru_cache(maxsize=_PARCELS)
+@lru_cache(maxsize=1)  # it holds pictures in memory
 def _unpacked(parcel: Parcel) -> Any:
     try:
         content = parcel.path.read_bytes()
