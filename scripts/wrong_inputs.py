@@ -338,6 +338,8 @@ _FEW_LINKS = {"stops": 1, "pans": 7, "points_per_image": 15}
 """One panorama whose frames have few neighbours: many have one alone."""
 _ROW = {"pans": 8}
 """Whole turns of few frames."""
+_SMALL = {"pans": 4, "sweep_rad": 2.0, "points_per_image": 15}
+"""Four pans that overlap, of few points: a tenth of the time."""
 _DOWN = {"spacing_m": 0.5, "pans": 6, "tilts_rad": (-np.pi / 2,)}
 """Heads that look straight down, at stops so close that they see the same ground."""
 _MOUNTS = SolveOptions(sharing=Sharing(mounts=Freedom(scope="eye")))
@@ -464,9 +466,10 @@ class Outcome:
     """Names of the tests that failed; the error itself where nothing was solved."""
 
 
-def measure(case: Case, rig: str, seed: int, *, incremental: bool) -> Outcome:
-    """Simulate, spoil, solve, compare with the truth."""
-    options = SimulationOptions(**({"stops": 2} | dict(case.drive)))  # type: ignore[arg-type]  # by name
+def measure(case: Case, rig: str, seed: int, *, incremental: bool, small: bool = False) -> Outcome:
+    """Simulate, spoil, solve, compare with the truth; `small`: drives, as far as a case does not say."""
+    usual = {"stops": 2} | (_SMALL if small else {})
+    options = SimulationOptions(**(usual | dict(case.drive)))  # type: ignore[arg-type]  # by name
     simulation = simulate(rig_template(rig), options, seed=seed)
     traverse = case.fault(simulation, np.random.default_rng(seed))
     try:
@@ -516,6 +519,7 @@ def main() -> int:
     add("--groups", nargs="+", choices=tuple(GROUPS), default=list(GROUPS), metavar="GROUP")
     add("--only", nargs="+", metavar="TEXT", help="cases whose names contain one of these")
     add("--incremental", action="store_true", help="stop by stop")
+    add("--small", action="store_true", help="drives of four pans a stop with 15 points an image")
     a = parser.parse_args()
     if a.seeds < 1:
         raise InputError(f"--seeds: expected 1 or more, found {a.seeds}")
@@ -528,7 +532,7 @@ def main() -> int:
     for name, case in chosen.items():
         with progress.shown(name):
             outcomes = [
-                measure(case, rig, a.first_seed + i, incremental=a.incremental)
+                measure(case, rig, a.first_seed + i, incremental=a.incremental, small=a.small)
                 for i in range(a.seeds)
                 for rig in a.rigs
             ]

@@ -10,7 +10,7 @@ from pancam_graph import SimulationOptions, SolveOptions, simulate, solve
 from pancam_graph.base.errors import InputError
 from pancam_graph.graph import Model
 from pancam_graph.initialise import Start, start_from_telemetry
-from pancam_graph.rigs import mer_navcam
+from pancam_graph.rigs import TEMPLATES, mer_navcam
 from pancam_graph.simulate import Simulation
 from pancam_graph.solve import prepare
 from support.parameters import slow_but_for
@@ -87,3 +87,37 @@ def test_pan_is_known_where_the_head_looks_down(model: Model, tilt_deg: float) -
     angles, _ = errors_in_sigmas(simulation, solution)
     assert np.abs(angles).max() < 5
     assert np.rad2deg(solution.angle_sigma_rad.max()) < 1
+
+
+@pytest.mark.slow
+def test_pictures_that_hardly_overlap_do_not_tell_focal_lengths_and_say_so() -> None:
+    """Five pans of 60 degrees around a turn share a point or two: what was told badly stays as badly known.
+
+    Each eye's focal length is 5 % off as its sigma says, pans and tilts 50 mrad; the solution passes, and
+    its sigmas are what its errors are.
+    """
+    told_rad, told_focal = 0.05, 0.05
+    rig = TEMPLATES["stereo-pan-tilt"]()
+    options = SimulationOptions(stops=1, pans=5, tilts_rad=(-0.45,), points_per_image=40)
+    squares = []
+    for seed in range(1, 9):
+        made, rng = simulate(rig, options, seed=seed), np.random.default_rng([seed, 2])
+        eyes = []
+        for eye in rig.eyes:
+            K = eye.camera.pinhole.calibration_matrix.copy()
+            K[:2, :2] *= 1 + told_focal * rng.standard_normal()
+            eyes.append(replace(eye, camera=eye.camera.with_calibration(K)))
+        wide = replace(rig.uncertainty, focal=told_focal)
+        angles = made.truth.pan_tilt_rad + told_rad * rng.standard_normal(made.truth.pan_tilt_rad.shape)
+        frames = [
+            replace(f, pan_rad=float(p), tilt_rad=float(t), sigma_pan_rad=told_rad, sigma_tilt_rad=told_rad)
+            for f, (p, t) in zip(made.traverse.frames, angles, strict=True)
+        ]
+        told = replace(rig, eyes=tuple(eyes), uncertainty=wide)
+        solution = solve(replace(made.traverse, rig=told, frames=tuple(frames)))
+        assert solution.passed
+        focal = [entry for entry in solution.refined if entry.entry == "focal"]
+        assert min(entry.sigma for entry in focal) > 0.5 * told_focal
+        squares.append(errors_in_sigmas(made, solution)[0] ** 2)
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.45)  # 80 numbers, three of their standard errors
+    assert np.max(squares) < 16
