@@ -19,6 +19,7 @@ __all__ = [
     "Z_DOWN_R_Z_UP",
     "BoolArray",
     "FloatArray",
+    "Int32Array",
     "IntArray",
     "axes_across",
     "block_diagonal",
@@ -46,6 +47,7 @@ __all__ = [
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+Int32Array = NDArray[np.int32]
 BoolArray = NDArray[np.bool_]
 
 HEAD_R_FORWARD_CAMERA: FloatArray = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

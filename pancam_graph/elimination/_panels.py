@@ -93,9 +93,9 @@ class Panels:
         ]
         self._position = {g: i for i, g in enumerate(structure.order)}
 
-    def clear(self) -> None:
-        """Set everything to 0."""
-        self.numbers.fill(0.0)
+    def blank(self) -> "Panels":
+        """A system of the same structure that is 0."""
+        return self._with(np.zeros(len(self.numbers)))
 
     def _views(self) -> list[FloatArray]:
         """The panel of each group, in `numbers`."""
@@ -148,8 +148,11 @@ class Panels:
 
     def copy(self) -> "Panels":
         """The same system in memory of its own."""
+        return self._with(self.numbers.copy())
+
+    def _with(self, numbers: FloatArray) -> "Panels":
         twin = copy(self)
-        twin.numbers = self.numbers.copy()
+        twin.numbers = numbers
         twin.panel = twin._views()
         return twin
 

@@ -135,7 +135,7 @@ class LandmarkSystem:
         """(landmarks, 4) at the point of linearisation"""
         self.origin_m = landmarks.origin_m[self.landmark_row]
         self.structure = pattern(linkage.group_dim, [*reach.values(), *cliques], last=last)
-        self._panels = Panels(self.structure)
+        self._panels = Panels(self.structure)  # stays 0, and without memory where it is large
         self._layout = Layout.of(linkage)
         edges = np.flatnonzero(np.diff(first[self.landmark_row], prepend=-1, append=-1))
         self._arrange(measurements, first, reach, edges)
@@ -155,6 +155,8 @@ class LandmarkSystem:
         self._memory = room or Room()
         self._moved, self._moved_cost = np.empty_like(self.vector), np.zeros(n)
         self._has_moved = False
+        self._posture: Posture
+        self._rests = False
 
     def _arrange(
         self, m: Measurements, first: IntArray, reach: dict[int, tuple[int, ...]], edges: IntArray
@@ -172,13 +174,13 @@ class LandmarkSystem:
             uv_px=np.empty((0, 2)),
             whitening=np.empty((0, 2, 2)),
             occurrence_begin=np.empty(n_obs + 1, dtype=np.int64),
-            occurrence_unit=np.empty(n_obs, dtype=np.int64),
-            occurrence_row=np.empty(n_obs, dtype=np.int64),
+            occurrence_unit=np.empty(n_obs, dtype=np.int32),
+            occurrence_row=np.empty(n_obs, dtype=np.int32),
             place_begin=np.empty(n_obs + 1, dtype=np.int64),
-            place=np.empty(n_segments, dtype=np.int64),
+            place=np.empty(n_segments, dtype=np.int32),
             landmark_begin=np.empty(n + 1, dtype=np.int64),
             pair_begin=np.empty(n + 1, dtype=np.int64),
-            pair=np.empty(most_pairs, dtype=np.int64),
+            pair=np.empty(most_pairs, dtype=np.int32),
         )
         begin = m.begin
         rows, cursor = np.empty(n_obs, dtype=np.int64), np.zeros(4, dtype=np.int64)
@@ -244,12 +246,13 @@ class LandmarkSystem:
 
         These are the normal equations of cameras and landmarks (thesis eq. 3.40) with landmarks eliminated
         (eq. 3.42), linearised at the given posture and at the landmarks' linearisation point.
-
-        The panels are this object's own and are filled anew by the next call.
         """
         bearings, sights = self.bearings(posture), self._sights_at(posture.views)
+        if self._rests:
+            self.reduced = self.reduced._replace(arms=np.empty(6 * len(sights.pair)))
+        self._posture, self._rests = posture, False
         eliminate = kernel.eliminate_poses if bearings.chain.shape[1] == 6 else kernel.eliminate_calibrations
-        self._panels.clear()
+        panels = self._panels.blank()
         for wave in self._waves:
             systems = self._room(wave)
             n_entries = sum(len(S) for S, _ in systems)
@@ -279,7 +282,7 @@ class LandmarkSystem:
             def summed(first: int, last: int, wave: _Wave = wave, systems: _Systems = systems) -> None:
                 # In the order of the chunks, so that no bit depends on the number of threads.
                 for chunk, (S, s) in zip(wave, systems, strict=True):
-                    block, panels = self.blocks[chunk.block], self._panels
+                    block = self.blocks[chunk.block]
                     of_block = block.row, block.group, block.begin, block.panel_column
                     to = panels.begin, panels.width, panels.numbers
                     kernel.add_to_panels(S, s, *of_block, first, last, *to)
@@ -290,8 +293,8 @@ class LandmarkSystem:
             in_parallel(summed, n_groups, grain=grain)
             for chunk, (_, part) in zip(wave, parts, strict=False):
                 assert self._fields is not None
-                self._fields.add(part, self.blocks[chunk.block], self._panels)
-        return self._panels
+                self._fields.add(part, self.blocks[chunk.block], panels)
+        return panels
 
     def _of_chunk(self, chunk: _Chunk) -> _OfChunk:
         """What the loops that eliminate take of the landmarks of a chunk, in their order."""
@@ -318,6 +321,11 @@ class LandmarkSystem:
             self._plain = views.fields, self.sights._replace(uv_px=np.ascontiguousarray(uv_px))
         return self._plain[1]
 
+    def rest(self) -> None:
+        """Give back the memory of products of landmarks with cameras: what needs them linearises again."""
+        self.reduced, self._memory = self.reduced._replace(arms=np.empty(0)), Room()
+        self._rests = True
+
     def put_back(self, panels: Panels, g: int) -> tuple[FloatArray, FloatArray]:
         """The system (n, n), (n,) in the columns of one group, landmarks and other variables held.
 
@@ -343,6 +351,8 @@ class LandmarkSystem:
 
     def _dense_arms(self, chunk: _Chunk) -> FloatArray:
         """W = L^-1 E' (landmarks, 3, columns of the block) of the landmarks of a chunk."""
+        if self._rests:
+            self.linearise(self._posture)
         counts = np.diff(self.sights.pair_begin[chunk.begin : chunk.end + 1])
         first, last = self.sights.pair_begin[chunk.begin], self.sights.pair_begin[chunk.end]
         landmark, pair = np.repeat(np.arange(len(counts)), counts), self.sights.pair[first:last]
@@ -386,22 +396,13 @@ class LandmarkSystem:
         if self._fields is not None:
             reduced = reduced._replace(gamma=self._fields.following(reduced.gamma, posture.views))
 
+        landmarks = self.vector, self.origin_m, self.loss.kind, self.loss.width
+        moved = self._moved, self._moved_cost
+
         def work(begin: int, end: int) -> None:
             for chunk in self.chunks[begin:end]:
-                kernel.follow(
-                    sights,
-                    bearings,
-                    self.vector,
-                    self.origin_m,
-                    self.loss.kind,
-                    self.loss.width,
-                    chunk.begin,
-                    chunk.end,
-                    reduced,
-                    steps[chunk.block],
-                    self._moved,
-                    self._moved_cost,
-                )
+                some = chunk.begin, chunk.end, reduced, steps[chunk.block]
+                kernel.follow(sights, bearings, *landmarks, *some, *moved)
 
         in_parallel(work, len(self.chunks), grain=1)
         self._has_moved = True
@@ -441,19 +442,8 @@ class LandmarkSystem:
         if len(strays) == 0:
             return
         weight, loss, refined = np.ones(len(seen.image)), self.loss, self._moved.copy()
-        over_landmarks(
-            kernel.refine,
-            strays,
-            seen,
-            self.origin_m,
-            weight,
-            loss.kind,
-            loss.width,
-            True,
-            _REFINED,
-            refined,
-            grain=_STRAY_GRAIN,
-        )
+        given = self.origin_m, weight, loss.kind, loss.width, True, _REFINED
+        over_landmarks(kernel.refine, strays, seen, *given, refined, grain=_STRAY_GRAIN)
         self._take_if_better(strays, refined[strays], sights, bearings)
 
         strays = strays[self._moved_cost[strays] > _LOST * counts[strays]]
@@ -552,6 +542,8 @@ class LandmarkSystem:
         landmark's cameras; None: cameras are exact. Infinite for landmarks at infinity, NaN for those that
         are not among `only` (landmarks,).
         """
+        if self._rests:
+            self.linearise(self._posture)
         out = np.full((len(self.landmark_row), 3, 3), np.nan)
         of_block: list[list[_Chunk]] = [[] for _ in self.blocks]
         asked = None if only is None else np.flatnonzero(only[self.landmark_row])

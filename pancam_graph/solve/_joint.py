@@ -116,6 +116,7 @@ class JointSystem:
     def damped_root(self, damping: float) -> Root:
         """Square root with damping added to the diagonal of all groups except the last."""
         if self._damped is None or self._damped[0] != damping:
+            self._damped = self._root = None  # a step follows, and neither is needed any more
             panels = self.panels().copy()
             for g, panel in enumerate(panels.panel):
                 if g != self.last:

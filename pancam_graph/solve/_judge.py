@@ -127,6 +127,8 @@ def _uncertainty(
     asked = prepared.given_sharing is not None
     try:
         reduced = reduced_of(fitted, problem)
+        if places is None:
+            reduced.system.rest()
         covariances = uncertainty(problem, state, reduced, landmarks=places, unseen=asked)
     except SolveError as error:
         return _unknown(fitted), problem, None, [f"no uncertainties: {error}"]

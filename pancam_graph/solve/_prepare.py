@@ -184,13 +184,13 @@ def solver_for(
 def triangulated(problem: Problem) -> Problem:
     """Landmarks by linear triangulation; one behind a camera starts far off, where its cameras look."""
     m, views, weight = problem.measurements, problem.views, problem.accepted.astype(float)
-    centre, direction = rays_of(m, views)
-    landmarks = triangulate(centre, direction, m.landmark, weight)
+    landmarks = triangulate(*rays_of(m, views), m.landmark, weight)
     _, in_front = residuals(landmarks, m, views)
     behind = np.bincount(m.landmark, ~in_front & (weight > 0), minlength=m.n_landmarks) > 0
     problem = problem.having(landmarks=landmarks)
     if not behind.any():
         return problem
+    _, direction = rays_of(m, views)
     mean = np.add.reduceat(weight[:, None] * direction, m.starts)
     ahead = landmarks.moved_to(landmarks.origin_m + reach_m(problem)[:, None] * mean)
     vector = np.where(behind[:, None], ahead.vector, landmarks.vector)
@@ -289,7 +289,7 @@ def _measure(
     Tracks seen from one place alone are left out where their share is below `from_one_place`. Raises
     SolveError where no track is seen twice.
     """
-    *_, valid = lines_of_sight(observations.image, observations.uv_px, views)
+    valid = lines_of_sight(observations.image, observations.uv_px, views)[2]  # the lines are large
     order = _by_track(observations)
     tracks, valid = observations.track[order], valid[order]
     number: IntArray = np.cumsum(np.diff(tracks, prepend=tracks[:1]) > 0, dtype=np.int64)

@@ -314,8 +314,10 @@ def test_a_system_of_blocks_is_the_same_as_a_dense_piece(swapped: bool) -> None:
         panels.add_right(g, rows, system.s[system.begin[g] : system.begin[g + 1]][rows])
     assert whole(panels)[0] == pytest.approx(system.S, rel=1e-12)
     assert whole(panels)[1] == pytest.approx(system.s, rel=1e-12)
-    panels.clear()
-    assert not any(panel.any() for panel in panels.panel)
+    blank = panels.blank()
+    assert [panel.shape for panel in blank.panel] == [panel.shape for panel in panels.panel]
+    assert not any(panel.any() for panel in blank.panel)
+    assert whole(panels)[0] == pytest.approx(system.S, rel=1e-12)
 
 
 def test_a_system_that_is_not_finite_is_refused() -> None:
@@ -435,6 +437,20 @@ def test_what_landmarks_took_from_a_group_can_be_put_back(shared: bool, loss: Lo
         S, s = system.put_back(panels, g)
         assert S / np.outer(size, size) == pytest.approx(A.T @ A / np.outer(size, size) + np.eye(n), abs=1e-8)
         assert s / size == pytest.approx(A.T @ dense.r / size + 2, abs=1e-8 * float(np.linalg.norm(dense.r)))
+
+
+def test_a_system_that_rests_says_the_same_when_it_is_asked() -> None:
+    rigged = Rigged(shared=True)
+    system = LandmarkSystem(rigged.linkage, rigged.m, rigged.landmarks)
+    panels = system.linearise(rigged.posture())
+    exact, put_back = system.landmark_covariance_m2(None), system.put_back(panels, 0)
+    system.rest()
+    assert system.reduced.arms.size == 0
+    assert np.array_equal(system.landmark_covariance_m2(None), exact)
+    system.rest()
+    assert all(map(np.array_equal, system.put_back(panels, 0), put_back))
+    system.rest()
+    assert np.array_equal(whole(system.linearise(rigged.posture()))[0], whole(panels)[0])
 
 
 @pytest.mark.parametrize("loss", ["none", "huber"])

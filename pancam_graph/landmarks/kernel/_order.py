@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.base.geometry import BoolArray, FloatArray, Int32Array, IntArray
 from pancam_graph.landmarks.kernel._compiling import entry
 from pancam_graph.landmarks.kernel._observe import Cameras
 
@@ -29,19 +29,19 @@ class Sights(NamedTuple):
     """(n, 2, 2) takes residuals in pixels to unit covariance"""
     occurrence_begin: IntArray
     """(occurrences + 1,) first observation of each, and n"""
-    occurrence_unit: IntArray
+    occurrence_unit: Int32Array
     """(occurrences,) the unit of each"""
-    occurrence_row: IntArray
+    occurrence_row: Int32Array
     """(occurrences,) row of that unit among the units that see a landmark of the block"""
     place_begin: IntArray
     """(occurrences + 1,) first entry in `place` of each"""
-    place: IntArray
+    place: Int32Array
     """(places,) by occurrence and segment: where in its landmark's list of pairs the segment begins"""
     landmark_begin: IntArray
     """(landmarks + 1,) first occurrence of each"""
     pair_begin: IntArray
     """(landmarks + 1,) first pair of each"""
-    pair: IntArray
+    pair: Int32Array
     """(pairs,) number of the pair in the block"""
 
 

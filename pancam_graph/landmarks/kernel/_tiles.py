@@ -7,7 +7,7 @@ used; below the diagonal of a tile on it, entries have no meaning.
 from collections.abc import Callable
 
 from pancam_graph.base.compiled import chosen, part
-from pancam_graph.base.geometry import FloatArray, IntArray
+from pancam_graph.base.geometry import FloatArray, Int32Array, IntArray
 from pancam_graph.landmarks.kernel._compiling import entry
 
 __all__ = ["add_to_panels", "subtract_row", "tile_entry"]
@@ -27,7 +27,7 @@ def _fastest(plain: Callable[..., None]) -> Callable[..., None]:
 
 @chosen(_fastest)
 def subtract_row(
-    tiles: FloatArray, row: int, arms: FloatArray, first: int, last: int, pair: IntArray
+    tiles: FloatArray, row: int, arms: FloatArray, first: int, last: int, pair: Int32Array
 ) -> None:
     """Subtract W_p' W_q from a row of tiles: p is pair `first` of a landmark, q goes from `first` to `last`.
 
