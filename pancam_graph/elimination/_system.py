@@ -52,6 +52,9 @@ step only strays are; after a shorter one, back substitution places landmarks we
 of second order to need one more step of the cameras."""
 _REFINED = 0.1
 """Refinement of a stray ends when its expected decrease is at most this share of its cost."""
+_CREEPING = 1e-4
+"""Both shares with a robust loss: its weights let a landmark with an outlier go on by small steps, of which
+each would need a step of the cameras."""
 _STRAY_GRAIN = 256
 """Strays that one thread takes at once."""
 _COST_GRAIN = 8192
@@ -433,7 +436,8 @@ class LandmarkSystem:
         counts = self._counts
         before, after = self.reduced.cost, self._moved_cost
         # A landmark whose cost hardly changes is placed as well as before, however large its cost.
-        touched = np.abs(after - before) > _TOUCHED * before
+        share, settled = (_TOUCHED, _REFINED) if self.loss.kind == kernel.NONE else (_CREEPING, _CREEPING)
+        touched = np.abs(after - before) > share * before
         is_stray = (after > _LOST * counts) | touched & (after > _STRAY * counts)
         least, most = _HALFWAY
         is_halfway = least * before.sum() < before.sum() - after.sum() < most * before.sum()
@@ -442,7 +446,7 @@ class LandmarkSystem:
         if len(strays) == 0:
             return
         weight, loss, refined = np.ones(len(seen.image)), self.loss, self._moved.copy()
-        given = self.origin_m, weight, loss.kind, loss.width, True, _REFINED
+        given = self.origin_m, weight, loss.kind, loss.width, True, settled
         over_landmarks(kernel.refine, strays, seen, *given, refined, grain=_STRAY_GRAIN)
         self._take_if_better(strays, refined[strays], sights, bearings)
 
