@@ -130,6 +130,7 @@ def _uncertainty(
         if places is None:
             reduced.system.rest()
         covariances = uncertainty(problem, state, reduced, landmarks=places, unseen=asked)
+        reduced.system.rest()
     except SolveError as error:
         return _unknown(fitted), problem, None, [f"no uncertainties: {error}"]
     warnings = []
