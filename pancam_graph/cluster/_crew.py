@@ -250,13 +250,13 @@ class _Run:
 
     def _end(self, future: Any, batch: _Batch) -> None:
         """A task has ended: go on after its items, or have them done again, or leave them to the client."""
-        if future.status == "finished":
+        if future.status == "cancelled":  # by nobody else than a client that has lost its scheduler
+            raise self._crew.gone()
+        if future.status != "error":  # finished; or lost since, with the worker that had finished it
             for number in batch.numbers:
                 self._go_on_after(number)
             self._count(batch.numbers)
             return
-        if future.status != "error":  # cancelled or lost: by nobody else than a scheduler that went
-            raise self._crew.gone()
         error = future.exception()
         if isinstance(error, ClusterError):
             raise error
