@@ -24,6 +24,7 @@ _PICTURES: dict[Relief, str] = {
 _LINKS = {
     "mesh": "mesh (glTF, for any viewer of 3D)",
     "dem": "heights and sigmas (GeoTIFF)",
+    "dem_whole": "heights and sigmas of all distances as one (VRT)",
     "orthoimage": "orthoimage (GeoTIFF)",
     "cloud": "cloud (LAZ)",
     "cloud_ply": "cloud (PLY)",
