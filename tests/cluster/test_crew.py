@@ -157,11 +157,14 @@ def test_what_comes_after_a_failure_is_left_too(client: Any, tmp_path: Path) -> 
 def test_each_worker_has_a_log(client: Any, tmp_path: Path) -> None:
     logs, cache = tmp_path / "run.log.workers", tmp_path / "cache"
     cache.mkdir()
+    level = logging.getLogger("pancam_graph").level
     log_workers(client, logs)
     crew = Crew(client, folder=cache, machine=same)
     with crew.at_work():
         crew.share(job(mark, cache), range(4))
+    assert logging.getLogger("pancam_graph").level == logging.DEBUG
     client.unregister_worker_plugin("pancam-graph-log")
+    assert logging.getLogger("pancam_graph").level == level
     text = [path.read_text() for path in sorted(logs.iterdir())]
     assert len(text) == 2
     assert all(f"{item}" in "".join(text) for item in range(4))
