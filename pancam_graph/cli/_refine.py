@@ -139,6 +139,12 @@ def _add_options(parser: CommandParser) -> None:
         action=Flag,
         help="check the formal sigmas: solve halves of the terrain points too, and say how far they differ",
     )
+    _add_outputs(parser)
+
+
+def _add_outputs(parser: CommandParser) -> None:
+    """What is written besides the solution."""
+    add = parser.add_argument
     add(
         "--export",
         action=Several,

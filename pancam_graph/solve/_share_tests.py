@@ -1,21 +1,14 @@
-"""Shares of the observations in use: of all, and of the image, frame and stop that has the smallest.
+"""Shares of the observations in use: of all, and of the image, frame and stop that has the smallest."""
 
-A link, a point that an owner (a frame, a stop) shares with others, is lost to outliers more often the fewer
-observations the point has: of two, either one is enough. Owners differ in that, so that each is compared with
-what points of as many observations keep elsewhere. The links of one owner are different points, and lost
-independently where outliers are: their number in use is binomial, or varies less (Hoeffding 1956).
-"""
-
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import scipy
 
-from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.data import VerdictTest
-from pancam_graph.landmarks import Measurements, kernel
+from pancam_graph.landmarks import kernel
 from pancam_graph.solve._chances import CHANCE
 from pancam_graph.solve._problem import Problem
 
@@ -30,10 +23,6 @@ _FAIR_LINKS = 0.6
 wherever they lie in one plane."""
 _FAIR_LET_GO = 0.95
 """The same of a frame whose telemetry was let go: its pointing is then right, or something else is wrong."""
-_MOST = 4
-"""Observations of a point from which on more make no difference to its links."""
-_HALVINGS = 40
-"""Of the interval in which the share of wrong observations is sought."""
 _OBSERVATIONS = 12
 """Images, frames and stops with fewer observations are not tested alone ..."""
 _LINKS = 4
@@ -83,48 +72,20 @@ class InUse:
         n = int(self.n.sum())
         return float(self.used.sum() / n) if n else 1.0
 
-    def chance(self, of: IntArray, expected: FloatArray | None = None) -> FloatArray:
+    def chance(self, of: IntArray) -> FloatArray:
         """Chance (n,) of no more in use, if things of owners `of` (n,) were as good as all others.
 
-        `expected` are the shares (n,) that would be in use then; default: the usual one. A few are out of use
-        by chance too, where few are owned.
+        A few are out of use by chance too, where few are owned.
         """
         if not len(of):
             return np.zeros(0)  # SciPy's part for it takes longer to import than a small solve takes
-        share = self.usual if expected is None else expected
-        return np.asarray(scipy.special.bdtr(self.used[of].astype(float), self.n[of], share), dtype=float)
+        return np.asarray(
+            scipy.special.bdtr(self.used[of].astype(float), self.n[of], self.usual), dtype=float
+        )
 
 
-def _expected_links(m: Measurements, kept: BoolArray, owner: IntArray, of: IntArray) -> FloatArray:
-    """Share (n,) of the links of owners `of` (n,) that would be in use if they were as good as all others.
-
-    A point with a observations by the owner and b by others is in use with the chance (1 - q^a)(1 - q^b),
-    where each observation is wrong with the chance q; q is such that as many links in all would be in use as
-    are. `owner` is that of each measurement.
-    """
-    # A row for each owner of each landmark.
-    n_owners = 1 + int(owner.max())
-    place, row = np.unique(m.landmark * n_owners + owner, return_inverse=True)
-    landmark, by = np.divmod(place, n_owners)
-    own, own_used = np.bincount(row), np.bincount(row, kept)
-    other, other_used = (np.bincount(landmark, x)[landmark] - x for x in (own, own_used))
-    is_link = other > 0
-    own, other, by = own[is_link].clip(max=_MOST), other[is_link].clip(max=_MOST), by[is_link]
-    usual = float(np.mean((own_used[is_link] > 0) & (other_used[is_link] > 0)))
-    low, high = 0.0, 1.0
-    for _ in range(_HALVINGS):
-        q = 0.5 * (low + high)
-        in_use = (1 - q**own) * (1 - q**other)
-        low, high = (q, high) if float(in_use.mean()) > usual else (low, q)
-    return np.array([float(in_use[by == one].mean()) for one in of])
-
-
-def shares_in_use(problem: Problem, by_chance: BoolArray) -> Iterator[VerdictTest]:
-    """Tests of how much is in use of what was measured, and of what joins frames and stops.
-
-    Observations `by_chance` (observations,) fit but were left out all the same, so that they say nothing
-    against the image, frame or stop that has them: these are compared without them.
-    """
+def shares_in_use(problem: Problem) -> Iterator[VerdictTest]:
+    """Tests of how much is in use of what was measured, and of what joins frames and stops."""
     t = problem.template.traverse
     images = InUse.observations(problem)
     n = int(images.n.sum())
@@ -137,9 +98,6 @@ def shares_in_use(problem: Problem, by_chance: BoolArray) -> Iterator[VerdictTes
         f"only {share:.0%} of {n} observations are in use, too few to tell right ones from wrong "
         "ones; check matches and rig",
     )
-    if by_chance.any():
-        problem = _without(problem, by_chance)
-        images = InUse.observations(problem)
     owners = (
         ("image", np.arange(len(t.images)), [i.id for i in t.images]),
         ("frame", t.image_frame, [f.id for f in t.frames]),
@@ -153,17 +111,8 @@ def shares_in_use(problem: Problem, by_chance: BoolArray) -> Iterator[VerdictTes
     for name, owner, ids in owners[1:]:
         what = f"points shared with another {name}"
         test = _Fairness(name=f"{name} links", owner=name, what=what, least=_LINKS, fair=_FAIR_LINKS, ids=ids)
-        m = problem.measurements
-        expected = partial(_expected_links, m, problem.kept, owner[m.image])
-        yield test.of(InUse.links(problem, owner, len(ids)), expected=expected)
+        yield test.of(InUse.links(problem, owner, len(ids)))
     yield _frames_apart(problem)
-
-
-def _without(problem: Problem, by_chance: BoolArray) -> Problem:
-    """The problem without those of some observations (observations,) that are not in use."""
-    m = problem.measurements
-    rows = np.flatnonzero(problem.kept | ~by_chance[m.row])
-    return problem.having(measurements=m.part(rows), accepted=problem.accepted[rows])
 
 
 def _frames_apart(problem: Problem) -> VerdictTest:
@@ -227,36 +176,21 @@ class _Fairness:
     """Part of the usual share in use that each must have."""
     ids: Sequence[str]
 
-    def of(
-        self,
-        things: InUse,
-        among: IntArray | None = None,
-        expected: Callable[[IntArray], FloatArray] | None = None,
-    ) -> VerdictTest:
-        """The test of what owners have; only of owners `among` some, default: all.
-
-        `expected` takes owners (n,) to the shares (n,) that they would have in use if they were as good as
-        all others; default: the usual one.
-        """
+    def of(self, things: InUse, among: IntArray | None = None) -> VerdictTest:
+        """The test of what owners have; only of owners `among` some, default: all."""
         is_tested = np.ones(len(self.ids), dtype=bool)
         if among is not None:
             is_tested = np.isin(np.arange(len(self.ids)), among)
         n, used, usual = things.n, things.used, things.usual
-        fair = np.full(len(n), self.fair * usual)
-        share = used / n.clip(1)
-        suspect = is_tested & (n >= self.least) & (share < fair)
+        share, limit = used / n.clip(1), 1 - self.fair * usual
+        suspect = is_tested & (n >= self.least) & (share < self.fair * usual)
         few = np.flatnonzero(suspect)
-        if len(few):
-            shares = None if expected is None else expected(few)
-            if shares is not None:
-                fair[few] = self.fair * shares
-            suspect[few] = (share[few] < fair[few]) & (things.chance(few, shares) < CHANCE / len(self.ids))
+        suspect[few] = things.chance(few) < CHANCE / len(self.ids)
         tested = np.flatnonzero(suspect if suspect.any() else is_tested & (n >= self.least))
         if not len(tested):
             good = f"too few {self.what} to test a {self.owner} alone"
-            return VerdictTest.of(self.name, None, 1 - self.fair * usual, good, "")
+            return VerdictTest.of(self.name, None, limit, good, "")
         worst = int(tested[np.argmin(share[tested])])
-        limit = 1 - float(fair[worst])
         counts = f"{int(used[worst])} of {int(n[worst])}"
         says = f"of {self.owner} {self.ids[worst]} {counts} {self.what} are in use"
         value = 1 - float(share[worst])

@@ -98,7 +98,7 @@ def verdict(at: Optimum) -> Verdict:
     """All tests of a fit."""
     residuals = Residuals.of(at.fitted.problem)
     tests = [_converged(at), _finite(residuals), _cost(at), _optimum(at)]
-    tests += shares_in_use(at.fitted.problem, at.fitted.screened.by_chance)
+    tests += shares_in_use(at.fitted.problem)
     if residuals.n_observations:
         tests += _noise(at, residuals)
     tests += [
