@@ -108,3 +108,13 @@ def scripts_folder() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no {folder}: the programs are part of the repository, not of the package")
     return folder
+
+
+@pytest.fixture(scope="module")
+def client() -> Iterator[Any]:
+    """A client of two Dask workers of one thread in this process."""
+    distributed = pytest.importorskip("distributed", reason="needs the extra pancam-graph[cluster]")
+    with distributed.Client(
+        n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None, set_as_default=False
+    ) as client:
+        yield client

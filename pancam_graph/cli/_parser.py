@@ -22,6 +22,7 @@ __all__ = [
     "ScriptParser",
     "Several",
     "above_zero",
+    "add_images_option",
     "degrees",
 ]
 
@@ -187,3 +188,13 @@ class CommandParser(Parser):
             "all subcommands. Paths count from the folder that the program runs in. The command line wins\n"
             "over the file."
         )
+
+
+def add_images_option(parser: CommandParser) -> None:
+    """Add the option that says where the pictures of a folder of results are now."""
+    parser.add_argument(
+        "--images",
+        type=Path,
+        metavar="FOLDER",
+        help="the folder that was refined, where it is not any more where it was then",
+    )

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from pancam_graph.base.text import shortened
 from pancam_graph.cli._command import Command, Invocation
-from pancam_graph.cli._parser import CommandParser, above_zero
+from pancam_graph.cli._parser import CommandParser, above_zero, add_images_option
 from pancam_graph.cli._streams import write
 
 if TYPE_CHECKING:
@@ -56,12 +56,7 @@ def _add_options(parser: CommandParser) -> None:
         metavar="DEG",
         help="how far a stop may be turned, degrees (%(default)s)",
     )
-    add(
-        "--images",
-        type=Path,
-        metavar="FOLDER",
-        help="the folder that was refined, where it is not any more where it was then",
-    )
+    add_images_option(parser)
 
 
 def _work(call: Invocation) -> int:

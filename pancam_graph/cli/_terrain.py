@@ -4,7 +4,7 @@ from pathlib import Path
 
 from pancam_graph.base.text import shortened
 from pancam_graph.cli._command import Command, Invocation
-from pancam_graph.cli._parser import CommandParser, above_zero
+from pancam_graph.cli._parser import CommandParser, above_zero, add_images_option
 from pancam_graph.cli._streams import write
 
 __all__ = ["TERRAIN"]
@@ -50,12 +50,7 @@ def _add_options(parser: CommandParser) -> None:
         help="fill holes up to this width, metres, from what surrounds them; their count is 0 (none)",
     )
     add("--ply", action="store_true", help="write clouds as PLY too")
-    add(
-        "--images",
-        type=Path,
-        metavar="FOLDER",
-        help="the folder that was refined, where it is not any more where it was then",
-    )
+    add_images_option(parser)
 
 
 def _work(call: Invocation) -> int:

@@ -316,13 +316,12 @@ class RigVariables:
 
     def _joint(self, keys: Sequence[int]) -> FloatArray:
         """Covariance (n, n) of the priors of variables that stops share, also of eyes that no image has."""
-        assert self.sharing.covariance is not None
+        prior = self.sharing.covariance or RigCovariance(entries=(), matrix=np.zeros((0, 0)))
         entries = [entry for key in keys for entry in self._entries_of(key)]
         rig = self.traverse.rig
         eyes = [None if e.camera is None else rig.eye_index(e.camera) for e in entries]
         sigma = [self._own_sigma(e.quantity, e.entry, eye) for e, eye in zip(entries, eyes, strict=True)]
-        matrix = self.sharing.covariance.among(entries, np.array(sigma))
-        named = set(self.sharing.covariance.entries)
+        matrix, named = prior.among(entries, np.array(sigma)), set(prior.entries)
         place = 0
         for key in keys:
             own = self._entries_of(key)
@@ -364,12 +363,8 @@ class RigVariables:
         """Size of changes (eyes, ...) of fields' coefficients: RMS (eyes,) in sigmas of their priors."""
         out = []
         for key, change_px in zip(self.field_keys, changes_px.reshape(len(changes_px), -1), strict=True):
-            prior = (
-                self._field_covariance(index_of(key))
-                if self.sharing.covariance is None
-                else self._joint([key])
-            )
-            out.append(np.sqrt(np.mean(np.linalg.solve(np.linalg.cholesky(prior), change_px) ** 2)))
+            whitened = np.linalg.solve(np.linalg.cholesky(self._joint([key])), change_px)
+            out.append(np.sqrt(np.mean(whitened**2)))
         return np.array(out)
 
     def prior_information(self) -> FloatArray:

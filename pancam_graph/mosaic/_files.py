@@ -215,6 +215,8 @@ def _write_stereo(
 
 
 _POINTING: dict[Pointing, str] = {"telemetry": "telemetry's", "refined": "refined"}
+_WHOLE: dict[Pointing, str] = {p: f"{_POINTING[p]} pointing" for p in POINTINGS}
+"""Captions of pictures that show a whole mosaic."""
 
 
 def _world_file(cylinder: Cylinder, north_deg: float | None) -> str:
@@ -283,17 +285,15 @@ def _blinks(made: StopMosaics, group: str, north_deg: float | None) -> list[Blin
         discs = {
             p: polar_view(made.cylinder, p, "", _BLINK_GROUND_PX, north_deg=north_deg) for p in POINTINGS
         }
-        named = {p: f"{_POINTING[p]} pointing" for p in POINTINGS}
-        blinks.append(_blink(group, "from above the mast, the horizon a circle", named, discs))
+        blinks.append(_blink(group, "from above the mast, the horizon a circle", _WHOLE, discs))
     if made.ground is not None:
         blinks.append(_blink_of(made.ground, group, "from above", _BLINK_GROUND_PX, north_deg))
     return blinks
 
 
 def _blink_of(mosaic: Mosaic, group: str, title: str, width_px: int, north_deg: float | None) -> Blink:
-    captions = {p: f"{_POINTING[p]} pointing" for p in POINTINGS}
     shown = {p: with_axes(mosaic, p, "", width_px, north_deg=north_deg) for p in POINTINGS}
-    return _blink(group, title, captions, shown)
+    return _blink(group, title, _WHOLE, shown)
 
 
 def _blink(

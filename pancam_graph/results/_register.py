@@ -13,11 +13,16 @@ from pancam_graph.io import read_map_image, read_surface
 from pancam_graph.results._refined_drive import read_drive
 from pancam_graph.results._solution_json import read_solution_json
 from pancam_graph.results._solved_folder import SOLUTION_JSON
-from pancam_graph.terrain import Registration, TerrainOptions, make_terrain, register_stop
+from pancam_graph.terrain import (
+    CELLS_PER_PIXEL,
+    Registration,
+    TerrainOptions,
+    make_terrain,
+    register_stop,
+)
 
 __all__ = ["Registered", "register"]
 
-_CELLS_PER_PIXEL = 4
 _REACH_M = 25.0
 """Ground that is compared: farther away a view from the side shows too little."""
 
@@ -63,7 +68,7 @@ def register(
     image = read_map_image(Path(map_file), near_m, site)
     surface = None if dem_file is None else read_surface(Path(dem_file), near_m, site)
     pixel_m = float(np.abs(image.step_m).mean())
-    options = TerrainOptions(cell_m=pixel_m / _CELLS_PER_PIXEL, reach_m=_REACH_M)
+    options = TerrainOptions(cell_m=pixel_m / CELLS_PER_PIXEL, reach_m=_REACH_M)
     terrain = make_terrain(drive, options, progress=progress, cache=cache_folder(out))
     found, missing = list[Registration](), list[str]()
     for number, (stop, view) in enumerate(terrain.stops.items()):

@@ -8,6 +8,7 @@ from pancam_graph.terrain._extra import require_extra as require_extra
 from pancam_graph.terrain._fused import Fused as Fused
 from pancam_graph.terrain._make import Terrain as Terrain
 from pancam_graph.terrain._make import make_terrain as make_terrain
+from pancam_graph.terrain._registration import CELLS_PER_PIXEL as CELLS_PER_PIXEL
 from pancam_graph.terrain._registration import Registration as Registration
 from pancam_graph.terrain._registration import register_stop as register_stop
 from pancam_graph.terrain._section import Section as Section

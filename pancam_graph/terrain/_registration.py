@@ -22,7 +22,7 @@ from pancam_graph.data import MapImage, StopPlacement, Surface
 from pancam_graph.terrain._fused import Fused
 from pancam_graph.terrain._levels import composed
 
-__all__ = ["Registration", "register_stop"]
+__all__ = ["CELLS_PER_PIXEL", "Registration", "register_stop"]
 
 _LEAST_CELLS = 400
 """Cells of the map that a view must cover."""
@@ -33,7 +33,7 @@ _SECOND = 0.8
 """Share of the best correlation that another place may reach."""
 _APART_PX = 6
 """Pixels beyond which another place is not the same."""
-_CELLS_PER_PIXEL = 4
+CELLS_PER_PIXEL = 4
 """Cells of a view along a pixel of the map, at least, where the view has several sizes of them."""
 _HIGH_PASS_PX = 8.0
 """Standard deviation of the blur that brightness is compared above of."""
@@ -122,7 +122,7 @@ def register_stop(
     """
     here = f"stop {stop}: map"
     pixel = float(np.abs(map_image.step_m).mean())
-    view = composed(view, pixel / _CELLS_PER_PIXEL)
+    view = composed(view, pixel / CELLS_PER_PIXEL)
     patch = _on_map(view, at_m, pixel)
     seen = np.isfinite(patch)
     if seen.sum() < _LEAST_CELLS:

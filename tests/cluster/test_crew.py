@@ -1,7 +1,6 @@
 """Work on workers: everything is done once or named, whoever dies; here with workers in this process."""
 
 import logging
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,18 +11,7 @@ from pancam_graph.cluster import Crew, Job, _machine, connected, dashboard, log_
 from support import cluster_jobs
 from support.cluster_jobs import Folder, mark, mark_after, mark_but_for_seven, same
 
-distributed = pytest.importorskip(
-    "distributed", reason="needs the extra: pip install 'pancam-graph[cluster]'"
-)
-
-
-@pytest.fixture(scope="module")
-def client() -> Iterator[Any]:
-    """Two workers of one thread in this process."""
-    with distributed.Client(
-        n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None, set_as_default=False
-    ) as client:
-        yield client
+pytest.importorskip("distributed", reason="needs the extra: pip install 'pancam-graph[cluster]'")
 
 
 def job(function: Any, folder: Path) -> Job:

@@ -1,6 +1,6 @@
 """Pictures on workers: the same bytes as alone, and everything that workers can do is done by them."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +13,7 @@ from pancam_graph.images import find_observations
 from pancam_graph.images._cache import Cache
 from support.image_scenes import QUICK, as_bytes, found_in, make_traverse
 
-distributed = pytest.importorskip("distributed", reason="needs the extra pancam-graph[cluster]")
-
-
-@pytest.fixture(scope="module")
-def client() -> Iterator[Any]:
-    """Two workers of one thread in this process."""
-    with distributed.Client(
-        n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None, set_as_default=False
-    ) as client:
-        yield client
+pytest.importorskip("distributed", reason="needs the extra pancam-graph[cluster]")
 
 
 @pytest.fixture(scope="module")
