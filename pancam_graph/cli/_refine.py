@@ -51,6 +51,15 @@ def _add_options(parser: CommandParser) -> None:
     add("folder", type=Path, metavar="FOLDER", help="folder to read")
     add("--out", type=Path, required=True, help="folder to write")
     add(
+        "--add",
+        action=Several,
+        type=Path,
+        default=(),
+        metavar="FOLDER",
+        help="one or more folders with more of the same drive, such as the pictures of later sols: with OUT "
+        "of the drive so far, pictures and stops that they do not see are not matched again",
+    )
+    add(
         "--model",
         choices=("mast", "circle", "free", "projective"),
         default="mast",
@@ -222,7 +231,7 @@ def _work(call: Invocation) -> int:
         client = None
         if arguments.cluster is not None:
             client = clients.enter_context(_workers(call))
-        traverse = read_input(arguments.folder)
+        traverse = read_input(arguments.folder, *arguments.add)
         if arguments.use_rig is not None:
             traverse = use_rig(traverse, arguments.use_rig)
         if arguments.ties is not None:

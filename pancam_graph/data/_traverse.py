@@ -259,6 +259,8 @@ class Traverse:
     """Numbers of the rig to estimate, unless the options of a solve say otherwise; None if unstated."""
     folder: Path | None = None
     """Folder that paths of image files are relative to; None for a traverse made in memory."""
+    parts: tuple[str, ...] = ()
+    """Folders that it was read from, relative to `folder`, where they are several."""
     warnings: tuple[str, ...] = field(default=())
     """Sentences about the input that a reader of it wrote for the user."""
     matching: Matching | None = None

@@ -6,6 +6,7 @@ of the first pixel alone, so calibration, mount and smooth field are those of on
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -42,8 +43,10 @@ def same_focal_lengths(one: LabelledImage, other: LabelledImage) -> bool:
     )
 
 
-def on_detectors(images: Sequence[LabelledImage]) -> tuple[LabelledImage, ...]:
+def on_detectors(images: Sequence[LabelledImage], root: Path) -> tuple[LabelledImage, ...]:
     """The images with windows of one detector in the pixels of the smallest picture that holds them all.
+
+    Tiles are named by their way from the folder `root`.
 
     A window is told by two things that must agree to a pixel: its first line and sample, and the principal
     point of its camera model. Windows of one exposure become one image, in the place of the first. What is no
@@ -59,7 +62,7 @@ def on_detectors(images: Sequence[LabelledImage]) -> tuple[LabelledImage, ...]:
                 break
         else:
             detectors.append([_Window(image=image, left_px=0, top_px=0)])
-    put = {id(w.image): image for windows in detectors for w, image in _on_one_detector(windows)}
+    put = {id(w.image): image for windows in detectors for w, image in _on_one_detector(windows, root)}
     return tuple(put[id(image)] for image in images if id(image) in put)
 
 
@@ -78,7 +81,7 @@ def _window(first: LabelledImage, image: LabelledImage) -> _Window | None:
     return None
 
 
-def _on_one_detector(windows: Sequence[_Window]) -> list[tuple[_Window, LabelledImage]]:
+def _on_one_detector(windows: Sequence[_Window], root: Path) -> list[tuple[_Window, LabelledImage]]:
     """Each exposure of a detector, with the first of its windows."""
     left, top = min(w.left_px for w in windows), min(w.top_px for w in windows)
     width = max(w.left_px + w.image.model.width_px for w in windows) - left
@@ -97,7 +100,7 @@ def _on_one_detector(windows: Sequence[_Window]) -> list[tuple[_Window, Labelled
             continue
         whole = subframed(model, width, height, left_px=left - first.left_px, top_px=top - first.top_px)
         tiles = tuple(
-            Tile(file=w.image.file.name, left_px=w.left_px - left, top_px=w.top_px - top) for w in parts
+            Tile(file=w.image.way_from(root), left_px=w.left_px - left, top_px=w.top_px - top) for w in parts
         )
         found.append((first, replace(first.image, model=whole, tiles=tiles)))
     return found

@@ -17,5 +17,8 @@ class InputFormat:
     """What a folder of the format has, as error messages say it."""
     matches: Callable[[Sequence[str]], bool]
     """Whether a folder with files of these names is of the format."""
-    read: Callable[[Path], Traverse]
-    """Read the folder. Raises InputError saying where, what was expected and what was found."""
+    read: Callable[[Path, Sequence[Path]], Traverse]
+    """Read a drive from one or more folders that lie within the first argument, which becomes its `folder`.
+
+    Raises InputError saying where, what was expected and what was found.
+    """

@@ -1,6 +1,6 @@
 """The labelled images of a folder: which file is read by which label, and what became of the others."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -28,7 +28,7 @@ _PRODUCT = "Product_Observational"
 
 @dataclass(kw_only=True, eq=False)
 class LabelledFiles:
-    """What became of the files of a folder."""
+    """What became of the files of one or more folders."""
 
     images: list[LabelledImage] = field(default_factory=list)
     """By the names of their pictures."""
@@ -42,6 +42,19 @@ class LabelledFiles:
     """The table of localisation, where there is one."""
     unread: list[Path] = field(default_factory=list)
     """Files that have no label, and are none."""
+
+    @staticmethod
+    def joined(parts: "Sequence[LabelledFiles]") -> "LabelledFiles":
+        """What became of the files of several folders; the first table of localisation counts."""
+        joined = LabelledFiles()
+        for part in parts:
+            joined.images += part.images
+            joined.unusable |= part.unusable
+            joined.warnings += part.warnings
+            joined.site_poses |= part.site_poses
+            joined.places = joined.places or part.places
+            joined.unread += part.unread
+        return joined
 
 
 class _NoLabelError(InputError):

@@ -65,3 +65,7 @@ class LabelledImage:
     def unit(self) -> str:
         """The camera that it is: host, instrument and serial number."""
         return " ".join(part for part in (self.host, self.instrument, self.serial) if part)
+
+    def way_from(self, root: Path) -> str:
+        """The picture's path relative to a folder that it lies in."""
+        return self.file.relative_to(root).as_posix()

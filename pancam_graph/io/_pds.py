@@ -32,7 +32,8 @@ from pancam_graph.base.text import visible
 from pancam_graph.data import Frame, Image, Site, Stop, Traverse
 from pancam_graph.io._detectors import SAME_PRINCIPAL_POINT_PX, on_detectors, same_focal_lengths
 from pancam_graph.io._input_format import InputFormat
-from pancam_graph.io._labelled_files import LABEL_SUFFIXES, labelled_files
+from pancam_graph.io._joined_drive import parts_of
+from pancam_graph.io._labelled_files import LABEL_SUFFIXES, LabelledFiles, labelled_files
 from pancam_graph.io._labelled_image import LabelledImage
 from pancam_graph.io._one_group import counted, named_files, one_group
 from pancam_graph.io._pds_exposures import one_of_each_exposure
@@ -95,7 +96,13 @@ def read_pds(folder: Path | str) -> Traverse:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of rover images, found {_kind(folder)}")
-    found = labelled_files(folder)
+    return _read_folders(folder, [folder])
+
+
+def _read_folders(root: Path, folders: Sequence[Path]) -> Traverse:
+    """All labelled images of folders within `root`, read as `read_pds` does those of one."""
+    folder = folders[0]
+    found = LabelledFiles.joined([labelled_files(each) for each in folders])
     products, unusable = found.images, found.unusable
     if not products and not unusable:
         pictures = sum(looks_like_picture(file) for file in found.unread)
@@ -108,7 +115,7 @@ def read_pds(folder: Path | str) -> Traverse:
         raise next(iter(unusable.values()))
     group = one_group(products, found.site_poses)
     exposures = one_of_each_exposure(group.images)
-    images = on_detectors(exposures.images)
+    images = on_detectors(exposures.images, root)
     kinematics = images[0].mast
     warnings = [
         *_left_out(unusable),
@@ -167,12 +174,13 @@ def read_pds(folder: Path | str) -> Traverse:
                 id=visible(image.file.stem),  # a name that is no text has no place in results
                 frame=frame_ids[frame_of[i]],
                 camera=eye_names[eye_of[i]],
-                file=image.file.name,
+                file=image.way_from(root),
                 tiles=image.tiles,
             )
             for i, image in enumerate(images)
         ),
-        folder=folder,
+        folder=root,
+        parts=parts_of(root, folders),
         warnings=tuple(warnings),
         site=site,
     )
@@ -181,7 +189,7 @@ def read_pds(folder: Path | str) -> Traverse:
 PDS3 = InputFormat(
     needs="rover images with labels (*.IMG, *.LBL, *.xml, *.json)",
     matches=lambda names: any(Path(name).suffix.lower() in LABEL_SUFFIXES for name in names),
-    read=read_pds,
+    read=_read_folders,
 )
 
 

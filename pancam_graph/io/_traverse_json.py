@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from pancam_graph.io._constraint_entries import constraint_entry, points_csv, re
 from pancam_graph.io._entries import TRAVERSE_FORMAT, VERSION, PoseEntry
 from pancam_graph.io._input_format import InputFormat
 from pancam_graph.io._inside import inside
+from pancam_graph.io._joined_drive import Part, joined_drive
 from pancam_graph.io._json import prefixed, read_json, refused_by_schema, validated
 from pancam_graph.io._mask_files import mask_file, read_mask
 from pancam_graph.io._observations import observations_npz, read_observations
@@ -228,8 +230,15 @@ def traverse_entries(traverse: Traverse) -> TraverseFile:
     )
 
 
+def _read_folders(root: Path, folders: Sequence[Path]) -> Traverse:
+    parts = [read_traverse(folder) for folder in folders]
+    if len(parts) == 1:
+        return parts[0]
+    return joined_drive(root, [Part.of(each, traverse_entries(each), root) for each in parts], _TRAVERSE_JSON)
+
+
 TRAVERSE_FOLDER = InputFormat(
-    needs=_TRAVERSE_JSON, matches=lambda names: _TRAVERSE_JSON in names, read=read_traverse
+    needs=_TRAVERSE_JSON, matches=lambda names: _TRAVERSE_JSON in names, read=_read_folders
 )
 
 

@@ -242,6 +242,8 @@ class SolutionFile(Entry):
     warnings: list[str]
     folder: Text | None = None
     """The folder that was refined, relative to that of the results; the key is missing without one."""
+    parts: list[Text] = Field(default_factory=list)
+    """Folders that were refined together, relative to `folder`; the key is missing where it was one."""
     site: SiteEntry | None = None
     """Where the world is on its planet; the key is missing where that is not known."""
     cross_validation: CrossValidationEntry | None = None
@@ -270,6 +272,7 @@ def solution_json(solution: Solution, out: Path | None = None) -> bytes:
         "refined": not solution.refined,
         "fields": not any(isinstance(eye.camera, FieldCamera) for eye in solution.rig.eyes),
         "folder": out is None or solution.traverse.folder is None,
+        "parts": out is None or not solution.traverse.parts,
         "site": solution.traverse.site is None,
         "cross_validation": solution.cross_validation is None,
         "incremental": solution.incremental is None,
@@ -369,6 +372,7 @@ def solution_file(solution: Solution, out: Path | None = None) -> SolutionFile:
         # Warnings of the reader come first, and once, also where the solver passed them on.
         warnings=list(dict.fromkeys([*traverse.warnings, *solution.warnings])),
         folder=None if out is None or traverse.folder is None else _way(traverse.folder, out),
+        parts=list(traverse.parts),
         site=None if traverse.site is None else SiteEntry.of(traverse.site),
         method=solution.method,
         cross_validation=None if validation is None else CrossValidationEntry.of(validation, traverse),

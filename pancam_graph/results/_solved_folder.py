@@ -19,7 +19,8 @@ SOLUTION_JSON = "solution.json"
 def read_solved(out: Path, folder: Path | None, instead: str = "name it") -> tuple[SolutionFile, Traverse]:
     """The `solution.json` of a folder of results, and the traverse that was refined, from its own folder.
 
-    `folder` is that folder; None: where it was then. `instead` says what to do where images of one eye have
+    `folder` is that folder, or the one with all of those that were refined together; None: where it was then.
+    `instead` says what to do where images of one eye have
     different cameras.
 
     Raises InputError for a folder without results, for pictures that are not there any more or belong to
@@ -36,7 +37,7 @@ def read_solved(out: Path, folder: Path | None, instead: str = "name it") -> tup
         raise InputError(
             f"{pictures}: expected the folder that was refined into {out}, found no folder: name it"
         )
-    traverse = read_input(pictures)
+    traverse = read_input(*(pictures / part for part in file.parts or ["."]))
     for kind, own, found in (
         ("stops", [s.id for s in traverse.stops], [s.id for s in file.stops]),
         ("images", [i.id for i in traverse.images], [i.id for i in file.images]),

@@ -339,7 +339,7 @@ def test_rover_images_go_to_the_pds_reader(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     expected = io_samples.traverse()
-    made_up = replace(PDS3, read=lambda folder: {tmp_path: expected}[folder])
+    made_up = replace(PDS3, read=lambda root, folders: {tmp_path: expected}[folders[0]])
     monkeypatch.setattr("pancam_graph.io._inputs.FORMATS", (TRAVERSE_FOLDER, made_up))
     (tmp_path / name).write_bytes(b"")
     assert read_input(tmp_path) is expected
@@ -350,7 +350,9 @@ def test_rover_images_go_to_the_pds_reader(
 def test_a_format_more_is_read_and_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An error says what every format needs, and a folder goes to the first format that takes it."""
     expected = io_samples.traverse()
-    made_up = InputFormat(needs="a plan", matches=lambda names: "plan.txt" in names, read=lambda _: expected)
+    made_up = InputFormat(
+        needs="a plan", matches=lambda names: "plan.txt" in names, read=lambda root, folders: expected
+    )
     monkeypatch.setattr("pancam_graph.io._inputs.FORMATS", (TRAVERSE_FOLDER, made_up))
     (tmp_path / "notes.txt").write_bytes(b"")
     with pytest.raises(InputError, match=r"a folder with traverse\.json or with a plan, found notes\.txt$"):
