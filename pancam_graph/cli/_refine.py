@@ -240,7 +240,11 @@ def _work(call: Invocation) -> int:
         if arguments.start is not None:
             traverse, start = started(traverse, arguments.start, incremental=arguments.incremental)
         check_exports(traverse, arguments.export)
-        options = replace(options, sharing=parse_sharing(arguments.sharing, traverse.sharing))
+        options = replace(
+            options,
+            sharing=parse_sharing(arguments.sharing, traverse.sharing),
+            stereo_covariances=any(image.file is not None for image in traverse.images),  # for terrain
+        )
         if traverse.observations is None:
             from pancam_graph import find_observations
             from pancam_graph.images import cache_folder

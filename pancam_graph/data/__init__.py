@@ -54,6 +54,9 @@ from pancam_graph.data._solution import Seconds as Seconds
 from pancam_graph.data._solution import Solution as Solution
 from pancam_graph.data._solution import State as State
 from pancam_graph.data._solution import rms_px as rms_px
+from pancam_graph.data._stereo import StereoCovariance as StereoCovariance
+from pancam_graph.data._stereo import StereoNodes as StereoNodes
+from pancam_graph.data._stereo import stereo_order as stereo_order
 from pancam_graph.data._surface import MapImage as MapImage
 from pancam_graph.data._surface import Surface as Surface
 from pancam_graph.data._traverse import UNKNOWN_RAD as UNKNOWN_RAD

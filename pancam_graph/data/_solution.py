@@ -14,6 +14,7 @@ from pancam_graph.cameras import CALIBRATION_ENTRIES, Camera, projection_matrix,
 from pancam_graph.data._cross_validation import CrossValidation
 from pancam_graph.data._rig_treatment import RigTreatment
 from pancam_graph.data._sharing import Quantity, Sharing
+from pancam_graph.data._stereo import StereoCovariance
 from pancam_graph.data._traverse import Traverse
 from pancam_graph.data._verdict import Verdict
 from pancam_graph.elimination import JointCovariance, relative_pose_covariance
@@ -209,6 +210,9 @@ class Solution:
     landmark_covariance_m2: FloatArray | None = None
     """(landmarks, 3, 3) formal covariance of `final.landmarks_m`, all else marginalised; None unless
     requested."""
+    stereo_covariance: StereoCovariance | None = field(default=None, repr=False)
+    """Covariances of places that stereo pairs see, due to poses, angles and the rig; None unless requested,
+    and where a direction is free or the cameras are variables themselves."""
     mast_covariance: JointCovariance | None = field(default=None, repr=False)
     """Square root of the joint covariance of all masts, for `stop_covariance_between`; None if a direction is
     free."""

@@ -124,7 +124,8 @@ def _residual_figures(solution: Solution, eye: int, held_px: FloatArray | None) 
     if not len(after[0]):
         return []
     # Both at one scale, so that they can be compared.
-    longest = max(_long(mean) for _, mean, _ in (after, before or after))
+    shown = [cells for cells in (before, after) if cells is not None and len(cells[0])]
+    longest = max(_long(mean) for _, mean, _ in shown)
     out = []
     for name, cells, when in (
         ("before", before, "with the rig held as told"),

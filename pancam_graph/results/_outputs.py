@@ -50,6 +50,12 @@ def _gis() -> OutputWriter:
     return GIS
 
 
+def _stereo() -> OutputWriter:
+    from pancam_graph.results._stereo import STEREO
+
+    return STEREO
+
+
 def _residuals() -> OutputWriter:
     from pancam_graph.results._residuals import RESIDUALS
 
@@ -117,6 +123,7 @@ OUTPUTS = (
         older=EXPORT_FOLDER,
     ),
     Output(name="residuals.npz", when="always", writer=_residuals),
+    Output(name="stereo.npz", when="always", writer=_stereo),
     Output(name="residuals.csv", when="csv", writer=_residuals_csv),
     Output(name="mosaics", when="mosaics", writer=_mosaics, older=MOSAIC_FOLDER),
     Output(name=TERRAIN, when="terrain", writer=_terrain, older=TERRAIN_FOLDER),

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from pancam_graph.results._solved_folder import SOLUTION_JSON, camera_poses, read_solved
+from pancam_graph.results._stereo import STEREO_FILE, read_stereo
 from pancam_graph.terrain import Drive
 
 __all__ = ["read_drive"]
@@ -26,5 +27,6 @@ def read_drive(out: Path | str, folder: Path | str | None = None) -> Drive:
         cameras=tuple(eyes[eye].camera for eye in traverse.image_eye.tolist()),
         world_R_camera=rotations,
         world_t_camera=centres,
+        stereo=read_stereo(out / STEREO_FILE, len(traverse.images)),
         angle_sigma_rad=np.array([[np.nan if s is None else s for s in pair] for pair in sigmas]),
     )

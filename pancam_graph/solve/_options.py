@@ -60,6 +60,8 @@ class SolveOptions(StopRule):
     measured, since their sigmas are guesses."""
     landmark_covariances: bool = False
     """Whether the solution has the covariance of each terrain point."""
+    stereo_covariances: bool = False
+    """Whether the solution has covariances of places that stereo pairs see (`Solution.stereo_covariance`)."""
 
     def __post_init__(self) -> None:
         """Check the choices."""

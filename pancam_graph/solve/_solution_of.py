@@ -3,11 +3,12 @@
 import numpy as np
 
 from pancam_graph.base.geometry import BoolArray, FloatArray
-from pancam_graph.data import PixelNoise, RigTreatment, Solution
+from pancam_graph.data import PixelNoise, RigTreatment, Solution, StereoCovariance
 from pancam_graph.rigs import RigCovariance
 from pancam_graph.solve._fit import Fitted
 from pancam_graph.solve._judge import Judged, state_of
 from pancam_graph.solve._problem import Problem
+from pancam_graph.solve._stereo import stereo_covariance
 
 __all__ = ["solution_of"]
 
@@ -41,6 +42,7 @@ def solution_of(judged: Judged) -> Solution:
         stop_covariance=covariances.stop_covariance,
         angle_sigma_rad=covariances.angle_sigma_rad,
         landmark_covariance_m2=covariances.landmark_covariance_m2,
+        stereo_covariance=_stereo_covariance(judged),
         mast_covariance=covariances.masts,
         came_back=judged.used & screened.set_aside,
         refined=problem.template.refined(problem.values, covariances.rig_sigmas),
@@ -59,6 +61,14 @@ def _treatment(fitted: Fitted) -> RigTreatment:
     if given is None:
         return prepared.options.rig
     return "estimated" if given.any_free else "held"
+
+
+def _stereo_covariance(judged: Judged) -> StereoCovariance | None:
+    """`Solution.stereo_covariance` of a fit."""
+    fitted, found = judged.fitted, judged.stated.variables
+    if not fitted.screened.prepared.options.stereo_covariances or found is None:
+        return None
+    return stereo_covariance(fitted.problem, found)
 
 
 def _rig_covariance(judged: Judged) -> RigCovariance | None:

@@ -1,20 +1,16 @@
 """What terrain is made from: a traverse with refined and with telemetry's cameras."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from pancam_graph.base.geometry import FloatArray
 from pancam_graph.cameras import Camera
-from pancam_graph.data import Solution, Traverse
+from pancam_graph.data import Solution, StereoCovariance, Traverse, stereo_order
 from pancam_graph.io import picture_file, same_pictures
 
 __all__ = ["Drive", "Pair", "drive_of", "stereo_pairs"]
-
-_ALIKE_FOCAL = 1.5
-"""Factor by which focal lengths of a pair of eyes may differ."""
-_LEAST_BASELINE_M = 1e-3
-_ALIKE_AXES = np.cos(np.deg2rad(30.0))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -30,6 +26,23 @@ class Drive:
     """(images, 3) as adjusted, metres."""
     angle_sigma_rad: FloatArray
     """(frames, 2) standard deviation of pan and tilt; NaN where unknown."""
+    stereo: StereoCovariance | None = None
+    """Errors that places of a frame have in common; None: unknown."""
+
+    @cached_property
+    def own_tilt_sigma_rad(self) -> FloatArray:
+        """(frames,) standard deviation of that part of a tilt's error which is the frame's alone.
+
+        Where errors in common are known, these have what the surest frame of a stop is uncertain of. A tilt
+        of which nothing is known counts as exact.
+        """
+        variance = np.nan_to_num(self.angle_sigma_rad[:, 1]) ** 2
+        if self.stereo is not None:
+            stop = self.traverse.frame_stop
+            least = np.full(len(self.traverse.stops), np.inf)
+            np.minimum.at(least, stop, variance)
+            variance = variance - least[stop]
+        return np.asarray(np.sqrt(variance))
 
     def telemetry(self) -> tuple[FloatArray, FloatArray]:
         """Orientations (images, 3, 3) and centres (images, 3) of cameras by telemetry."""
@@ -44,6 +57,7 @@ def drive_of(solution: Solution) -> Drive:
         world_R_camera=solution.final.world_R_camera,
         world_t_camera=solution.final.world_t_camera,
         angle_sigma_rad=solution.angle_sigma_rad,
+        stereo=solution.stereo_covariance,
     )
 
 
@@ -88,15 +102,10 @@ def stereo_pairs(drive: Drive) -> tuple[list[Pair], list[str]]:
 
 
 def _pair(drive: Drive, frame: int, a: int, b: int) -> Pair | None:
-    focal = [drive.cameras[i].pinhole.fx_px for i in (a, b)]
-    R = drive.world_R_camera
+    both, focal = [a, b], [drive.cameras[i].pinhole.fx_px for i in (a, b)]
+    order = stereo_order((focal[0], focal[1]), drive.world_R_camera[both], drive.world_t_camera[both])
+    if order is None:
+        return None
     between = drive.world_t_camera[b] - drive.world_t_camera[a]
     baseline_m = float(np.linalg.norm(between))
-    alike = max(focal) < _ALIKE_FOCAL * min(focal) and R[a][:, 2] @ R[b][:, 2] > _ALIKE_AXES
-    if not alike or baseline_m < _LEAST_BASELINE_M:
-        return None
-    # The first axis that the baseline has a larger part of decides; an eye above the other is turned.
-    to_right, down = between @ R[a][:, 0], between @ R[a][:, 1]
-    first = to_right if abs(to_right) >= abs(down) else down
-    pair = Pair(frame=frame, left=int(a), right=int(b), baseline_m=baseline_m)
-    return pair if first > 0 else replace(pair, left=int(b), right=int(a))
+    return Pair(frame=frame, left=both[order[0]], right=both[order[1]], baseline_m=baseline_m)

@@ -22,6 +22,7 @@ class Fused:
     grid: Grid
     height_m: NDArray[np.float32]
     sigma_m: NDArray[np.float32]
+    """Standard deviation of the height: that of frames' own errors, and of those that they have in common."""
     count: NDArray[np.float32]
     """How many frames see each cell."""
     disagreement_m: NDArray[np.float32]
@@ -46,12 +47,12 @@ def fuse(grid: Grid, layers: Sequence[Layer], telemetry: Sequence[Layer] = ()) -
         slice(min(s.start for s in along), max(s.stop for s in along)) for along in zip(*boxes, strict=True)
     )
     rows, columns = box
-    height, variance, count, disagreement, grey = _fused_bands(layers, (rows, columns), 5)
+    height, variance, count, disagreement, grey, shared = _fused_bands(layers, (rows, columns), 6)
     (before,) = _fused_bands(telemetry, (rows, columns), 1)
     return Fused(
         grid=grid.part(rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start),
         height_m=height,
-        sigma_m=np.sqrt(variance),
+        sigma_m=np.sqrt(variance + shared),
         count=count,
         disagreement_m=disagreement,
         grey=grey,
@@ -62,14 +63,16 @@ def fuse(grid: Grid, layers: Sequence[Layer], telemetry: Sequence[Layer] = ()) -
 def _fused_bands(layers: Sequence[Layer], box: tuple[slice, slice], bands: int) -> NDArray[np.float32]:
     """The first bands (bands, rows, columns) of what layers are as one, in some rows and columns of the grid.
 
-    The bands are height, variance, count, disagreement, and grey. What layers have beyond is cut off.
+    The bands are height, variance of frames' own errors, count, disagreement, grey, and variance of errors in
+    common, of frames the mean by their own variances: more frames do not lower it. What layers have beyond is
+    cut off.
     """
     (top, bottom), (left, right) = ((s.start, s.stop) for s in box)
     fused = np.empty((bands, bottom - top, right - left), dtype=np.float32)
     for begin in range(top, bottom, _ROWS):
         end = min(begin + _ROWS, bottom)
         here = [lay for lay in layers if lay.first_row < end and lay.box[0].stop > begin]
-        stack = np.full((3, max(len(here), 1), end - begin, right - left), np.nan, dtype=np.float32)
+        stack = np.full((4, max(len(here), 1), end - begin, right - left), np.nan, dtype=np.float32)
         for k, layer in enumerate(here):
             r, c = layer.box
             first, last = max(r.start, begin), min(r.stop, end)
@@ -78,10 +81,11 @@ def _fused_bands(layers: Sequence[Layer], box: tuple[slice, slice], bands: int) 
                 continue
             to = slice(first - begin, last - begin), slice(west - left, east - left)
             part = slice(first - r.start, last - r.start), slice(west - c.start, east - c.start)
-            for band, values in enumerate((layer.height_m, layer.variance_m2, layer.grey)):
-                stack[(band, k, *to)] = values[part]
-        flat = stack.reshape(3, stack.shape[1], -1)
-        out = np.empty((5, flat.shape[2]), dtype=np.float32)
-        kernel.fuse_cells(flat[0], flat[1], flat[2], out)
+            known = (layer.height_m, layer.variance_m2, layer.grey, layer.shared_m2)
+            for band, values in enumerate(known):
+                stack[(band, k, *to)] = 0.0 if values is None else values[part]
+        flat = stack.reshape(4, stack.shape[1], -1)
+        out = np.empty((6, flat.shape[2]), dtype=np.float32)
+        kernel.fuse_cells(flat[0], flat[1], flat[2], flat[3], out)
         fused[:, begin - top : end - top] = out[:bands].reshape(bands, end - begin, right - left)
     return fused

@@ -56,6 +56,8 @@ class Layer:
     height_m: NDArray[np.float32]
     variance_m2: NDArray[np.float32]
     grey: NDArray[np.float32]
+    shared_m2: NDArray[np.float32] | None = None
+    """Variance of the height due to errors that neighbouring cells have in common; None: unknown."""
 
     @property
     def box(self) -> tuple[slice, slice]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pancam_graph.base.errors import ImageError
 from pancam_graph.base.geometry import BoolArray, FloatArray
+from pancam_graph.data import StereoNodes
 from pancam_graph.io import read_picture
 from pancam_graph.terrain import kernel
 from pancam_graph.terrain._drive import Drive, Pair
@@ -26,6 +27,8 @@ _FARTHEST_SHARE = 0.15
 _NORMAL_PX = 2
 _STEEPEST = 0.2
 """Least upward part of a normal with which the error of a depth is carried into one of the height."""
+_SLOPE_CELLS = 3
+"""Cells to each side over which the slope of the ground is taken that errors along the ground lift."""
 _ACROSS_PX = 0.05
 """Standard deviation of where a pixel looks, across its line of sight."""
 _ALIKE = 2.0
@@ -57,6 +60,39 @@ class Points:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class SharedErrors:
+    """Errors that the places of one frame have in common: those of its pose and angles, and of the rig."""
+
+    world_R_camera: FloatArray
+    """(3, 3) of the left camera"""
+    world_t_camera: FloatArray
+    """(3,)"""
+    depth_m: FloatArray
+    """(depths,)"""
+    nodes: StereoNodes
+
+    def of_heights(
+        self, x_m: FloatArray, y_m: FloatArray, height_m: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Variances (rows, columns) of the heights of cells at x (columns,) and y (rows,); NaN where none."""
+        variance = np.empty_like(height_m)
+        kernel.shared_variances(
+            x_m,
+            y_m,
+            height_m,
+            _SLOPE_CELLS,
+            1 / _STEEPEST,
+            np.ascontiguousarray(self.world_R_camera),
+            np.ascontiguousarray(self.world_t_camera),
+            self.nodes.extent,
+            self.depth_m,
+            self.nodes.covariance,
+            variance,
+        )
+        return variance
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Surface:
     """A range image in the world: points of the left, rectified picture of a pair."""
 
@@ -75,6 +111,9 @@ class Surface:
     stands_m: float
     """Height of the camera above the ground at the foot of the mast."""
     tilt_sigma_rad: float
+    """Of that part of the tilt's error which is the frame's alone."""
+    shared: "SharedErrors | None" = None
+    """Errors that its places have in common; None: unknown."""
 
     @cached_property
     def points_m(self) -> FloatArray:
@@ -133,6 +172,9 @@ class Surface:
             height_m=height,
             variance_m2=np.where(seen, whole, np.float32(np.nan)),
             grey=grey,
+            shared_m2=None
+            if self.shared is None or move is not None
+            else self.shared.of_heights(x, y, height),
         )
 
     @cached_property
@@ -207,7 +249,6 @@ def surface_of(drive: Drive, pair: Pair, masks: tuple[BoolArray, BoolArray], far
         share = found.sigma_px * depth / (rectified.left.fx_px * rectified.baseline_m)
         known = (share < _FARTHEST_SHARE) & (depth < 2 * farthest_m) & ~_at_edges(found.disparity_px)
         depth = np.where(known, depth, np.nan)
-    tilt = drive.angle_sigma_rad[pair.frame, 1]
     return Surface(
         pair=pair,
         world_T_point=(rays, rectified.world_t_left),
@@ -217,7 +258,20 @@ def surface_of(drive: Drive, pair: Pair, masks: tuple[BoolArray, BoolArray], far
         grey=found.grey,
         focal_px=rectified.left.fx_px,
         stands_m=stands_m,
-        tilt_sigma_rad=float(tilt) if np.isfinite(tilt) else 0.0,
+        tilt_sigma_rad=float(drive.own_tilt_sigma_rad[pair.frame]),
+        shared=_shared(drive, pair),
+    )
+
+
+def _shared(drive: Drive, pair: Pair) -> SharedErrors | None:
+    nodes = None if drive.stereo is None else drive.stereo.of(pair.left, pair.right)
+    if drive.stereo is None or nodes is None:
+        return None
+    return SharedErrors(
+        world_R_camera=drive.world_R_camera[pair.left],
+        world_t_camera=drive.world_t_camera[pair.left],
+        depth_m=drive.stereo.depth_m,
+        nodes=nodes,
     )
 
 

@@ -11,7 +11,7 @@ from pancam_graph import SimulationOptions, Solution, SolveOptions, simulate, so
 from pancam_graph.base.geometry import FloatArray
 from pancam_graph.cameras import FIELD_SHAPE, Camera, Pinhole
 from pancam_graph.data import RigTreatment
-from pancam_graph.report._lens_figures import displacement_px, mean_residuals
+from pancam_graph.report._lens_figures import displacement_px, lens_figures, mean_residuals
 from pancam_graph.report._look import Figure
 from pancam_graph.report._page import make_page
 from pancam_graph.report._rig import rig_section
@@ -79,6 +79,14 @@ def test_each_eye_has_its_figures() -> None:
         for when in ("with the rig held as told", "as refined")
     )
     assert before > 3 * after
+
+
+def test_an_eye_of_which_too_little_is_known_with_the_rig_held_has_its_residuals_as_refined() -> None:
+    solution = solved()
+    nothing = np.full((len(solution.used), 2), np.nan)
+    drawn = {figure.id for _, figures in lens_figures(solution, nothing) for figure in figures}
+    assert {"mean-after-0", "mean-after-1"} <= drawn
+    assert not drawn & {"mean-before-0", "mean-before-1"}
 
 
 def test_a_smooth_field_is_drawn_beside_the_lens() -> None:

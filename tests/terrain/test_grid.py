@@ -7,10 +7,12 @@ import pytest
 from numpy.typing import NDArray
 
 from pancam_graph.base.errors import InputError
+from pancam_graph.data import StereoNodes
 from pancam_graph.terrain import Agreement, TerrainOptions
 from pancam_graph.terrain._agreement import agreement_of
 from pancam_graph.terrain._fused import fuse
 from pancam_graph.terrain._grid import Grid, Layer, grid_around
+from pancam_graph.terrain._surface import SharedErrors
 from pancam_graph.terrain.kernel import raster_quads
 
 GRID = Grid(left_m=0.0, top_m=2.0, cell_m=0.1, rows=20, columns=20)
@@ -116,3 +118,35 @@ def test_a_cell_too_small_for_memory_is_refused_with_one_that_fits() -> None:
     assert grid_around(centres, 25.0, 0.012).columns == 12501
     with pytest.raises(InputError, match="terrain: cell_m: expected a number above 0, found 0"):
         TerrainOptions(cell_m=0.0)
+
+
+def test_errors_in_common_are_not_averaged_out() -> None:
+    common = replace(layer(0, 1.0, 0.01), shared_m2=np.full((15, 12), 9e-4, dtype=np.float32))
+    other = replace(layer(1, 1.0, 0.01), shared_m2=np.full((15, 12), 1e-4, dtype=np.float32))
+    alone, both = fuse(GRID, [common]), fuse(GRID, [common, other])
+    assert alone.sigma_m[4, 4] == pytest.approx(np.sqrt(1e-4 + 9e-4), rel=1e-4)
+    assert both.sigma_m[4, 4] == pytest.approx(np.sqrt(0.5e-4 + 5e-4), rel=1e-4)
+
+
+def test_an_error_in_common_lifts_cells_by_their_distance_and_their_slope() -> None:
+    """Nodes say that depths err by 1 % in common; the camera looks along x from 2 m above the ground."""
+    R = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    depth = 0.8 * 1.6 ** np.arange(12.0)
+    nodes = np.zeros((12, 7, 7, 6))
+    nodes[..., 5] = 0.01**2
+    errors = SharedErrors(
+        world_R_camera=R,
+        world_t_camera=np.array([0.0, 0.0, 2.0]),
+        depth_m=depth,
+        nodes=StereoNodes(np.array([-1.0, 1.0, -1.0, 1.0]), nodes),
+    )
+    x, y = np.linspace(3.0, 6.0, 31), np.linspace(1.0, -1.0, 21)
+    level = np.zeros((21, 31), dtype=np.float32)
+    # A ray that ends 1 % too far ends 1 % of the camera's height too low.
+    np.testing.assert_allclose(np.sqrt(errors.of_heights(x, y, level)), 0.02, rtol=1e-5)
+    slope = (0.2 * (x - 3.0) * np.ones((21, 1))).astype(np.float32)
+    lifted = np.sqrt(errors.of_heights(x, y, slope)[5:-5, 5:-5])
+    expected = np.abs(0.01 * (2.0 - 0.2 * (x - 3.0)) + 0.2 * 0.01 * x)[5:-5]
+    np.testing.assert_allclose(lifted, np.broadcast_to(expected, lifted.shape), rtol=1e-4)
+    level[3, 4] = np.nan
+    assert np.flatnonzero(np.isnan(errors.of_heights(x, y, level))).tolist() == [3 * 31 + 4]

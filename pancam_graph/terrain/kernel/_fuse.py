@@ -20,12 +20,14 @@ def fuse_cells(
     height_m: NDArray[np.float32],
     variance_m2: NDArray[np.float32],
     grey: NDArray[np.float32],
+    shared_m2: NDArray[np.float32],
     fused: NDArray[np.float32],
 ) -> None:
     """Fuse the heights of frames in cells: the mean by variances, robust against frames that are far off.
 
-    `height_m`, `variance_m2` and `grey` are (frames, cells), NaN where a frame does not see a cell. `fused`
-    (5, cells) gets height, its variance, the number of frames, their disagreement, and brightness. The
+    `height_m`, `variance_m2`, `grey` and `shared_m2`, the variance of errors that frames have in common, are
+    (frames, cells), NaN where a frame does not see a cell. `fused` (6, cells) gets height, its variance, the
+    number of frames, their disagreement, brightness, and the mean of the variances in common. The
     disagreement is the weighted standard deviation between frames; NaN where fewer than two see the cell.
     """
     frames, cells = height_m.shape
@@ -40,12 +42,12 @@ def fuse_cells(
                     at -= 1
                 order[at], which[at] = value, f
                 n += 1
-        fused[0, c] = fused[1, c] = fused[3, c] = fused[4, c] = math.nan
+        fused[0, c] = fused[1, c] = fused[3, c] = fused[4, c] = fused[5, c] = math.nan
         fused[2, c] = n
         if n == 0:
             continue
         median = order[n // 2] if n % 2 else 0.5 * (order[n // 2 - 1] + order[n // 2])
-        total = mean = spread = information = light = 0.0
+        total = mean = spread = information = light = common = 0.0
         for k in range(n):
             variance = float(variance_m2[which[k], c])
             ww = 1 / variance
@@ -56,6 +58,7 @@ def fuse_cells(
             mean += ww * order[k]
             information += ww * ww * variance
             light += ww * grey[which[k], c]
+            common += ww * shared_m2[which[k], c]
         mean /= total
         for k in range(n):
             variance = float(variance_m2[which[k], c])
@@ -66,6 +69,7 @@ def fuse_cells(
         fused[0, c] = mean
         fused[1, c] = information / (total * total)
         fused[4, c] = light / total
+        fused[5, c] = common / total
         if n > 1:
             # What frames differ by beyond their sigmas is an error of some of them.
             fused[3, c] = math.sqrt(spread / total)
