@@ -20,6 +20,7 @@ __all__ = [
     "CONSTRAINTS",
     "EXACT",
     "Constraint",
+    "FrameDirection",
     "Landmark",
     "LandmarkAzimuth",
     "LandmarkDistance",
@@ -75,9 +76,16 @@ class Constraint:
         return () if one is None else (one,)
 
     @property
+    def frames(self) -> tuple[str, ...]:
+        """Ids of the frames that it is about."""
+        one = getattr(self, "frame", None)
+        return () if one is None else (one,)
+
+    @property
     def about(self) -> str:
         """Its kind, and what it is about, in words."""
-        return f"{self.kind} of {' and '.join(str(one) for one in (*self.landmarks, *self.stops))}"
+        things = *self.landmarks, *self.stops, *self.frames
+        return f"{self.kind} of {' and '.join(str(one) for one in things)}"
 
     def contradicts(self, other: "Constraint") -> bool:
         """Whether both are exact (sigma 0), about the same, and differ."""
@@ -407,6 +415,61 @@ class StopHeading(_Measured):
     sigma_rad: float
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FrameDirection(Constraint):
+    """A feature without parallax, in a known direction, at a pixel of a picture: the sun, a star, a far peak.
+
+    The direction is the apparent one: where air bends light, as it is seen from the ground.
+    """
+
+    kind = "frame-direction"
+    frame: str
+    """Id of the frame."""
+    camera: str
+    """Name of the eye that took the picture."""
+    u_px: float
+    v_px: float
+    """Where the feature is in the picture, of the sun the middle of its disc."""
+    sigma_px: float
+    """Standard deviation of each coordinate, pixels."""
+    azimuth_rad: float
+    """Anticlockwise from the world's x axis, seen from above."""
+    elevation_rad: float
+    """Positive upwards, between -pi / 2 and pi / 2."""
+    sigma_rad: float = 0.0
+    """Standard deviation of the direction along each axis across it; 0: pixels alone are uncertain."""
+
+    def __post_init__(self) -> None:
+        """Check numbers."""
+        for name in ("u_px", "v_px", "azimuth_rad"):
+            _number(name, getattr(self, name))
+        if _number("sigma_px", self.sigma_px) <= 0:
+            raise InputError(f"sigma_px: expected a number above 0, found {self.sigma_px}")
+        if _number("sigma_rad", self.sigma_rad) < 0:
+            raise InputError(f"sigma_rad: expected 0 (exact) or a positive number, found {self.sigma_rad}")
+        if abs(_number("elevation_rad", self.elevation_rad)) > np.pi / 2:
+            raise InputError(
+                f"elevation_rad: expected a number from -pi / 2 to pi / 2, found {self.elevation_rad}"
+            )
+
+    @property
+    def about(self) -> str:
+        """Its kind, frame and camera, in words."""
+        return f"{self.kind} of {self.frame} {self.camera}"
+
+    @property
+    def direction(self) -> FloatArray:
+        """(3,) unit vector of the world."""
+        level = np.cos(self.elevation_rad)
+        return np.array(
+            [
+                level * np.cos(self.azimuth_rad),
+                level * np.sin(self.azimuth_rad),
+                np.sin(self.elevation_rad),
+            ]
+        )
+
+
 CONSTRAINTS: tuple[type[Constraint], ...] = (
     LandmarkPosition,
     LandmarkHeight,
@@ -421,6 +484,7 @@ CONSTRAINTS: tuple[type[Constraint], ...] = (
     StopPose,
     StopDistance,
     StopHeading,
+    FrameDirection,
 )
 """All kinds, in the order in which error messages name them."""
 

@@ -19,7 +19,7 @@ from pancam_graph.base.arrays import float_array, int_array
 from pancam_graph.base.choices import expected_one_of, nearest, some_of
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, compose, pose_arrays
-from pancam_graph.data._constraints import Constraint, Landmark
+from pancam_graph.data._constraints import Constraint, FrameDirection, Landmark
 from pancam_graph.data._matching import Matching
 from pancam_graph.data._noise import PixelNoise, mean_sigma_px
 from pancam_graph.data._points import NamedPoints
@@ -347,6 +347,8 @@ class Traverse:
             for stop in one.stops:
                 if stop not in stops:
                     raise InputError(expected_one_of(f"{where}: stop", stop, stops))
+            if isinstance(one, FrameDirection):
+                self._require_in_picture(one, where)
             for landmark in one.landmarks:
                 self.track_of(landmark, f"{where}: landmark")
             if one.stops and not one.landmarks and held.issuperset(one.stops):
@@ -361,6 +363,32 @@ class Traverse:
                         "found another value"
                     )
             before.append(i)
+
+    def _require_in_picture(self, one: FrameDirection, where: str) -> None:
+        """Raise InputError for a direction seen in a picture that there is not, or beside it."""
+        for what, name, names in (
+            ("frame", one.frame, [f.id for f in self.frames]),
+            ("camera", one.camera, [eye.name for eye in self.rig.eyes]),
+        ):
+            if name not in names:
+                raise InputError(expected_one_of(f"{where}: {what}", name, names))
+        image = self.image_of(one)
+        if image is None:
+            cameras = ", ".join(i.camera for i in self.images if i.frame == one.frame) or "none"
+            raise InputError(
+                f"{where}: expected an image of {one.frame} by {one.camera}; found images by {cameras}"
+            )
+        camera = self.rig.eyes[int(self.image_eye[image])].camera
+        if not camera.contains(np.array([[one.u_px, one.v_px]]))[0]:
+            raise InputError(
+                f"{where}: expected pixels in a picture of {camera.width_px} x {camera.height_px}, found "
+                f"({one.u_px:g}, {one.v_px:g})"
+            )
+
+    def image_of(self, one: FrameDirection) -> int | None:
+        """Row of the image in which a feature of known direction is; None where there is no such image."""
+        seen = one.frame, one.camera
+        return next((i for i, image in enumerate(self.images) if (image.frame, image.camera) == seen), None)
 
     def track_of(self, landmark: Landmark, where: str = "landmark") -> int | None:
         """Number of the track of a landmark, by name or number; None where it has none yet.

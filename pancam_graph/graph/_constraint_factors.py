@@ -1,4 +1,4 @@
-"""Constraints on stops, and those that join points, as factors; those on one point are in `_sensors`."""
+"""Constraints on stops and frames, and those that join points; those on one point are in `_sensors`."""
 
 from collections.abc import Iterator, Mapping
 
@@ -7,6 +7,7 @@ import numpy as np
 
 from pancam_graph.data import (
     Constraint,
+    FrameDirection,
     LandmarkDistance,
     StopDistance,
     StopHeading,
@@ -16,20 +17,29 @@ from pancam_graph.data import (
     Traverse,
 )
 from pancam_graph.factors import Key, stop_distance_factor, stop_heading_factor, stop_position_factor
+from pancam_graph.graph._direction_factors import require_in_sight
 from pancam_graph.graph._given import GivenFactor
-from pancam_graph.graph._graph_keys import GraphKeys
+from pancam_graph.graph._template import FactorTemplate
 
 __all__ = ["landmark_constraints", "stop_constraints"]
 
 
-def stop_constraints(traverse: Traverse, keys: GraphKeys) -> Iterator[GivenFactor]:
-    """The constraints of a traverse that are about stops alone."""
+def stop_constraints(traverse: Traverse, template: FactorTemplate) -> Iterator[GivenFactor]:
+    """The constraints of a traverse that are about stops and frames, on a template of its drive.
+
+    Raises InputError for a direction that its camera cannot see, or that is of no camera of the template's.
+    """
     for i, one in enumerate(traverse.constraints):
         if one.landmarks:
             continue
-        factor = _factor(one, [keys.mast(stop) for stop in one.stops])
+        name = f"constraints[{i}] ({one.about})"
+        if isinstance(one, FrameDirection):
+            require_in_sight(traverse, one, template.image_of(one), name)
+            factor: gtsam.NonlinearFactor | None = template.direction_factor(one)
+        else:
+            factor = _factor(one, [template.keys.mast(stop) for stop in one.stops])
         if factor is not None:
-            yield GivenFactor(factor=factor, name=f"constraints[{i}] ({one.about})", constraint=i)
+            yield GivenFactor(factor=factor, name=name, constraint=i)
 
 
 def landmark_constraints(traverse: Traverse, key_of_track: Mapping[int | None, int]) -> Iterator[GivenFactor]:

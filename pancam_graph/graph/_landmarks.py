@@ -47,6 +47,7 @@ class ExplicitLandmarks:
     def beside_landmarks(self, given: Sequence[GivenFactor] = ()) -> gtsam.NonlinearFactorGraph:
         """All factors except those of observations: the template's and the caller's."""
         template_factors = self.template.factors(apart=True)
+        given = self.template.believed(given)
         seats = self.calibrations.seats(self.template.seats(given))
         placed = (seated(one, seats) for one in given)
         graph = self.calibrations.in_place(template_factors.graph)

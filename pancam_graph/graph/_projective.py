@@ -9,6 +9,7 @@ scale factor of P.
 import gtsam
 import numpy as np
 
+from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray, IntArray, pose_arrays
 from pancam_graph.cameras import (
     CALIBRATION_ENTRIES,
@@ -17,7 +18,7 @@ from pancam_graph.cameras import (
     projection_tangents,
     split_projections,
 )
-from pancam_graph.data import ENTRIES, Refined, RigCorrection, State, Traverse
+from pancam_graph.data import ENTRIES, FrameDirection, Refined, RigCorrection, State, Traverse
 from pancam_graph.elimination import Covariance, Posture
 from pancam_graph.factors import Fixed, Key, projective_factor
 from pancam_graph.graph._factors import FactorList
@@ -55,6 +56,12 @@ class ProjectiveTemplate(SoftTemplate):
         super().__init__(traverse, "projective", flex)
         n = len(traverse.images)
         self.conditioning = _conditioning(traverse) if normalise else Conditioning.none(n)
+
+    def direction_factor(self, one: FrameDirection) -> gtsam.CustomFactor:
+        """Raise InputError: a matrix is no camera through which directions are seen."""
+        raise InputError(
+            f"constraints ({one.about}): expected the model mast, circle or free, found projective"
+        )
 
     def _split(self, values: gtsam.Values) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """K, camera_R_world, centre relative to `origin_m`, and scale factor of all images."""

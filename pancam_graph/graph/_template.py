@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from copy import copy
+from dataclasses import replace
 from functools import cached_property
 from typing import Self
 
@@ -11,9 +12,10 @@ import numpy as np
 
 from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.cameras import Fields, LensTable, fields_of
-from pancam_graph.data import Refined, RigCorrection, Sharing, State, Traverse
+from pancam_graph.data import FrameDirection, Refined, RigCorrection, Sharing, State, Traverse
 from pancam_graph.elimination import Covariance, JointCovariance, Linkage, PosePlace, Posture, Root
 from pancam_graph.factors import Fixed, Key, Slot, encoder_factor, joint_prior_factor
+from pancam_graph.graph._direction_factors import direction_by_mast
 from pancam_graph.graph._factors import FactorList, Factors
 from pancam_graph.graph._given import GivenFactor, Seat, seated
 from pancam_graph.graph._graph_keys import GraphKeys
@@ -98,6 +100,7 @@ class FactorTemplate(ABC):
         template lacks. `apart` as for `ties`: it keeps the graph sparse for elimination by GTSAM.
         """
         stops = range(len(self.traverse.stops))
+        given = [self.own(one) for one in given]
         return Factors(
             telemetry=tuple(self.telemetry_priors()),
             ties=tuple(self.ties(apart=apart)),
@@ -113,12 +116,48 @@ class FactorTemplate(ABC):
         self, given: Sequence[GivenFactor], present: gtsam.Values | None = None
     ) -> tuple[gtsam.NonlinearFactor, ...]:
         """Given factors on this template's variables, but those held or let go; see `factors`."""
-        believed = [
-            one for one in given if one.constraint is None or not self.let_go.constraints[one.constraint]
-        ]
-        seats = self.seats(believed, present)
-        placed = (seated(one, seats) for one in believed)
+        given = self.believed(given)
+        seats = self.seats(given, present)
+        placed = (seated(one, seats) for one in given)
         return tuple(factor for factor in placed if factor is not None)
+
+    def believed(self, given: Sequence[GivenFactor]) -> list[GivenFactor]:
+        """Given factors but those that state constraints which were let go."""
+        gone = self.let_go.constraints
+        return [one for one in given if one.constraint is None or not gone[one.constraint]]
+
+    def own(self, given: GivenFactor) -> GivenFactor:
+        """A given factor as this template has it: a direction that a camera sees is of its own variables."""
+        one = None if given.constraint is None else self.traverse.constraints[given.constraint]
+        if not isinstance(one, FrameDirection):
+            return given
+        return replace(given, factor=self.direction_factor(one))
+
+    def direction_factor(self, one: FrameDirection) -> gtsam.CustomFactor:
+        """What is seen in a known direction, on keys of which the template has seats; here by the mast."""
+        image = self.image_of(one)
+        stop, frame = int(self.traverse.image_stop[image]), int(self.traverse.image_frame[image])
+        return direction_by_mast(
+            one,
+            self.rig_variables,
+            image,
+            self.mast(stop),
+            Key(key_of(Kind.ANGLES, frame)),
+            self.head_flex.slot(key_of(Kind.FLEX, frame)),
+            self.plain_px(one),
+        )
+
+    def image_of(self, one: FrameDirection) -> int:
+        """Row of the image in which a direction is seen."""
+        image = self.traverse.image_of(one)
+        assert image is not None  # the traverse has looked
+        return image
+
+    def plain_px(self, one: FrameDirection) -> FloatArray:
+        """(2,) the pixel of a direction as it would be without the smooth field of the rig's camera."""
+        image = np.array([self.image_of(one)])
+        (plain_px,) = self.without_field(image, np.array([[one.u_px, one.v_px]]))
+        return np.asarray(plain_px)
 
     @cached_property
     def keys(self) -> GraphKeys:

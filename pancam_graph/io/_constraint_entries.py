@@ -40,7 +40,7 @@ class _ConstraintEntry(SparseEntry):
     """Base of all kinds."""
 
     _OPTIONAL: ClassVar = frozenset(
-        {"robust", "sigma_m", "covariance_m2", "position_m", "world_T_mast", "covariance"}
+        {"robust", "sigma_m", "sigma_rad", "covariance_m2", "position_m", "world_T_mast", "covariance"}
     )
 
     kind: str
@@ -168,6 +168,21 @@ class _StopHeading(_ConstraintEntry):
     sigma_rad: float
 
 
+class _FrameDirection(_ConstraintEntry):
+    kind: Literal["frame-direction"]
+    frame: Label
+    camera: Label
+    u_px: float
+    v_px: float
+    sigma_px: float
+    azimuth_rad: float
+    elevation_rad: float
+    sigma_rad: float | None = None
+
+    def _made(self, known: dict[str, Any]) -> Constraint:
+        return super()._made({name: value for name, value in known.items() if value is not None})
+
+
 AnyConstraint = Annotated[
     _LandmarkPosition
     | _LandmarkHeight
@@ -180,7 +195,8 @@ AnyConstraint = Annotated[
     | _StopPosition
     | _StopPose
     | _StopDistance
-    | _StopHeading,
+    | _StopHeading
+    | _FrameDirection,
     Field(discriminator="kind"),
 ]
 """Any kind of constraint, as the type of an entry."""

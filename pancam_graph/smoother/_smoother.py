@@ -261,7 +261,7 @@ class TraverseSmoother:
         return self.add_factors_of(self._template, factors)
 
     def add_constraints(self, constraints: Sequence[Constraint]) -> Update:
-        """Add ties on stops; they take part from now on, as factors of the caller's do, and are never let go.
+        """Add ties on stops and frames; they take part from now on, and are never let go.
 
         Raises InputError, and changes nothing, for a tie on a stop that was not added or that telemetry
         holds, and for one on terrain points: these are eliminated at places that move with their stops
@@ -270,10 +270,11 @@ class TraverseSmoother:
         for i, one in enumerate(constraints):
             if one.landmarks:
                 raise InputError(
-                    f"constraints[{i}] ({one.about}): expected a tie on stops, found one on terrain points"
+                    f"constraints[{i}] ({one.about}): expected a tie on stops or frames, found one on "
+                    "terrain points"
                 )
         tied = replace(self._template.traverse, constraints=tuple(constraints))
-        return self.add_factors([one.factor for one in stop_constraints(tied, self.keys)])
+        return self.add_factors([one.factor for one in stop_constraints(tied, self._template)])
 
     def add_factors_of(self, template: HardTemplate, factors: UserFactors) -> Update:
         """The same on the keys of a template of the whole drive, which may be in another order."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from pancam_graph.base.geometry import FloatArray
 from pancam_graph.data import (
+    FrameDirection,
     LandmarkAzimuth,
     LandmarkElevation,
     LandmarkInfinity,
@@ -183,7 +184,7 @@ def _test(
     size, unit = float(np.linalg.norm(raw)), "m"
     if isinstance(one, StopPose | LandmarkInfinity):
         unit = ""
-    elif isinstance(one, LandmarkAzimuth | LandmarkElevation | StopHeading):
+    elif isinstance(one, LandmarkAzimuth | LandmarkElevation | StopHeading | FrameDirection):
         size, unit = float(np.degrees(size)), "degrees"
     return ConstraintTest(
         row=row,

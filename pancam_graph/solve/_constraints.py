@@ -49,7 +49,7 @@ def require_constraints(traverse: Traverse, options: SolveOptions, problem: Prob
         for landmark in one.landmarks:
             if traverse.track_of(landmark, where) not in seen:
                 raise InputError(f"{where}: expected a point that two or more images see, found it in fewer")
-    given = list(stop_constraints(traverse, template.keys))
+    given = list(stop_constraints(traverse, template))
     check_given(given, template.seats(given), problem.values)
 
 
@@ -64,7 +64,7 @@ def constrained(problem: Problem, *, placed: bool = True) -> Problem:
     if not traverse.constraints:
         return problem
     given = [one for one in problem.factors.given if one.constraint is None]
-    given += stop_constraints(traverse, template.keys)
+    given += stop_constraints(traverse, template)
     made = ties_of(traverse, _tracks(problem))
     if made is None:
         return replace(problem, factors=template.factors(given, present=problem.values))

@@ -83,6 +83,6 @@ def build_graph(
         loss=loss,
         is_rigid=options.firm_tie == "hard",
     )
-    for one in stop_constraints(traverse, problem.template.keys):
+    for one in stop_constraints(traverse, problem.template):
         graph.push_back(one.factor)
     return graph, values

@@ -14,6 +14,7 @@ from pancam_graph import Traverse, read_traverse, write_traverse
 from pancam_graph.base.errors import InputError
 from pancam_graph.data import (
     CONSTRAINTS,
+    FrameDirection,
     LandmarkAzimuth,
     LandmarkDistance,
     LandmarkElevation,
@@ -55,6 +56,16 @@ EVERY = (
     LandmarkSurface(landmark="rock7", surface=GROUND, sigma_m=0.1, robust=True),
     LandmarkDistance(between=("rock7", 0), distance_m=2.5, sigma_m=0.01),
     StopPlacement(stop=S1, world_T_mast=POSE, covariance=1e-4 * np.eye(6)),
+    FrameDirection(
+        frame="frame00000",
+        camera="left",
+        u_px=100.5,
+        v_px=-0.5,
+        sigma_px=0.3,
+        azimuth_rad=-2.0,
+        elevation_rad=0.6,
+        sigma_rad=1e-4,
+    ),
 )
 
 
@@ -192,7 +203,7 @@ WRONG: dict[str, tuple[Change, str]] = {
     ),
     "contradictory exact heights": (
         lambda c: c["constraints"].extend(EXACT),
-        r"constraints\[15\] \(landmark-height\): expected what constraints\[14\] says, which is exact",
+        r"constraints\[16\] \(landmark-height\): expected what constraints\[15\] says, which is exact",
     ),
     "a surface that is not there": (entry(11, file="hills.tif"), "hills.tif: expected a GeoTIFF, found"),
     "a surface outside": (entry(11, file="../dem.tif"), "file: expected a path inside the traverse folder"),
@@ -206,13 +217,35 @@ WRONG: dict[str, tuple[Change, str]] = {
     "no distance": (entry(12, distance_m=0.0), "distance_m: expected a number above 0, found 0.0"),
     "contradictory exact distances": (
         lambda c: c["constraints"].extend(DISTANCES),
-        r"constraints\[15\] \(landmark-distance\): expected what constraints\[14\] says, which is exact",
+        r"constraints\[16\] \(landmark-distance\): expected what constraints\[15\] says, which is exact",
     ),
     "a place told in two ways": (
         entry(13, position_m=[0.0, 0.0, 0.0]),
         "expected position_m with sigma_m or covariance_m2, or world_T_mast with covariance; found pos",
     ),
     "a pose without covariance": (entry(13, covariance=None), "found world_T_mast"),
+    "direction of an unknown frame": (
+        entry(14, frame="frame0000"),
+        r"constraints\[14\] \(frame-direction\): frame: expected one of .*found 'frame0000'",
+    ),
+    "direction seen by an unknown camera": (
+        entry(14, camera="lefy"),
+        "camera: expected one of left, right; found 'lefy'; is 'left' meant",
+    ),
+    "direction beside the picture": (
+        entry(14, u_px=1023.6),
+        r"expected pixels in a picture of 1024 x 1024, found \(1023.6, -0.5\)",
+    ),
+    "direction without a sigma of pixels": (
+        entry(14, sigma_px=0.0),
+        "sigma_px: expected a number above 0, found 0.0",
+    ),
+    "direction with a negative sigma": (entry(14, sigma_rad=-1e-3), "sigma_rad: expected 0"),
+    "direction beyond the zenith": (entry(14, elevation_rad=1.58), "a number from -pi / 2 to pi / 2"),
+    "direction without an azimuth": (
+        lambda c: c["constraints"][14].pop("azimuth_rad"),
+        "azimuth_rad: expected",
+    ),
     "points that are not there": (
         lambda c: c.update(points="marks.csv"),
         "marks.csv: expected a file, found",

@@ -137,7 +137,7 @@ def test_a_smoother_with_ties_on_stops_is_where_batch_is() -> None:
     off = smoother.covariance(traverse.stops[1].id) - batch.stop_covariance[1]
     assert np.abs(off / np.outer(sigma, sigma)).max() < 1e-2
     with pytest.raises(
-        InputError, match=r"constraints\[0\] .*: expected a tie on stops, found one on terrain"
+        InputError, match=r"constraints\[0\] .*: expected a tie on stops or frames, found one on terrain"
     ):
         smoother.add_constraints(landmark_ties(simulated(2, 3))[:1])
     with pytest.raises(InputError, match="found stop0000 held by sigma 0"):
