@@ -117,7 +117,6 @@ def telemetry_alignment(terrain: StopTerrain, a: int, b: int) -> Alignment:
 def align_stops(
     terrain: StopTerrain,
     features: Callable[[int], Features],
-    feature_of: IntArray,
     a: int,
     b: int,
     options: FrontEndOptions,
@@ -128,14 +127,13 @@ def align_stops(
     what most of these matches say corrects the pose, and the search is repeated in the smaller windows. Where
     they contradict telemetry, it is repeated with a telemetry that pulls less (see `believed`). Where
     telemetry leaves wide windows open, the search begins where most matches agree (see `_begun`).
-    `feature_of` is the feature of each of the terrain's observations.
     """
     telemetry = telemetry_alignment(terrain, a, b)
-    correction = _begun(terrain, features, feature_of, (a, b), telemetry, options)
+    correction = _begun(terrain, features, (a, b), telemetry, options)
     prior, rounds = believed(telemetry, correction), _ROUNDS
     while rounds:
         rounds -= 1
-        ties, half_width = _matched(terrain, features, feature_of, (a, b), correction, options)
+        ties, half_width = _matched(terrain, features, (a, b), correction, options)
         if len(ties) < options.min_pair_matches:
             return Refusal.FEW_ALIKE
         start_px = float(np.median(half_width))
@@ -154,7 +152,6 @@ def align_stops(
 def _begun(
     terrain: StopTerrain,
     features: Callable[[int], Features],
-    feature_of: IntArray,
     stops: tuple[int, int],
     telemetry: Alignment,
     options: FrontEndOptions,
@@ -177,7 +174,7 @@ def _begun(
             shift = radius * sigma_m * (np.cos(angle) * east + np.sin(angle) * north)
             place = telemetry.world_T_mast.compose(gtsam.Pose3(gtsam.Rot3(), shift))
             start = Alignment(world_T_mast=place, root=_START_WINDOW * telemetry.root)
-            ties, half_width = _matched(terrain, features, feature_of, stops, start, options)
+            ties, half_width = _matched(terrain, features, stops, start, options)
             if len(ties) < options.min_pair_matches:
                 continue
             found = fit_pose(terrain, ties, start, start, float(np.median(half_width)))
@@ -202,7 +199,6 @@ def believed(telemetry: Alignment, found: Alignment) -> Alignment:
 def _matched(
     terrain: StopTerrain,
     features: Callable[[int], Features],
-    feature_of: IntArray,
     stops: tuple[int, int],
     at: Alignment,
     options: FrontEndOptions,
@@ -219,9 +215,9 @@ def _matched(
             magnification=seen.zoom,
             valid=sought.usable,
         )
-        of_terrain = features(sought.own).select(feature_of[terrain.row[sought.rows]])
+        of_terrain = features(sought.own).select(terrain.feature[sought.rows])
         theirs = terrain.rows_of[sought.image]
-        other = features(sought.image).select(feature_of[terrain.row[theirs]])
+        other = features(sought.image).select(terrain.feature[theirs])
         matches = match_in_windows(of_terrain, other, segments, options)
         parts.append(
             Ties(

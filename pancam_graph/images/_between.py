@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.base.threads import in_parallel
-from pancam_graph.data import Observations, Refusal, StopMatching, Traverse, mean_sigma_px
+from pancam_graph.data import Refusal, StopMatching, Traverse
 from pancam_graph.images._alignment import (
     Alignment,
     Ties,
@@ -24,13 +24,12 @@ from pancam_graph.images._alignment import (
 from pancam_graph.images._features import Features
 from pancam_graph.images._front_end_options import FrontEndOptions
 from pancam_graph.images._local_map import HALF_WIDTH_PX
-from pancam_graph.images._masks import pixels_at
 from pancam_graph.images._patch_noise import patch_covariance_px2
 from pancam_graph.images._patches import MAX_REACH_PX, QUALITIES, Coefficients, align_patches
-from pancam_graph.images._splines import Splines
-from pancam_graph.images._terrain import Sighting, StopTerrain, rows_by_image
+from pancam_graph.images._terrain import Sighting, StopTerrain
+from pancam_graph.images._usable import on_terrain
 
-__all__ = ["StopMatcher", "StopTies", "agreeing", "joined", "on_terrain", "stereo_stops"]
+__all__ = ["StopMatcher", "StopTies", "agreeing", "stereo_stops"]
 
 _CELL_PX = 64.0
 _PER_CELL = 2
@@ -100,14 +99,13 @@ class StopMatcher:
     """Finds the terrain of one stop in the images of another. Several threads may use it at once."""
 
     terrain: StopTerrain
-    """Points of all stops, without those that a mask covers."""
-    spline: Splines
+    """Points of the stops, without those that a mask covers. Images are by their rows in it."""
+    spline: Callable[[int, int], Coefficients]
+    """Spline coefficients of an image, blurred by half octaves; see `Splines`."""
     usable: Callable[[int], BoolArray]
     """Which pixels (height, width) of an image show terrain, by row."""
     features: Callable[[int], Features]
     """Features of an image, by row."""
-    feature_of: IntArray
-    """(observations,) row of each of the terrain's observations in its image's features."""
     options: FrontEndOptions
 
     def ties(self, one: int, other: int) -> StopTies:
@@ -117,7 +115,7 @@ class StopMatcher:
         a point is sought in the images where the corrected pose has it, warped by the surface there, and
         matched by least squares.
         """
-        alignment = align_stops(self.terrain, self.features, self.feature_of, one, other, self.options)
+        alignment = align_stops(self.terrain, self.features, one, other, self.options)
         if isinstance(alignment, Refusal):
             return _nothing(self.terrain, (one, other), _Sought(), alignment)
         t = self.terrain.traverse
@@ -163,15 +161,14 @@ def _nothing(terrain: StopTerrain, stops: tuple[int, int], sought: "_Sought", re
 
 
 def agreeing(terrain: StopTerrain, there: StopTies, back: StopTies) -> tuple[StopTies, StopTies]:
-    """The ties of two stops in both directions; none at all where the two contradict each other.
+    """The ties of the two stops of a terrain in both directions; none where these contradict each other.
 
     Either stop's terrain in the images of the other says where the two stand relative to each other. That is
     the same twice, unless one of them, or both, fitted what is alike by chance.
     """
     if there.report.refusal or back.report.refusal:
         return there, back
-    a, b = there.report.a, there.report.b
-    masts = [terrain.traverse.stops[s].world_T_mast for s in (a, b)]
+    masts = [stop.world_T_mast for stop in terrain.traverse.stops]
     a_T_b, b_T_a = masts[0].between(there.pose.world_T_mast), masts[1].between(back.pose.world_T_mast)
     gap = gtsam.Pose3.Logmap(a_T_b.compose(b_T_a))
     moved = b_T_a.inverse().AdjointMap()
@@ -181,10 +178,10 @@ def agreeing(terrain: StopTerrain, there: StopTies, back: StopTies) -> tuple[Sto
     far = np.linalg.norm(gap[3:]) > _GAP_SHARE * apart_m or np.linalg.norm(gap[:3]) > _GAP_RAD
     if not (far and sigmas > _GAP_SIGMAS):
         return there, back
-    return _contradicted(terrain, there), _contradicted(terrain, back)
+    return _contradicted(terrain, (0, 1), there), _contradicted(terrain, (1, 0), back)
 
 
-def _contradicted(terrain: StopTerrain, stop_ties: StopTies) -> StopTies:
+def _contradicted(terrain: StopTerrain, stops: tuple[int, int], stop_ties: StopTies) -> StopTies:
     report = stop_ties.report
     return StopTies(
         ties=Ties.concatenate([]),
@@ -195,7 +192,7 @@ def _contradicted(terrain: StopTerrain, stop_ties: StopTies) -> StopTies:
             noise_px=0.0,
             refusal=Refusal.CONTRADICTION,
         ),
-        pose=telemetry_alignment(terrain, report.a, report.b),
+        pose=telemetry_alignment(terrain, *stops),
     )
 
 
@@ -211,14 +208,6 @@ class _Sought:
 
     def __add__(self, other: "_Sought") -> "_Sought":
         return _Sought(**{name: value + getattr(other, name) for name, value in vars(self).items()})
-
-
-def on_terrain(usable: Callable[[int], BoolArray], image: IntArray, uv_px: FloatArray) -> BoolArray:
-    """Which pixels (n, 2) of images (n,) show terrain."""
-    shows = np.zeros(len(image), dtype=bool)
-    for i, rows in rows_by_image(image).items():
-        shows[rows] = pixels_at(usable(i), uv_px[rows])
-    return shows
 
 
 def _spread(terrain: StopTerrain) -> BoolArray:
@@ -271,7 +260,7 @@ def _with_common_errors(ties: Ties) -> Ties:
 
 def _found(
     terrain: StopTerrain,
-    spline: Splines,
+    spline: Callable[[int, int], Coefficients],
     rows: IntArray,
     image: int,
     alignment: Alignment,
@@ -304,7 +293,7 @@ def _found(
         return _Sought(), Ties.concatenate([])
     level = np.clip(np.rint(2 * np.log2(np.sqrt(stretch[k, 0] * stretch[k, 1]))), 0, 4).astype(np.int64)
     start, uv, fit = terrain.uv_px[rows[k]], seen.uv_px[k].copy(), np.empty((len(k), QUALITIES))
-    first, second_at = spline(int(terrain.image[rows[0]])), partial(spline, image)
+    first, second_at = spline(int(terrain.image[rows[0]]), 0), partial(spline, image)
     for blur in np.unique(level).tolist():
         part = np.flatnonzero(level == blur)
         patches = start[part], affine[k[part]], bend[k[part]], reach[k[part]], uv[part]
@@ -375,20 +364,3 @@ def _aligned(
         grain=_GRAIN,
     )
     return uv_b, fit
-
-
-def joined(obs: Observations, terrain: StopTerrain, ties: Ties) -> Observations:
-    """Observations, which have covariances, with the ties added to their points' tracks."""
-    assert obs.covariance_px2 is not None
-    image = np.concatenate([obs.image, ties.image])
-    track = np.concatenate([obs.track, terrain.track[ties.row]])
-    order = np.lexsort((image, track))
-    covariance = np.concatenate([obs.covariance_px2, ties.covariance_px2])[order]
-    return replace(
-        obs,
-        image=image[order],
-        track=track[order],
-        uv_px=np.concatenate([obs.uv_px, ties.uv_px])[order],
-        sigma_px=mean_sigma_px(covariance),
-        covariance_px2=covariance,
-    )

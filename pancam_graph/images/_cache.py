@@ -3,7 +3,7 @@
 import hashlib
 import json
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from functools import cache
@@ -24,12 +24,13 @@ from numpy.typing import NDArray
 
 from pancam_graph.base.errors import ClusterError, InputError
 from pancam_graph.base.regular_files import is_missing
+from pancam_graph.base.sources import source_digest
 from pancam_graph.base.whole_files import whole_file
 from pancam_graph.images._cache_folder import begin_cache
 from pancam_graph.images._held import Held
 from pancam_graph.io import NpzFile, prefixed
 
-__all__ = ["Cache", "digest", "libraries"]
+__all__ = ["Arrays", "Cache", "digest", "key_of", "libraries"]
 
 _LOG = logging.getLogger(__name__)
 _SUFFIX = ".npz"
@@ -196,6 +197,14 @@ def digest(*parts: Any) -> str:
     running = hashlib.sha256(json.dumps(libraries()).encode())
     _feed(running, parts)
     return running.hexdigest()
+
+
+def key_of(kind: str, calls: Iterable[Callable[..., Any]], alone: Iterable[str], *inputs: Any) -> str:
+    """The key of a kind of result: a digest of its inputs and of all modules that its calls run through.
+
+    Of the modules that `alone` names, and of this one, only the own text counts, not what they import.
+    """
+    return digest(kind, source_digest(*calls, alone=(*alone, __name__)), *inputs)
 
 
 def _feed(running: Any, value: Any) -> None:

@@ -1,7 +1,8 @@
 """From image files to observations: masks, features, pairs, matches, tracks."""
 
 import logging
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, overload
@@ -9,18 +10,17 @@ from typing import Any, overload
 import numpy as np
 
 from pancam_graph.base.errors import InputError
-from pancam_graph.base.geometry import IntArray
 from pancam_graph.base.options import options_of
 from pancam_graph.base.threads import in_order
-from pancam_graph.data import Matching, Observations, PairMatching, StopMatching, Traverse
-from pancam_graph.images._alignment import Ties
-from pancam_graph.images._between import StopTies, agreeing, joined
+from pancam_graph.data import Matching, Observations, PairMatching, StopMatching, Traverse, mean_sigma_px
+from pancam_graph.images._between import StopTies
 from pancam_graph.images._cache import Cache
 from pancam_graph.images._front_end_options import FrontEndOptions
 from pancam_graph.images._masks import ImageMask, Reason
 from pancam_graph.images._match_pair import PairMatches
 from pancam_graph.images._on_workers import Helpers, helped
 from pancam_graph.images._pairs import PairGeometry
+from pancam_graph.images._placed import PlacedStops, TiedTracks
 from pancam_graph.images._read import image_name, listed
 from pancam_graph.images._steps import Progress, Steps
 
@@ -31,6 +31,7 @@ _SURE_OVERLAP = 0.1
 _SURE_DEPTH_M = 3.0
 _OVER_EXPOSED = 0.3
 _MOST = 0.5
+_COLUMNS = ("image", "track", "uv_px", "covariance_px2")
 _WHY = {
     Reason.USER: "is black in its mask",
     Reason.MISSING: "has no data",
@@ -80,17 +81,18 @@ def find_observations(
     options = options_of(FrontEndOptions, options, "find_observations")
     work = Steps(traverse, options, progress, Cache(cache))
     with helped(client, work, cache) as helpers:
-        return _found(work, helpers)
+        return _found(PlacedStops(work), helpers)
 
 
-def _found(work: Steps, helpers: Helpers | None) -> Traverse:
+def _found(placed: PlacedStops, helpers: Helpers | None) -> Traverse:
     """The traverse with observations; what helpers do before is not done here."""
+    work = placed.work
     traverse, options = work.traverse, work.options
     if helpers is not None:
-        work.plan()
-        helpers.within_stops(work)
+        placed.plan()
+        helpers.do_all(placed)
     _make_masks(work)
-    work.plan()
+    placed.plan()
     warnings = [*work.pictures.warnings, *_over_exposed(work)]
     _make_features(work)
     pairs = _match(work)
@@ -116,16 +118,17 @@ def _found(work: Steps, helpers: Helpers | None) -> Traverse:
         for i in unseen
         if i not in work.pictures.unusable
     ]
-    observations, feature = _within_stops(work)
-    stops: list[StopMatching] = []
+    _within_stops(work)
+    tied, stops = dict[int, list[TiedTracks]](), list[StopMatching]()
     if work.stop_pairs:
-        observations, stops = _between_stops(work, helpers, observations, feature)
+        tied, stops = _between_stops(placed)
         untied = {(a, b) for a, b in work.stop_pairs} - {tuple(sorted((s.a, s.b))) for s in stops if s.kept}
         warnings += [
             f"stops {traverse.stops[a].id} and {traverse.stops[b].id}: no ties, although they may see the "
             "same terrain"
             for a, b in sorted(untied)
         ]
+    observations = _observations(work, tied)
     work.cache.forget_others()
     matching = Matching(pairs=tuple(pairs), stops=tuple(stops))
     return traverse.with_observations(observations.with_points(traverse.points), warnings, matching=matching)
@@ -200,45 +203,28 @@ def _match(work: Steps) -> list[PairMatching]:
     return [report for _, report in sorted(zip(order, reports, strict=True), key=lambda each: each[0])]
 
 
-def _within_stops(work: Steps) -> tuple[Observations, IntArray]:
-    """Observations within the stops, sorted by track, then image, and the row of each among its features."""
+def _within_stops(work: Steps) -> None:
+    """Refine the tracks of all groups of stops."""
     parts = [(group, origin) for group in range(len(work.groups)) for origin in work.origins(group)]
 
     def refine(part: tuple[int, int]) -> None:
         work.refined(*part)
 
     in_order(refine, parts, lambda k, _: work.tell("refinement", k + 1, len(parts)))
-    groups = [work.observed(group) for group in range(len(work.groups))]
-    begin = np.cumsum([0, *(1 + int(each["track"].max(initial=-1)) for each in groups)])
-    columns = {name: np.concatenate([each[name] for each in groups]) for name in groups[0]}
-    track = np.concatenate([each["track"] + first for each, first in zip(groups, begin, strict=False)])
-    # Tracks are numbered by the images in which they begin, whatever their group.
-    first = columns["image"][np.searchsorted(track, np.arange(begin[-1]))]
-    number = np.empty(begin[-1], dtype=np.int64)
-    number[np.argsort(first, kind="stable")] = np.arange(begin[-1])
-    order = np.argsort(number[track], kind="stable")
-    observations = Observations(
-        image=columns["image"][order],
-        track=number[track][order],
-        uv_px=columns["uv_px"][order],
-        sigma_px=columns["sigma_px"][order],
-        origin="images",
-    ).with_covariance(columns["covariance_px2"][order])
-    return observations, columns["feature"][order]
 
 
-def _between_stops(
-    work: Steps, helpers: Helpers | None, observations: Observations, feature: IntArray
-) -> tuple[Observations, list[StopMatching]]:
-    """Observations within stops with ties between stops added, and a report of each pair of stops.
+def _between_stops(placed: PlacedStops) -> tuple[dict[int, list[TiedTracks]], list[StopMatching]]:
+    """What ties between stops add to the tracks of each group, and a report of each pair of stops.
 
-    A solve of them places the terrain of each stop, which is then sought in the images of other stops. The
+    A solve of its own places the terrain of each stop, which is then sought in the images of other stops. The
     result for each direction of each pair of stops is kept in the cache as soon as it is done.
     """
-    placed = work.placed(observations, feature)
-    directed = [d for a, b in work.stop_pairs for d in ((a, b), (b, a))]
-    if helpers is not None:
-        helpers.between_stops(work, observations, feature, directed)
+    work, directed = placed.work, placed.directed
+
+    def place(group: int) -> None:
+        placed.placed(group)
+
+    in_order(place, placed.groups, lambda k, _: work.tell("terrain of the stops", k + 1, len(placed.groups)))
 
     def tell(k: int, tied: StopTies) -> None:
         report = tied.report
@@ -247,12 +233,55 @@ def _between_stops(
         work.tell("ties between stops", k + 1, len(directed))
 
     found = in_order(lambda stops: placed.ties(*stops), directed, tell)
-    terrain = placed.matcher.terrain
-    both = [agreeing(terrain, *pair) for pair in zip(found[::2], found[1::2], strict=True)]
-    stop_ties = [each for pair in both for each in pair]
-    ties = Ties.concatenate([each.ties for each in stop_ties])
-    ties = ties.scaled(np.full(len(ties), placed.unit))
-    return joined(observations, terrain, ties), [each.report for each in stop_ties]
+    unit, tied, reports = placed.unit(), defaultdict[int, list[TiedTracks]](list), list[StopMatching]()
+    for there, back in zip(found[::2], found[1::2], strict=True):
+        for each in placed.agreeing(there, back):
+            group, ties = placed.tied(each, unit)
+            tied[group].append(ties)
+            reports.append(each.report)
+    return tied, reports
+
+
+def _observations(work: Steps, tied: Mapping[int, Sequence[TiedTracks]]) -> Observations:
+    """All observations, sorted by track, then image; tracks are numbered by the images in which they begin.
+
+    `tied` has what images of other stops see of the tracks of a group. Memory holds the columns once, and
+    those of one group more.
+    """
+    lengths, begins = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+    for group in range(len(work.groups)):
+        own = work.observed(group)
+        _, first, length = np.unique(own["track"], return_index=True, return_counts=True)
+        for ties in tied.get(group, ()):
+            np.add.at(length, ties.track, 1)
+        lengths.append(length)
+        begins.append(own["image"][first])
+    length, begin = np.concatenate(lengths), np.concatenate(begins)
+    order = np.argsort(begin, kind="stable")
+    number = np.empty_like(order)
+    number[order] = np.arange(len(order))
+    start = np.cumsum(np.concatenate([[0], length[order]]))
+    image, track = (np.empty(start[-1], dtype=np.int64) for _ in range(2))
+    uv_px, covariance_px2 = np.empty((start[-1], 2)), np.empty((start[-1], 2, 2))
+    n_tracks = 0
+    for group in range(len(work.groups)):
+        parts = [work.observed(group), *(vars(each) for each in tied.get(group, ()))]
+        columns = {n: np.concatenate([p[n] for p in parts]) for n in _COLUMNS}
+        by_track = np.lexsort((columns["image"], columns["track"]))
+        columns = {n: column[by_track] for n, column in columns.items()}
+        one = columns["track"]
+        place = start[number[n_tracks + one]] + np.arange(len(one)) - np.searchsorted(one, one)
+        image[place], track[place] = columns["image"], number[n_tracks + one]
+        uv_px[place], covariance_px2[place] = columns["uv_px"], columns["covariance_px2"]
+        n_tracks += 1 + int(one.max(initial=-1))
+    return Observations(
+        image=image,
+        track=track,
+        uv_px=uv_px,
+        sigma_px=mean_sigma_px(covariance_px2),
+        covariance_px2=covariance_px2,
+        origin="images",
+    )
 
 
 def _over_exposed(work: Steps) -> list[str]:

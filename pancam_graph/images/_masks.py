@@ -122,10 +122,3 @@ def elevation_rad(traverse: Traverse, row: int) -> FloatArray:
     grid_v, grid_u = np.mgrid[:height, :width].astype(np.float32)
     at = grid_u * ((_NODES - 1) / max(width - 1, 1)), grid_v * ((_NODES - 1) / max(height - 1, 1))
     return np.asarray(cv2.remap(nodes, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
-
-
-def pixels_at(usable: BoolArray, uv_px: FloatArray) -> BoolArray:
-    """Whether pixels (n, 2) are usable; one outside the image counts as the nearest inside."""
-    height, width = usable.shape
-    u, v = np.rint(uv_px).astype(np.int64).T
-    return np.asarray(usable[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)])

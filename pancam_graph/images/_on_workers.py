@@ -4,47 +4,31 @@ The caller goes through all steps as it does alone, and makes what is missing: w
 whatever order, the result has the same bytes.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cache, cached_property, partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from pancam_graph import cluster
 from pancam_graph.base.errors import InputError
-from pancam_graph.base.geometry import IntArray
-from pancam_graph.data import Observations
 from pancam_graph.images._cache import libraries
 from pancam_graph.images._cache_folder import begin_cache
-from pancam_graph.images._steps import PlacedStops, Steps
+from pancam_graph.images._placed import PlacedStops
+from pancam_graph.images._steps import Steps
 from pancam_graph.io import picture_file
 
 __all__ = ["Helpers", "helped"]
 
 
 class _Item(NamedTuple):
-    """One step of one image, pair or group, or of a group's tracks that begin in one image."""
+    """One step of one image, pair, group, or two stops, or of a group's tracks that begin in one image."""
 
-    kind: Literal["mask", "features", "matches", "tracks", "refined"]
+    kind: Literal["mask", "features", "matches", "tracks", "refined", "observed", "terrain", "ties"]
     number: int
-    """Row of the image, or number of the pair or group."""
-    group: int = -1
-    """Number of the group of tracks that are refined."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Tying:
-    """What ties between stops need: steps, observations within stops, and their rows among the features."""
-
-    work: Steps
-    observations: Observations
-    feature: IntArray
-
-    @cached_property
-    def placed(self) -> PlacedStops:
-        """The terrain of single stops, which the caller has left in the cache."""
-        return self.work.placed(self.observations, self.feature)
+    """Row of the image or stop, or number of the pair or group."""
+    second: int = -1
+    """Number of the group of tracks that are refined, or row of the stop whose images are looked at."""
 
 
 class Helpers:
@@ -54,26 +38,15 @@ class Helpers:
         """The crew is at work."""
         self._crew = crew
 
-    def within_stops(self, work: Steps) -> None:
-        """All steps up to the refined tracks of each group of stops, none of which waits for another group.
+    def do_all(self, placed: PlacedStops) -> None:
+        """All steps of a drive, none of which waits for stops that it does not need.
 
         The steps must know the plan of the drive.
         """
-        items, after = _plan(work)
-        job = cluster.Job(function=_do, shared=work, name=partial(_name, work))
-        self._crew.share(job, items, after, partial(work.tell, "images, pairs and tracks on workers"))
-
-    def between_stops(
-        self, work: Steps, observations: Observations, feature: IntArray, stops: Sequence[tuple[int, int]]
-    ) -> None:
-        """Ties of each of these directed pairs of stops, whose terrain is in the cache."""
-        names = [stop.id for stop in work.traverse.stops]
-        job = cluster.Job(
-            function=_tie,
-            shared=_Tying(work, observations, feature),
-            name=lambda pair: f"stops {names[pair[0]]} and {names[pair[1]]}",
-        )
-        self._crew.share(job, stops, done=partial(work.tell, "ties between stops on workers"))
+        items, after = _plan(placed)
+        work = placed.work
+        job = cluster.Job(function=_do, shared=placed, name=partial(_name, work))
+        self._crew.share(job, items, after, partial(work.tell, "images, stops and ties on workers"))
 
 
 @contextmanager
@@ -102,10 +75,16 @@ def _machine() -> dict[str, str]:
     return {**cluster.machine(), **libraries()}
 
 
-def _plan(work: Steps) -> tuple[list[_Item], list[list[int]]]:
-    """Items group by group, and the numbers of those that each needs."""
+def _plan(placed: PlacedStops) -> tuple[list[_Item], list[list[int]]]:
+    """Items group by group, and the numbers of those that each needs.
+
+    Two stops are tied right after the later of them: what memory and disks hold of them is still there.
+    """
+    work = placed.work
     items, after = list[_Item](), list[list[int]]()
-    mask, features = dict[int, int](), dict[int, int]()
+    mask, features, terrain = dict[int, int](), dict[int, int](), dict[int, int]()
+    waiting = [(max(placed.group_of[a], placed.group_of[b]), a, b) for a, b in placed.directed]
+    ties = {last: [pair[1:] for pair in waiting if pair[0] == last] for last, *_ in waiting}
 
     def add(item: _Item, before: list[int]) -> int:
         items.append(item)
@@ -119,41 +98,52 @@ def _plan(work: Steps) -> tuple[list[_Item], list[list[int]]]:
 
     for group, pairs in enumerate(work.groups):
         ends = {k: (work.pairs[k].a, work.pairs[k].b) for k in pairs}
-        rows = sorted({row for both in ends.values() for row in both})
+        rows = work.rows_of(group)
         add_images(rows)
         matches = [add(_Item("matches", k), [features[a], features[b]]) for k, (a, b) in ends.items()]
         tracks = add(_Item("tracks", group), matches)
-        for row in rows:
-            add(_Item("refined", row, group), [tracks])
+        refined = [add(_Item("refined", row, group), [tracks]) for row in rows]
+        observed = add(_Item("observed", group), refined)
+        if group in placed.groups:
+            images = placed.images_of(group)
+            add_images(images)
+            terrain[group] = add(_Item("terrain", group), [observed, *(mask[row] for row in images)])
+        for one, other in ties.get(group, ()):
+            add(_Item("ties", one, other), [terrain[placed.group_of[stop]] for stop in (one, other)])
     add_images(work.rows)
     return items, after
 
 
-def _do(work: Steps, item: _Item) -> None:
+def _do(placed: PlacedStops, item: _Item) -> None:
     """One item on a worker: what comes of it is in the cache."""
+    work, number = placed.work, item.number
     if item.kind == "mask":
-        work.figures(item.number)
+        work.figures(number)
     elif item.kind == "features":
-        work.features(item.number)
+        work.features(number)
     elif item.kind == "matches":
-        work.matches(work.pairs[item.number])
+        work.matches(work.pairs[number])
     elif item.kind == "tracks":
-        work.tracks(item.number)
-    elif item.number in work.origins(item.group):
-        work.refined(item.group, item.number)
-
-
-def _tie(tying: _Tying, stops: tuple[int, int]) -> None:
-    tying.placed.ties(*stops)
+        work.tracks(number)
+    elif item.kind == "observed":
+        work.observed(number)
+    elif item.kind == "terrain":
+        placed.placed(number)
+    elif item.kind == "ties":
+        placed.ties(number, item.second)
+    elif number in work.origins(item.second):
+        work.refined(item.second, number)
 
 
 def _name(work: Steps, item: _Item) -> str:
     """An item for people."""
-    images = work.traverse.images
+    traverse, number = work.traverse, item.number
     if item.kind == "matches":
-        pair = work.pairs[item.number]
-        return f"the matches of images {images[pair.a].id} and {images[pair.b].id}"
-    if item.kind == "tracks":
-        pair = work.pairs[work.groups[item.number][0]]
-        return f"the tracks of stop {work.traverse.stops[work.traverse.image_stop[pair.a]].id}"
-    return f"the {'tracks' if item.kind == 'refined' else item.kind} of image {images[item.number].id}"
+        pair = work.pairs[number]
+        return f"the matches of images {traverse.images[pair.a].id} and {traverse.images[pair.b].id}"
+    if item.kind == "ties":
+        return f"the ties of stops {traverse.stops[number].id} and {traverse.stops[item.second].id}"
+    if item.kind in {"tracks", "observed", "terrain"}:
+        what = "terrain" if item.kind == "terrain" else "tracks"
+        return f"the {what} of stop {traverse.stops[traverse.image_stop[work.rows_of(number)[0]]].id}"
+    return f"the {'tracks' if item.kind == 'refined' else item.kind} of image {traverse.images[number].id}"

@@ -1,4 +1,4 @@
-"""The steps of the front end: of an image, a pair of images, stops that are compared, and two stops.
+"""The steps of the front end within stops: of an image, a pair of images, and stops that are compared.
 
 Each is asked for by its item alone, and is made when it is first asked for, or taken from the cache. It
 loads the pictures, masks and features that it needs, and lets go of them: memory holds a bounded part of
@@ -20,15 +20,15 @@ from typing import Any
 import numpy as np
 import scipy
 
-from pancam_graph.base.geometry import BoolArray, IntArray
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.base.sources import source_digest
-from pancam_graph.data import Observations, Traverse
-from pancam_graph.images._between import StopMatcher, StopTies, on_terrain, stereo_stops
-from pancam_graph.images._cache import Arrays, Cache, digest
+from pancam_graph.data import Traverse
+from pancam_graph.images._between import stereo_stops
+from pancam_graph.images._cache import Arrays, Cache, digest, key_of
 from pancam_graph.images._features import Features, find_features
 from pancam_graph.images._front_end_options import FrontEndOptions
 from pancam_graph.images._held import Held
-from pancam_graph.images._masks import ImageMask, Reason, elevation_rad, mask_image, pixels_at
+from pancam_graph.images._masks import ImageMask, Reason, elevation_rad, mask_image
 from pancam_graph.images._match_pair import PairMatches, match_pair
 from pancam_graph.images._overlap import near_stops, overlap_cells, overlapping_pairs
 from pancam_graph.images._pairs import PairGeometry
@@ -37,11 +37,10 @@ from pancam_graph.images._read import PictureFiles, Pictures, read_pictures
 from pancam_graph.images._refine import RefinedTracks, refine_tracks
 from pancam_graph.images._rover import find_rover, rover_partners
 from pancam_graph.images._splines import Splines
-from pancam_graph.images._terrain import terrain_arrays, terrain_from
 from pancam_graph.images._tracks import Links, apart_tracks, join_tracks, shared_still, spread_tracks
-from pancam_graph.solve import SolveOptions, solve
+from pancam_graph.images._usable import pixels_at
 
-__all__ = ["MaskFigures", "PlacedStops", "Progress", "Steps", "step_key"]
+__all__ = ["MaskFigures", "Progress", "Steps", "step_key"]
 
 _WORLD_UP = np.array([0.0, 0.0, 1.0])
 _PATCH_PX = 8  # half width of the patch that refinement compares
@@ -56,15 +55,14 @@ _CALLS: dict[str, tuple[Callable[..., Any], ...]] = {
     "matches": (overlapping_pairs, match_pair),
     "tracks": (join_tracks,),
     "refined": (Splines, refine_tracks),
-    "terrain": (solve, terrain_arrays),
-    "ties": (Splines, terrain_from, on_terrain, StopMatcher),
+    "observed": (pixels_at, shared_by_tracks, shared_still),
 }
 """What each step that keeps something calls: its key depends on all modules that these run through."""
 
 
 def step_key(kind: str, *inputs: Any) -> str:
-    """The key of a step with these inputs. Of this module and the cache's, only their own text counts."""
-    return digest(kind, source_digest(*_CALLS[kind], alone=(__name__, digest.__module__)), *inputs)
+    """The key of a step with these inputs. Of this module only its own text counts."""
+    return key_of(kind, _CALLS[kind], (__name__,), *inputs)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,6 +94,7 @@ class Steps:
     _figures: dict[int, MaskFigures] = field(default_factory=dict)
     _feature_keys: dict[int, str] = field(default_factory=dict)
     _track_keys: dict[int, str] = field(default_factory=dict)
+    _observed_keys: dict[int, str] = field(default_factory=dict)
 
     def tell(self, stage: str, done: int, total: int) -> None:
         """Tell the caller that so many of the items of a stage are done."""
@@ -106,7 +105,7 @@ class Steps:
 
     def begin(self) -> None:
         """Find out what masks need to know of the drive as a whole, so that threads may ask for them."""
-        self.picture_keys, self.rows, self._files  # noqa: B018  made when asked for
+        self.picture_keys, self.rows, self.has_picture, self._files  # noqa: B018  made when asked for
 
     def plan(self) -> None:
         """Find out what all steps need to know of the drive as a whole, so that threads may ask for items."""
@@ -133,6 +132,11 @@ class Steps:
         """Rows of the images that have a picture, stop by stop: the order in which they are worked on."""
         order = np.argsort(self.traverse.image_stop, kind="stable").tolist()
         return [row for row in order if self.pictures.has(row)]
+
+    @cached_property
+    def has_picture(self) -> BoolArray:
+        """Which images (images,) have a picture that is used."""
+        return np.array([self.pictures.has(row) for row in range(len(self.traverse.images))])
 
     @cached_property
     def picture_keys(self) -> list[str]:
@@ -175,6 +179,11 @@ class Steps:
     def pairs(self) -> list[PairGeometry]:
         """Pairs of images whose features are compared."""
         return self._all_pairs[0]
+
+    @property
+    def spline(self) -> Splines:
+        """Spline coefficients of the pictures, by row and half octaves of blur."""
+        return self._spline
 
     @property
     def stop_pairs(self) -> list[tuple[int, int]]:
@@ -238,8 +247,9 @@ class Steps:
 
     def _partners(self, row: int) -> list[int]:
         """Images with which the rover is found in an image."""
-        has = np.array([each is not None for each in self.pictures.digests])
-        return rover_partners(self.traverse, row, available=has) if self.options.masks == "automatic" else []
+        if self.options.masks != "automatic":
+            return []
+        return rover_partners(self.traverse, row, available=self.has_picture)
 
     def figures(self, row: int) -> MaskFigures | None:
         """What is known of an image's mask without its pixels; None without a picture."""
@@ -355,9 +365,14 @@ class Steps:
                 "seen": seen,
             }
 
+        return self.cache.recall("tracks", self._track_key(group), make)
+
+    def _track_key(self, group: int) -> str:
         if group not in self._track_keys:
-            self._track_keys[group] = step_key("tracks", [self.match_key(pair) for pair in pairs])
-        return self.cache.recall("tracks", self._track_keys[group], make)
+            keys = [self.match_key(self.pairs[k]) for k in self.groups[group]]
+            # The same pictures may have other rows in another drive.
+            self._track_keys[group] = step_key("tracks", keys, self.rows_of(group))
+        return self._track_keys[group]
 
     def origins(self, group: int) -> list[int]:
         """Rows of the images of a group in which tracks begin."""
@@ -368,20 +383,27 @@ class Steps:
 
         Columns of `RefinedTracks`, and `row`: the rows of their observations among the group's.
         """
+        rows, columns, key = self._to_refine(group, origin)
+
+        def make() -> Arrays:
+            return vars(refine_tracks(self.traverse, self._spline, *columns, self.options))
+
+        return {**self.cache.recall("refined", key, make), "row": rows}
+
+    def _to_refine(
+        self, group: int, origin: int
+    ) -> tuple[IntArray, tuple[IntArray, IntArray, FloatArray, FloatArray], str]:
+        """Rows of a group's tracks that begin in an image, what is refined, and the key of the result."""
         tracks = self.tracks(group)
         rows = np.flatnonzero(tracks["origin"] == origin)
         own = {name: tracks[name][rows] for name in ("image", "track", "uv_px", "size_px")}
         number = np.unique(own["track"], return_inverse=True)[1]
         columns = own["image"], number, own["uv_px"], self._as_found_px(own)
-
-        def make() -> Arrays:
-            return vars(refine_tracks(self.traverse, self._spline, *columns, self.options))
-
         pictures = [self.picture_keys[i] for i in np.unique(own["image"])]
-        return {**self.cache.recall("refined", step_key("refined", pictures, columns), make), "row": rows}
+        return rows, columns, step_key("refined", pictures, columns)
 
-    def _as_found_px(self, tracks: Arrays) -> Any:
-        return np.hypot(self.options.sigma_px, self.options.sigma_per_size * tracks["size_px"])
+    def _as_found_px(self, tracks: Arrays) -> FloatArray:
+        return np.asarray(np.hypot(self.options.sigma_px, self.options.sigma_per_size * tracks["size_px"]))
 
     def observed(self, group: int) -> Arrays:
         """Observations within a group, as columns sorted by track, then image.
@@ -390,31 +412,52 @@ class Steps:
         look unlike are left out where two images share enough others. An observation keeps its position as it
         was found if the patch around it, or around the first of its track, has pixels that are left out.
         """
-        tracks = self.tracks(group)
-        image, track, uv_px = tracks["image"], tracks["track"], tracks["uv_px"]
-        if not len(track):
-            none = {"sigma_px": np.empty(0), "covariance_px2": np.empty((0, 2, 2))}
-            return {**{name: tracks[name] for name in ("image", "feature", "track", "uv_px")}, **none}
-        parts = [self.refined(group, origin) for origin in self.origins(group)]
-        order = np.argsort(np.concatenate([part.pop("row") for part in parts]))
-        fitted = RefinedTracks(**{n: np.concatenate([p[n] for p in parts])[order] for n in parts[0]})
-        clear = self._clear(image, track, fitted.uv_px) & self._clear(image, track, uv_px)
-        clear &= clear[np.searchsorted(track, track)]
-        moved, unlike = fitted.moved & clear, fitted.unlike & clear
-        as_found_px = self._as_found_px(tracks)
-        as_found = as_found_px[:, None, None] ** 2 * np.eye(2)
-        covariance = np.where((moved | unlike)[:, None, None], fitted.covariance_px2, as_found)
-        frame = self.traverse.image_frame[image]
-        covariance = shared_by_tracks(covariance, fitted.in_first_px2, moved, track, frame)
-        used = shared_still(track, ~(fitted.spare & clear))
-        return {
-            "image": image[used],
-            "feature": tracks["feature"][used],
-            "track": np.unique(track[used], return_inverse=True)[1],
-            "uv_px": np.where(moved[:, None], fitted.uv_px, uv_px)[used],
-            "sigma_px": as_found_px[used],
-            "covariance_px2": covariance[used],
-        }
+
+        def make() -> Arrays:
+            tracks = self.tracks(group)
+            image, track, uv_px = tracks["image"], tracks["track"], tracks["uv_px"]
+            if not len(track):
+                none = {"sigma_px": np.empty(0), "covariance_px2": np.empty((0, 2, 2))}
+                return {**{name: tracks[name] for name in ("image", "feature", "track", "uv_px")}, **none}
+            parts = [self.refined(group, origin) for origin in self.origins(group)]
+            order = np.argsort(np.concatenate([part.pop("row") for part in parts]))
+            fitted = RefinedTracks(**{n: np.concatenate([p[n] for p in parts])[order] for n in parts[0]})
+            clear = self._clear(image, track, fitted.uv_px) & self._clear(image, track, uv_px)
+            clear &= clear[np.searchsorted(track, track)]
+            moved, unlike = fitted.moved & clear, fitted.unlike & clear
+            as_found_px = self._as_found_px(tracks)
+            as_found = as_found_px[:, None, None] ** 2 * np.eye(2)
+            covariance = np.where((moved | unlike)[:, None, None], fitted.covariance_px2, as_found)
+            frame = self.traverse.image_frame[image]
+            covariance = shared_by_tracks(covariance, fitted.in_first_px2, moved, track, frame)
+            used = shared_still(track, ~(fitted.spare & clear))
+            return {
+                "image": image[used],
+                "feature": tracks["feature"][used],
+                "track": np.unique(track[used], return_inverse=True)[1],
+                "uv_px": np.where(moved[:, None], fitted.uv_px, uv_px)[used],
+                "sigma_px": as_found_px[used],
+                "covariance_px2": covariance[used],
+            }
+
+        return self.cache.recall("observed", self.observed_key(group), make)
+
+    def observed_key(self, group: int) -> str:
+        """Key of the observations within a group."""
+        if group not in self._observed_keys:
+            refined = [self._to_refine(group, origin)[2] for origin in self.origins(group)]
+            masks = [self.reasons(row) for row in self.rows_of(group)]
+            self._observed_keys[group] = step_key("observed", self._track_key(group), refined, masks)
+        return self._observed_keys[group]
+
+    def reasons(self, row: int) -> str | None:
+        """Digest of an image's mask; None without a picture."""
+        figures = self.figures(row)
+        return None if figures is None else figures.reasons
+
+    def rows_of(self, group: int) -> list[int]:
+        """Rows of the images of a group that are compared with others, ascending."""
+        return sorted({row for k in self.groups[group] for row in (self.pairs[k].a, self.pairs[k].b)})
 
     def _clear(self, image: IntArray, track: IntArray, uv_px: Any) -> BoolArray:
         """Which observations (n,) have no left-out pixel in the patch around them."""
@@ -433,66 +476,6 @@ class Steps:
                     usable = mask.usable(between_stops=between, margin_px=_PATCH_PX)
                     clear[rows] = pixels_at(usable, uv_px[rows])
         return clear
-
-    # All stops, and two stops
-
-    def placed(self, observations: Observations, feature: IntArray) -> "PlacedStops":
-        """The terrain that observations within stops place, each stop's by itself.
-
-        They are sorted by track, then image; `feature` (n,) is the row of each in its image's features.
-        """
-        traverse = replace(self.traverse, constraints=(), points=None).with_observations(observations)
-
-        def place() -> Arrays:
-            self.tell("terrain of the stops", 0, 1)
-            # A rig that is off as its uncertainty says puts terrain where other stops do not see it;
-            # fields are too small for that.
-            solution = solve(traverse, SolveOptions(field=False))
-            # A solve scales all noise by one factor, and the ties' noise must be in the same unit.
-            unit = np.median(observations.sigma_px / solution.sigma_px)
-            self.tell("terrain of the stops", 1, 1)
-            arrays: dict[str, Any] = dict(terrain_arrays(solution))
-            terrain = terrain_from(traverse, **arrays)
-            shown = on_terrain(self.usable, terrain.image, terrain.uv_px)
-            return {**arrays, "slope": terrain.slope, "shown": shown, "unit": np.array(unit)}
-
-        noise = observations.covariance_px2
-        columns = observations.image, observations.track, observations.uv_px, noise, feature
-        masks = [
-            None if (known := self.figures(row)) is None else known.reasons
-            for row in range(len(self.picture_keys))
-        ]
-        key = step_key("terrain", self.picture_keys, masks, self.traverse.stops, columns)
-        arrays: dict[str, Any] = self.cache.recall("terrain", key, place)
-        unit, shown = float(arrays.pop("unit")), arrays.pop("shown")
-        matcher = StopMatcher(
-            terrain=terrain_from(traverse, **arrays).select(shown),
-            spline=self._spline,
-            usable=self.usable,
-            features=self.features,
-            feature_of=feature,
-            options=self.options,
-        )
-        return PlacedStops(key=key, unit=unit, matcher=matcher, cache=self.cache)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PlacedStops:
-    """The terrain of single stops, to be sought in the images of others."""
-
-    key: str
-    unit: float
-    """Factor from the ties' noise to that of the observations."""
-    matcher: StopMatcher
-    cache: Cache
-
-    def ties(self, one: int, other: int) -> StopTies:
-        """Ties of the terrain of one stop with the images of another."""
-
-        def make() -> Arrays:
-            return self.matcher.ties(one, other).arrays()
-
-        return StopTies.of_arrays(self.cache.recall("ties", step_key("ties", self.key, (one, other)), make))
 
 
 def _links(pair: PairGeometry, matched: PairMatches) -> Links | None:

@@ -1,5 +1,6 @@
 """Terrain points that the images of single stops place, and how images of other stops should show them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -8,12 +9,21 @@ import gtsam
 import numpy as np
 import scipy
 
-from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, pose_arrays
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, compose, pose_arrays
 from pancam_graph.cameras import Camera
-from pancam_graph.data import Observations, Solution, Traverse
+from pancam_graph.data import DrivePart, Solution, Traverse
 from pancam_graph.images._local_map import HALF_WIDTH_PX, local_map
+from pancam_graph.images._usable import rows_by_image
+from pancam_graph.rigs import Rig
 
-__all__ = ["Sighting", "StopTerrain", "rows_by_image", "terrain_arrays", "terrain_from"]
+__all__ = [
+    "Sighting",
+    "StopTerrain",
+    "of_stops",
+    "terrain_arrays",
+    "terrain_from",
+    "unplaced_arrays",
+]
 
 _NEAREST_INVERSE_M = 1e-7
 _NEIGHBOURS = 12
@@ -23,6 +33,7 @@ _CAUCHY_SIGMAS = 2.0
 _GRAZING = 0.03
 _SLOPE_SHARE = 0.5
 _MOST_CHANGE = 0.5  # of the inverse depth within a patch
+_COLUMNS = ("track", "image", "uv_px", "feature", "inverse_depth", "sigma_inverse_m", "slope")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,14 +66,22 @@ class Sighting:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StopTerrain:
-    """Points with the image that each was first seen in, sorted by track."""
+    """Points of some stops with the image that each was first seen in, sorted by track within a stop."""
 
     traverse: Traverse
-    """With poses and angles from each stop's own images, and the observations within stops."""
+    """These stops, their frames and images; poses and angles are from each stop's own images."""
+    rigs: tuple[Rig, ...]
+    """(stops,) the rig as the images of each stop have it."""
+    drive_row: IntArray
+    """(images,) row of each image in the drive that the stops are of."""
     track: IntArray
-    """(n,) track of each point in the traverse."""
-    row: IntArray
-    """(n,) the first observation of each track."""
+    """(n,) track of each point among those that the images of its stop were compared for."""
+    image: IntArray
+    """(n,) image in which each point was first seen, by its row here."""
+    uv_px: FloatArray
+    """(n, 2) pixel of each point in that image."""
+    feature: IntArray
+    """(n,) row of that sighting among the image's features."""
     inverse_depth: FloatArray
     """(n,) per metre along the axis of the camera that saw it first; 0 for infinity."""
     sigma_inverse_m: FloatArray
@@ -72,19 +91,38 @@ class StopTerrain:
 
     def select(self, rows: BoolArray | IntArray) -> "StopTerrain":
         """Some of the points."""
-        names = ("track", "row", "inverse_depth", "sigma_inverse_m", "slope")
-        return replace(self, **{name: getattr(self, name)[rows] for name in names})
+        return replace(self, **{name: getattr(self, name)[rows] for name in _COLUMNS})
+
+    def of_stop(self, stop: int) -> "StopTerrain":
+        """One stop, with the points that its images saw first."""
+        rows = np.flatnonzero(self.stop == stop)
+        traverse, images = of_stops(self.traverse, np.array([stop]))
+        return replace(
+            self.select(rows),
+            traverse=traverse,
+            rigs=(self.rigs[stop],),
+            drive_row=self.drive_row[images],
+            image=np.searchsorted(images, self.image[rows]),
+        )
+
+    def beside(self, other: "StopTerrain") -> "StopTerrain":
+        """These stops and their points, followed by those of other stops of the same drive."""
+        a, b = self.traverse, other.traverse
+        columns = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _COLUMNS}
+        columns["image"][len(self.image) :] += len(a.images)
+        return StopTerrain(
+            traverse=replace(
+                a, stops=a.stops + b.stops, frames=a.frames + b.frames, images=a.images + b.images
+            ),
+            rigs=self.rigs + other.rigs,
+            drive_row=np.concatenate([self.drive_row, other.drive_row]),
+            **columns,
+        )
 
     @property
-    def observations(self) -> Observations:
-        """The observations within stops."""
-        assert self.traverse.observations is not None
-        return self.traverse.observations
-
-    @cached_property
-    def image(self) -> IntArray:
-        """(n,) image in which each point was first seen."""
-        return np.asarray(self.observations.image[self.row])
+    def nbytes(self) -> int:
+        """Bytes of the columns."""
+        return sum(int(getattr(self, name).nbytes) for name in _COLUMNS)
 
     @cached_property
     def rows_of(self) -> dict[int, IntArray]:
@@ -92,35 +130,39 @@ class StopTerrain:
         return rows_by_image(self.image)
 
     @cached_property
-    def uv_px(self) -> FloatArray:
-        """(n, 2) pixel of each point in that image."""
-        return np.asarray(self.observations.uv_px[self.row])
-
-    @cached_property
     def stop(self) -> IntArray:
         """(n,) stop of that image."""
         return self.traverse.image_stop[self.image]
 
     @cached_property
-    def _poses(self) -> tuple[FloatArray, FloatArray]:
-        return self.traverse.camera_poses()
+    def camera_poses(self) -> tuple[FloatArray, FloatArray]:
+        """`world_R_camera` (images, 3, 3) and centres (images, 3), metres."""
+        mast_R, mast_t = pose_arrays([stop.world_T_mast for stop in self.traverse.stops])
+        stop = self.traverse.image_stop
+        return compose(mast_R[stop], mast_t[stop], *self._mast_T_cameras)
 
     def camera(self, image: int) -> Camera:
         """Camera model of an image."""
-        return self.traverse.rig.eyes[int(self.traverse.image_eye[image])].camera
+        t = self.traverse
+        return self.rigs[int(t.image_stop[image])].eyes[int(t.image_eye[image])].camera
+
+    @cached_property
+    def _camera_number(self) -> IntArray:
+        """(images,) the same for images of one stop and eye."""
+        return self.traverse.image_stop * len(self.traverse.rig.eyes) + self.traverse.image_eye
 
     def points_m(self, rows: IntArray, shift_px: tuple[float, float] = (0.0, 0.0)) -> FloatArray:
         """World points (n, 3) of rows of one image; `shift_px` beside them, on the plane of the surface."""
         image = int(self.image[rows[0]])
         origin, ray = _sights(self.camera(image), self.uv_px[rows] + shift_px)
         inverse = self.inverse_depth[rows] + self.slope[rows] @ np.array(shift_px)
-        R, centre = (p[image] for p in self._poses)
+        R, centre = (p[image] for p in self.camera_poses)
         return np.asarray(centre + (origin + ray / np.maximum(inverse, _NEAREST_INVERSE_M)[:, None]) @ R.T)
 
     @cached_property
     def _world_m(self) -> FloatArray:
         """(n, 3) all points."""
-        points = np.empty((len(self.row), 3))
+        points = np.empty((len(self.image), 3))
         for rows in self.rows_of.values():
             points[rows] = self.points_m(rows)
         return points
@@ -128,39 +170,40 @@ class StopTerrain:
     @cached_property
     def _along(self) -> FloatArray:
         """(n, 3) derivatives of the points, in the world, by their depths."""
-        R, centre = (p[self.image] for p in self._poses)
-        axis = np.einsum("nij,nj->ni", R, self._forward[self.traverse.image_eye[self.image]])
+        R, centre = (p[self.image] for p in self.camera_poses)
+        axis = np.einsum("nij,nj->ni", R, self._forward[self._camera_number[self.image]])
         to_a = self._world_m - centre
         return np.asarray(to_a / np.maximum(np.einsum("ni,ni->n", to_a, axis), 1e-12)[:, None])
 
     @cached_property
     def _forward(self) -> FloatArray:
-        """Axes (eyes, 3) of their cameras, in their frames."""
-        return np.array([_forward(eye.camera) for eye in self.traverse.rig.eyes])
+        """Axes (stops x eyes, 3) of their cameras, in their frames."""
+        return np.array([_forward(eye.camera) for rig in self.rigs for eye in rig.eyes])
 
     def sighting(self, rows: IntArray, image: IntArray | int, world_T_mast: gtsam.Pose3) -> Sighting:
         """How `image`, of another stop, sees each of the rows, if its mast is at that pose.
 
         One image for all rows, or one for each.
         """
-        t, points, first = self.traverse, self._world_m[rows], self.image[rows]
+        points, first = self._world_m[rows], self.image[rows]
         image = np.broadcast_to(image, rows.shape)
-        eye = t.image_eye[image]
+        number = self._camera_number[image]
         mast_R, mast_t = (x[image] for x in self._mast_T_cameras)
         R_m, t_m = world_T_mast.rotation().matrix(), world_T_mast.translation()
         in_mast = (points - t_m) @ R_m
         in_camera = np.einsum("nji,nj->ni", mast_R, in_mast - mast_t)
         uv, d_point = np.empty((len(rows), 2)), np.empty((len(rows), 2, 3))
         valid = np.empty(len(rows), dtype=bool)
-        for e in np.unique(eye).tolist():
-            k = np.flatnonzero(eye == e)
-            uv[k], d_point[k], valid[k] = t.rig.eyes[e].camera.project_with_jacobian(in_camera[k])
+        for each in np.unique(number).tolist():
+            k = np.flatnonzero(number == each)
+            camera = self.camera(int(image[k[0]]))
+            uv[k], d_point[k], valid[k] = camera.project_with_jacobian(in_camera[k])
         d_mast = d_point @ np.swapaxes(mast_R, 1, 2)
         # In the mast's frame a turn w of the mast moves a point p by -w x p, a shift v moves it by -v.
         d_pose = np.concatenate([np.cross(d_mast, in_mast[:, None]), -d_mast], axis=2)
         inverse = np.maximum(self.inverse_depth[rows], _NEAREST_INVERSE_M)
         d_inverse = np.einsum("nij,nj->ni", d_mast @ R_m.T, -self._along[rows] / inverse[:, None] ** 2)
-        to_a = points - self._poses[1][first]
+        to_a = points - self.camera_poses[1][first]
         to_b = (in_mast - mast_t) @ R_m.T
         range_a = np.linalg.norm(to_a, axis=1)
         range_b = np.maximum(np.linalg.norm(to_b, axis=1), 1e-9)
@@ -169,7 +212,7 @@ class StopTerrain:
             d_pose=d_pose,
             d_inverse_depth=d_inverse,
             cosine=np.einsum("ni,ni->n", to_a, to_b) / np.maximum(range_a * range_b, 1e-12),
-            zoom=self._focal_px[eye] / self._focal_px[t.image_eye[first]] * range_a / range_b,
+            zoom=self._focal_px[number] / self._focal_px[self._camera_number[first]] * range_a / range_b,
             valid=valid,
         )
 
@@ -197,23 +240,46 @@ class StopTerrain:
     @cached_property
     def _mast_T_cameras(self) -> tuple[FloatArray, FloatArray]:
         t = self.traverse
-        return t.rig.mast_T_camera(t.pan_tilt_rad[t.image_frame], t.image_eye)
+        R, centre = np.empty((len(t.images), 3, 3)), np.empty((len(t.images), 3))
+        for stop, rig in enumerate(self.rigs):
+            k = np.flatnonzero(t.image_stop == stop)
+            R[k], centre[k] = rig.mast_T_camera(t.pan_tilt_rad[t.image_frame[k]], t.image_eye[k])
+        return R, centre
 
     @cached_property
     def _focal_px(self) -> FloatArray:
-        """Focal lengths (eyes,)."""
-        return np.array([e.camera.pinhole.calibration_matrix[0, 0] for e in self.traverse.rig.eyes])
+        """Focal lengths (stops x eyes,)."""
+        return np.array(
+            [eye.camera.pinhole.calibration_matrix[0, 0] for rig in self.rigs for eye in rig.eyes]
+        )
 
 
-def rows_by_image(image: IntArray) -> dict[int, IntArray]:
-    """Rows (ascending) of a column of images (n,), by the image."""
-    order = np.argsort(image, kind="stable")
-    images, begin = np.unique(image[order], return_index=True)
-    return dict(zip(images.tolist(), np.split(order, begin)[1:], strict=True))
+def of_stops(
+    traverse: Traverse, stops: IntArray, of_images: BoolArray | None = None
+) -> tuple[Traverse, IntArray]:
+    """Some stops of a traverse by themselves, rows ascending, and the rows of their images.
+
+    Without observations, constraints, named points and warnings. `of_images` (images,) leaves images out.
+    """
+    frames = np.flatnonzero(np.isin(traverse.frame_stop, stops)).tolist()
+    here = np.isin(traverse.image_stop, stops)
+    images = np.flatnonzero(here if of_images is None else here & of_images)
+    part = DrivePart(
+        name=traverse.name,
+        rig=traverse.rig,
+        stops=tuple(traverse.stops[k] for k in stops.tolist()),
+        frames=tuple(traverse.frames[k] for k in frames),
+        images=tuple(traverse.images[k] for k in images.tolist()),
+        sharing=traverse.sharing,
+    )
+    return part, images
 
 
-def terrain_arrays(solution: Solution) -> dict[str, FloatArray | IntArray]:
-    """What `terrain_from` needs to build the terrain of a solution of single stops."""
+def terrain_arrays(solution: Solution, feature: IntArray) -> dict[str, FloatArray | IntArray]:
+    """What `terrain_from` needs to build the terrain that a solution places.
+
+    `feature` (observations,) is the row of each of its observations among the features of its image.
+    """
     t, final = solution.traverse, solution.final
     obs = t.observations
     assert obs is not None
@@ -226,24 +292,48 @@ def terrain_arrays(solution: Solution) -> dict[str, FloatArray | IntArray]:
 
     image = obs.image[first]
     to_point = points - final.world_t_camera[image]
-    ahead = np.array([_forward(e.camera) for e in t.rig.eyes])[t.image_eye[image]]
+    ahead = np.array([_forward(eye.camera) for eye in solution.rig.eyes])[t.image_eye[image]]
     axis = np.einsum("nij,nj->ni", final.world_R_camera[image], ahead)
     depth = np.einsum("ni,ni->n", axis, to_point)
     sigma = _sigma_inverse_m(solution, tracks, to_point, image)
     good = (depth > 1e-3) & np.isfinite(sigma)
-    world_R_mast, world_t_mast = pose_arrays(final.world_T_mast)
-    rig = solution.rig
+    return {
+        **_geometry(solution.rig, final.pan_tilt_rad, final.world_T_mast),
+        "track": tracks[good],
+        "image": image[good],
+        "uv_px": obs.uv_px[first[good]],
+        "feature": feature[first[good]],
+        "inverse_depth": 1 / depth[good],
+        "sigma_inverse_m": sigma[good],
+    }
+
+
+def unplaced_arrays(traverse: Traverse) -> dict[str, FloatArray | IntArray]:
+    """As `terrain_arrays`, of stops none of whose points can be placed: they stand where telemetry says."""
+    none, no_number = np.empty(0), np.empty(0, dtype=np.int64)
+    masts = [stop.world_T_mast for stop in traverse.stops]
+    return {
+        **_geometry(traverse.rig, traverse.pan_tilt_rad, masts),
+        "track": no_number,
+        "image": no_number,
+        "uv_px": np.empty((0, 2)),
+        "feature": no_number,
+        "inverse_depth": none,
+        "sigma_inverse_m": none,
+    }
+
+
+def _geometry(
+    rig: Rig, pan_tilt_rad: FloatArray, world_T_mast: Sequence[gtsam.Pose3]
+) -> dict[str, FloatArray]:
+    world_R_mast, world_t_mast = pose_arrays(world_T_mast)
     return {
         "calibration": np.array([eye.camera.pinhole.calibration_matrix for eye in rig.eyes]),
         "head_T_camera": np.array([eye.head_T_camera.matrix() for eye in rig.eyes]),
         "pan_T_tilt": rig.pan_T_tilt.matrix(),
-        "pan_tilt_rad": final.pan_tilt_rad,
+        "pan_tilt_rad": pan_tilt_rad,
         "world_R_mast": world_R_mast,
         "world_t_mast": world_t_mast,
-        "track": tracks[good],
-        "row": first[good],
-        "inverse_depth": 1 / depth[good],
-        "sigma_inverse_m": sigma[good],
     }
 
 
@@ -256,10 +346,11 @@ def terrain_from(
     pan_tilt_rad: FloatArray,
     world_R_mast: FloatArray,
     world_t_mast: FloatArray,
+    drive_row: IntArray,
     slope: FloatArray | None = None,
     **columns: Any,
 ) -> StopTerrain:
-    """The points that a solution of the traverse places, each with its surface; see `terrain_arrays`.
+    """The points that one solution of some stops places, each with its surface; see `terrain_arrays`.
 
     Its traverse is at the solution, the rig too. `slope` is that of the surface, where it is known already.
     """
@@ -277,14 +368,16 @@ def terrain_from(
     )
     rig = replace(traverse.rig, eyes=eyes, pan_T_tilt=gtsam.Pose3(pan_T_tilt))
     terrain = StopTerrain(
-        traverse=replace(traverse, rig=rig, frames=frames, stops=stops),
+        traverse=replace(traverse, frames=frames, stops=stops, observations=None),
+        rigs=(rig,) * len(stops),
+        drive_row=drive_row,
         **columns,
         slope=np.zeros((len(columns["track"]), 2)) if slope is None else slope,
     )
     if slope is not None:
         return terrain
     slopes = terrain.slope.copy()
-    world_R_camera, _ = terrain.traverse.camera_poses()
+    world_R_camera, _ = terrain.camera_poses
     for i, rows in terrain.rows_of.items():
         slopes[rows] = _slopes(terrain, rows, world_R_camera[i])
     return replace(terrain, slope=slopes)

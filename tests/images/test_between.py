@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from pancam_graph import (
-    Observations,
     Rendering,
     RenderOptions,
     SimulationOptions,
@@ -28,9 +27,10 @@ from pancam_graph.base.geometry import HEAD_R_FORWARD_CAMERA, FloatArray
 from pancam_graph.base.threads import n_workers
 from pancam_graph.cameras import Pinhole
 from pancam_graph.data import Refusal, StopMatching
-from pancam_graph.images import FrontEndOptions, _alignment, _refine, _steps
+from pancam_graph.images import FrontEndOptions, _alignment, _placed, _refine, _steps
 from pancam_graph.images._alignment import Alignment, Ties, believed, fit_pose, telemetry_alignment
 from pancam_graph.images._between import StopMatcher, StopTies, agreeing
+from pancam_graph.images._cache import Arrays
 from pancam_graph.images._features import Features
 from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._splines import Splines
@@ -53,8 +53,9 @@ def simulated() -> tuple[StopTerrain, tuple[gtsam.Pose3, ...]]:
     assert traverse.observations is not None
     order = np.lexsort((traverse.observations.image, traverse.observations.track))
     ordered = traverse.with_observations(traverse.observations.select(order))
-    arrays: dict[str, Any] = terrain_arrays(solve(ordered))
-    return terrain_from(ordered, **arrays), simulation.truth.world_T_mast
+    arrays: dict[str, Any] = terrain_arrays(solve(ordered), np.zeros(len(order), dtype=np.int64))
+    terrain = terrain_from(ordered, drive_row=np.arange(len(ordered.images)), **arrays)
+    return terrain, simulation.truth.world_T_mast
 
 
 def test_terrain_lies_where_the_estimated_rig_has_it() -> None:
@@ -70,10 +71,11 @@ def test_terrain_lies_where_the_estimated_rig_has_it() -> None:
     )
     traverse = simulate(rig_template("mer-navcam"), options, seed=3).traverse
     solution = solve(traverse, SolveOptions(field=False))
-    arrays: dict[str, Any] = terrain_arrays(solution)
-    terrain = terrain_from(traverse, **arrays)
-    claimed = {**arrays, **terrain_arrays(replace(solution, final=replace(solution.final, rig=None)))}
-    off = [distances(t, solution) for t in (terrain, terrain_from(traverse, **claimed))]
+    rows = np.arange(len(traverse.images))
+    none = np.zeros(len(solution.used), dtype=np.int64)
+    as_claimed = replace(solution, final=replace(solution.final, rig=None))
+    arrays: list[dict[str, Any]] = [terrain_arrays(each, none) for each in (solution, as_claimed)]
+    off = [distances(terrain_from(traverse, drive_row=rows, **each), solution) for each in arrays]
     assert np.median(off[0]) < 1e-3  # the flex of frames is left out
     assert np.median(off[1]) > 2e-3
 
@@ -152,8 +154,7 @@ def test_a_search_begins_where_most_matches_agree(
         begun = {}
         for wide_px in (10.0, np.inf):
             monkeypatch.setattr(_alignment, "_WIDE_PX", wide_px)
-            none = np.zeros(0, dtype=np.int64)
-            begun[wide_px] = _alignment._begun(terrain, no_features, none, (0, 1), told, QUICK)
+            begun[wide_px] = _alignment._begun(terrain, no_features, (0, 1), told, QUICK)
         assert begun[np.inf] is told
         apart = true.between(begun[10.0].world_T_mast).translation()
         assert np.linalg.norm(apart) < 0.5 * sigma_m
@@ -288,12 +289,13 @@ Fitted = list[tuple[PairGeometry, FloatArray, FloatArray, FloatArray]]
 def small_run(small: tuple[Rendering, Traverse]) -> tuple[Traverse, Fitted, int]:
     """What is found, what the least-squares matching within stops made of what, and how much was untied."""
     fitted: Fitted = []
-    untied: list[int] = []
-    original, placed = _refine._refine_pair, _steps.Steps.placed
+    untied: dict[int, int] = {}
+    original, observed = _refine._refine_pair, _steps.Steps.observed
 
-    def counted(steps: _steps.Steps, observations: Observations, feature: np.ndarray) -> _steps.PlacedStops:
-        untied.append(len(observations))
-        return placed(steps, observations, feature)
+    def counted(steps: _steps.Steps, group: int) -> Arrays:
+        found = observed(steps, group)
+        untied[group] = len(found["track"])
+        return found
 
     def recorded(
         pair: PairGeometry, spline: Splines, uv_a: FloatArray, uv_b: FloatArray, options: FrontEndOptions
@@ -304,8 +306,8 @@ def small_run(small: tuple[Rendering, Traverse]) -> tuple[Traverse, Fitted, int]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_refine, "_refine_pair", recorded)
-        patch.setattr(_steps.Steps, "placed", counted)
-        return find_observations(small[1], QUICK), fitted, untied[0]
+        patch.setattr(_steps.Steps, "observed", counted)
+        return find_observations(small[1], QUICK), fitted, sum(untied.values())
 
 
 @pytest.fixture(scope="module")
@@ -416,8 +418,9 @@ def test_the_same_on_any_number_of_threads_and_from_the_cache(
         assert again.warnings == small_found.warnings
         for name in ("image", "track", "uv_px", "covariance_px2"):
             assert getattr(again.observations, name).tobytes() == getattr(before, name).tobytes()
-        for name in ("find_features", "match_pair", "refine_tracks", "terrain_arrays"):
+        for name in ("find_features", "match_pair", "refine_tracks", "shared_by_tracks"):
             monkeypatch.setattr(_steps, name, not_again)
+        monkeypatch.setattr(_placed, "terrain_arrays", not_again)
         monkeypatch.setattr(StopMatcher, "ties", not_again)
 
 
@@ -442,7 +445,7 @@ def test_ties_that_were_found_before_an_interrupt_are_kept(
     with pytest.raises(KeyboardInterrupt):
         find_observations(small[1], QUICK, cache=tmp_path)
     assert len(list(tmp_path.glob("ties-*"))) == 1
-    monkeypatch.setattr(_steps, "terrain_arrays", not_again)
+    monkeypatch.setattr(_placed, "terrain_arrays", not_again)
     again = find_observations(small[1], QUICK, cache=tmp_path)
     assert done == [(0, 1), (1, 0), (1, 0)]
     assert again.matching == small_found.matching

@@ -18,6 +18,7 @@ from pancam_graph.base.whole_files import whole_folder
 from pancam_graph.images import FrontEndOptions, cache_folder, find_observations, is_cache
 from pancam_graph.images._cache import Cache, digest
 from pancam_graph.images._cache_folder import begin_cache
+from pancam_graph.images._placed import placed_key
 from pancam_graph.images._steps import Steps, step_key
 from pancam_graph.results import check_out
 from support.image_scenes import QUICK, SIZE_PX, as_bytes, found_in, make_traverse
@@ -60,7 +61,7 @@ def test_with_and_without_a_cache_the_same_bytes(
     scene: Traverse, plain: bytes, made: dict[str, int], tmp_path: Path
 ) -> None:
     assert run(scene, tmp_path) == plain
-    assert made == {"mask": 3, "features": 3, "matches": 3, "tracks": 1, "refined": 2}
+    assert made == {"mask": 3, "features": 3, "matches": 3, "tracks": 1, "refined": 2, "observed": 1}
     made.clear()
     assert run(scene, tmp_path) == plain
     assert made == {}
@@ -119,7 +120,12 @@ def test_another_version_of_a_library_is_seen(monkeypatch: pytest.MonkeyPatch) -
     assert digest("features", 1.0) != before
 
 
-KINDS = ("mask", "features", "matches", "tracks", "refined", "terrain", "ties")
+WITHIN = ("mask", "features", "matches", "tracks", "refined", "observed")
+KINDS = (*WITHIN, "terrain", "ties")
+
+
+def key_of(kind: str) -> str:
+    return step_key(kind) if kind in WITHIN else placed_key(kind)
 
 
 @pytest.mark.parametrize(
@@ -128,7 +134,8 @@ KINDS = ("mask", "features", "matches", "tracks", "refined", "terrain", "ties")
         ("factors.mast", {"terrain"}),
         ("landmarks.kernel._eliminate", {"terrain"}),
         ("images._features", {"features", "matches", "ties"}),
-        ("images._sky", {"mask", "ties"}),
+        ("images._sky", {"mask"}),
+        ("images._tracks", {"tracks", "observed"}),
         ("images._patches", {"refined", "ties"}),
         ("rigs._rig", {"mask", "matches", "refined", "terrain", "ties"}),
         ("report._style", set()),
@@ -140,7 +147,7 @@ def test_an_edit_makes_those_steps_stale_that_run_through_it(
     monkeypatch: pytest.MonkeyPatch, edited: str, stale: set[str]
 ) -> None:
     """Of the steps' own sources; by their inputs, more steps follow from a stale one."""
-    before = {kind: step_key(kind) for kind in KINDS}
+    before = {kind: key_of(kind) for kind in KINDS}
     name = f"pancam_graph.{edited}"
     file, text = sources.source_of(name)
     assert text
@@ -150,7 +157,7 @@ def test_an_edit_makes_those_steps_stale_that_run_through_it(
     )
     sources._digest.cache_clear()
     try:
-        after = {kind: step_key(kind) for kind in KINDS}
+        after = {kind: key_of(kind) for kind in KINDS}
     finally:
         sources._digest.cache_clear()
     assert {kind for kind in KINDS if before[kind] != after[kind]} == stale
@@ -247,7 +254,7 @@ def test_an_interrupted_run_goes_on_where_it_was(
     assert made == {"mask": 3, "features": 3, "matches": 1}
     made.clear()
     assert run(scene, tmp_path) == plain
-    assert made == {"matches": 2, "tracks": 1, "refined": 2}
+    assert made == {"matches": 2, "tracks": 1, "refined": 2, "observed": 1}
 
 
 def test_a_folder_with_nothing_but_a_cache_may_become_results(tmp_path: Path) -> None:

@@ -51,10 +51,11 @@ def test_workers_make_all_and_the_bytes_are_the_same(
     )
     assert as_bytes(found_in(found)) == alone
     assert sorted(made) == [
-        (True, k) for k in ("features", "features", "mask", "mask", "matches", "refined", "tracks")
+        (True, k)
+        for k in ("features", "features", "mask", "mask", "matches", "observed", "refined", "tracks")
     ]
     assert found.folder == scene.folder
-    assert ("images, pairs and tracks on workers", 8, 8) in told
+    assert ("images, stops and ties on workers", 9, 9) in told
     made.clear()
     assert (
         as_bytes(found_in(find_observations(scene, QUICK, cache=tmp_path / "cache", client=client))) == alone
