@@ -17,6 +17,7 @@ from typing import Any
 
 from pancam_graph.base.errors import ClusterError
 from pancam_graph.base.whole_files import whole_file
+from pancam_graph.cluster._hanging import Executing, Pace, restart, what_runs
 from pancam_graph.cluster._machine import PACKAGE, package_version
 from pancam_graph.cluster._worker import Parcel, Probe, look_around, run_batch
 
@@ -32,7 +33,13 @@ _SHARE = 8
 """Batches per thread that ready items are split into, so that the last ones end at about the same time."""
 _MOST_IN_BATCH = 16
 _TRIES = 3
+_LOOK_S = 5.0
+"""How often the scheduler is asked what runs; workers tell it about as often."""
 _PROBE_FILES = 3
+
+
+def _of_one_kind(_: Any) -> str:
+    return ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +51,8 @@ class Job:
     """What all items need; goes to a worker once, by a file in the shared folder."""
     name: Callable[[Any], str]
     """What an item is, for people."""
+    kind: Callable[[Any], str] = _of_one_kind
+    """Items of one kind take about the same time."""
 
 
 @dataclass
@@ -52,6 +61,10 @@ class _Batch:
 
     numbers: list[int]
     tries: int = 0
+    given_up: int = 0
+    """How often it was taken from a worker that did not end it."""
+    seconds: float = 0.0
+    """How long a worker had been at it when the scheduler was last asked."""
 
 
 class Crew:
@@ -67,6 +80,7 @@ class Crew:
         self._machine = machine, dict(machine())
         self._files: list[tuple[Path, int]] = []
         self._parcels = set[Path]()
+        self._can_look = True
 
     @contextmanager
     def at_work(self, files: Iterable[Path] = ()) -> Iterator[None]:
@@ -110,6 +124,26 @@ class Crew:
         """The error of a scheduler that is gone."""
         return self.broken("the scheduler is gone")
 
+    def what_runs(self) -> Mapping[str, Executing]:
+        """Tasks under way, by key; none where the scheduler cannot tell, which is logged once."""
+        if not self._can_look:
+            return {}
+        try:
+            found: Mapping[str, Executing] = self.client.run_on_scheduler(what_runs)
+        except (
+            Exception
+        ) as error:  # what a scheduler says that lacks the package; one that is gone is noticed
+            self._can_look = False
+            _LOG.warning(
+                "the scheduler does not tell what runs, so that nothing that hangs is noticed: %s", error
+            )
+            return {}
+        return found
+
+    def restart(self, address: str) -> None:
+        """End a worker that hangs; its nanny, if it has one, begins another."""
+        self.client.run_on_scheduler(restart, address)
+
     def check(self) -> None:
         """Raise ClusterError for the first worker, by address, that cannot do the work."""
         probe = self._folder / f"probe-{secrets.token_hex(4)}"
@@ -145,10 +179,11 @@ class Crew:
         is called with how many items are done, and how many there are. A task whose worker dies runs on
         another one; one that raises runs again twice. An item that still raises is left to the caller, with
         those that come after it: the caller meets the same error where it does them itself, and the log has a
-        warning.
+        warning. A task that takes many times as long as others of its kind is taken from its worker, which is
+        ended, and given to another one.
 
-        Raises ClusterError for an item on which each worker that tries it dies, where the scheduler is gone
-        or no worker is left for a minute, and as `at_work` does for workers that have come since.
+        Raises ClusterError for an item on which each worker that tries it dies or hangs, where the scheduler
+        is gone or no worker is left for a minute, and as `at_work` does for workers that have come since.
         """
         if items:
             _Run(self, job, items, after or [()] * len(items), done).finish()
@@ -200,6 +235,7 @@ class _Run:
         self._again = deque[_Batch]()
         self._running = dict[Any, _Batch]()
         self._ended = queue.SimpleQueue[Any]()
+        self._pace, self._looked_s = Pace(), time.monotonic()
         self._over = set[int]()
 
     def finish(self) -> None:
@@ -208,13 +244,16 @@ class _Run:
         try:
             while len(self._over) < len(self._items):
                 self._begin()
+                self._look()
                 try:
                     future = self._ended.get(timeout=_POLL_S)
                 except queue.Empty:
                     lonely_since_s = self._lonely(lonely_since_s)
                 else:
                     lonely_since_s = None
-                    self._end(future, self._running.pop(future))
+                    batch = self._running.pop(future, None)
+                    if batch is not None:  # else it was taken from its worker
+                        self._end(future, batch)
         finally:
             if self._running:
                 with suppress(Exception):  # a scheduler that is gone has nothing to cancel
@@ -239,6 +278,39 @@ class _Run:
                 self._running[future] = batch
                 future.add_done_callback(self._ended.put)
 
+    def _look(self) -> None:
+        """Take from workers what they do not end, and end these, from time to time."""
+        if time.monotonic() - self._looked_s < _LOOK_S:
+            return
+        self._looked_s, runs = time.monotonic(), self._crew.what_runs()
+        for future, batch in list(self._running.items()):
+            now = runs.get(str(future.key))
+            if now is None:
+                continue
+            batch.seconds = now.seconds
+            if now.seconds > self._pace.limit_s(self._kinds(batch), batch.given_up):
+                self._give_up(future, batch, now.worker)
+
+    def _kinds(self, batch: _Batch) -> list[str]:
+        return [self._job.kind(self._items[number]) for number in batch.numbers]
+
+    def _names(self, batch: _Batch) -> str:
+        return ", ".join(self._job.name(self._items[number]) for number in batch.numbers)
+
+    def _give_up(self, future: Any, batch: _Batch, worker: str) -> None:
+        """Take a task from a worker that does not end it. What both write then is the same, and whole."""
+        what = f"{self._names(batch)}: worker {worker} did not end in {batch.seconds:.0f} s"
+        del self._running[future]
+        with suppress(Exception):  # one of a worker that has died meanwhile
+            self._crew.client.cancel([future], force=True)
+        with suppress(Exception):  # it is not given another task in any case
+            self._crew.restart(worker)
+        given_up = batch.given_up + 1
+        if len(batch.numbers) == 1 and given_up >= _TRIES:
+            raise self._crew.broken(f"{what}, nor did {given_up - 1} others")
+        _LOG.warning("%s, and another one does it", what)
+        self._again.extend(_Batch([number], batch.tries, given_up) for number in batch.numbers)
+
     def _lonely(self, since_s: float | None) -> float | None:
         """Since when there is no worker; None: there is one."""
         if self._crew.n_threads():
@@ -255,17 +327,18 @@ class _Run:
         if future.status != "error":  # finished; or lost since, with the worker that had finished it
             for number in batch.numbers:
                 self._go_on_after(number)
+            self._pace.ended(self._kinds(batch), batch.seconds)
             self._count(batch.numbers)
             return
         error = future.exception()
         if isinstance(error, ClusterError):
             raise error
         is_killed = type(error).__name__ == "KilledWorker"  # of an extra
-        names = ", ".join(self._job.name(self._items[number]) for number in batch.numbers)
+        names = self._names(batch)
         if is_killed and len(batch.numbers) == 1 and batch.tries > 1:
             raise self._crew.broken(f"all workers that tried {names} died")
         if len(batch.numbers) > 1:
-            self._again.extend(_Batch([number], batch.tries) for number in batch.numbers)
+            self._again.extend(_Batch([number], batch.tries, batch.given_up) for number in batch.numbers)
         elif is_killed or batch.tries < _TRIES:
             self._again.append(batch)
         else:

@@ -45,7 +45,7 @@ class Helpers:
         """
         items, after = _plan(placed)
         work = placed.work
-        job = cluster.Job(function=_do, shared=placed, name=partial(_name, work))
+        job = cluster.Job(function=_do, shared=placed, name=partial(_name, work), kind=_kind)
         self._crew.share(job, items, after, partial(work.tell, "images, stops and ties on workers"))
 
 
@@ -133,6 +133,10 @@ def _do(placed: PlacedStops, item: _Item) -> None:
         placed.ties(number, item.second)
     elif number in work.origins(item.second):
         work.refined(item.second, number)
+
+
+def _kind(item: _Item) -> str:
+    return item.kind
 
 
 def _name(work: Steps, item: _Item) -> str:

@@ -8,6 +8,7 @@ import pytest
 
 from pancam_graph.base.errors import ClusterError, InputError
 from pancam_graph.cluster import Crew, Job, _machine, connected, dashboard, log_workers
+from pancam_graph.cluster._hanging import Pace
 from support import cluster_jobs
 from support.cluster_jobs import Folder, mark, mark_after, mark_but_for_seven, same
 
@@ -157,3 +158,30 @@ def test_each_worker_has_a_log(client: Any, tmp_path: Path) -> None:
     assert len(text) == 2
     assert all(f"{item}" in "".join(text) for item in range(4))
     assert dashboard(client) is None or str(dashboard(client)).startswith("http")
+
+
+def test_what_hangs_is_told_by_the_longest_of_its_kind() -> None:
+    pace = Pace()
+    assert pace.limit_s(["a", "b"], 0) == 600.0
+    pace.ended(["a"], 50.0)
+    pace.ended(["a", "a"], 40.0)
+    pace.ended(["b"], 1.0)
+    assert pace.limit_s(["b"], 0) == 600.0
+    assert pace.limit_s(["a"], 0) == 1000.0
+    assert pace.limit_s(["a", "a", "b"], 0) == 2020.0
+    assert pace.limit_s(["a"], 2) == 4000.0
+
+
+def test_a_scheduler_that_cannot_tell_what_runs_is_said_once(
+    client: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def refuse(*_: Any) -> None:
+        raise ModuleNotFoundError("No module named 'pancam_graph'")
+
+    monkeypatch.setattr("pancam_graph.cluster._crew._LOOK_S", 0.0)
+    monkeypatch.setattr(client, "run_on_scheduler", refuse)
+    crew = Crew(client, folder=tmp_path, machine=same)
+    with crew.at_work(), caplog.at_level(logging.WARNING, "pancam_graph"):
+        crew.share(job(mark, tmp_path), range(20))
+    assert len(marks(tmp_path)) == 20
+    assert len([r for r in caplog.records if "does not tell what runs" in r.getMessage()]) == 1

@@ -17,7 +17,15 @@ import pytest
 from pancam_graph.base.errors import ClusterError
 from pancam_graph.cluster import Crew, Job, connected
 from pancam_graph.images import find_observations
-from support.cluster_jobs import Folder, die_of_seven, mark, mark_slowly, same
+from support.cluster_jobs import (
+    Folder,
+    die_of_seven,
+    hang_of_seven,
+    hang_of_seven_once,
+    mark,
+    mark_slowly,
+    same,
+)
 from support.image_scenes import QUICK, as_bytes, found_in, make_traverse
 
 distributed = pytest.importorskip("distributed", reason="needs the extra pancam-graph[cluster]")
@@ -99,6 +107,39 @@ def test_an_item_that_kills_each_worker_is_named(tmp_path: Path) -> None:
         ):
             crew.share(job(die_of_seven, tmp_path), range(10))
     assert done_in(tmp_path) >= set(range(7))
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A task that runs for two seconds hangs; however often it was given up."""
+    monkeypatch.setattr("pancam_graph.cluster._hanging._LEAST_S", 2.0)
+    monkeypatch.setattr("pancam_graph.cluster._hanging._GROWTH", 1.0)
+    monkeypatch.setattr("pancam_graph.cluster._crew._LOOK_S", 0.5)
+
+
+@pytest.mark.usefixtures("impatient")
+def test_a_worker_that_hangs_is_ended_and_another_does_its_work(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with connected("local:2") as client:
+        crew = Crew(client, folder=tmp_path, machine=same)
+        with crew.at_work(), caplog.at_level("WARNING", "pancam_graph"):
+            crew.share(job(hang_of_seven_once, tmp_path), range(40))
+    assert done_in(tmp_path) == set(range(40))
+    assert len([r for r in caplog.records if "did not end in" in r.getMessage()]) == 1
+    with pytest.raises(ProcessLookupError):
+        os.kill(int((tmp_path / "hangs").read_text()), 0)
+
+
+@pytest.mark.usefixtures("impatient")
+def test_an_item_that_hangs_on_each_worker_is_named(tmp_path: Path) -> None:
+    with connected("local:1") as client:
+        crew = Crew(client, folder=tmp_path, machine=same)
+        expected = r"item 7: worker tcp://.* did not end in . s, nor did 2 others; what was found so far"
+        with pytest.raises(ClusterError, match=expected), crew.at_work():
+            crew.share(job(hang_of_seven, tmp_path), range(10))
+    assert done_in(tmp_path) >= set(range(7))
+    assert len(set((tmp_path / "hangs").read_text().split())) == 3
 
 
 def test_a_scheduler_that_goes_is_said_and_what_is_done_stays(tmp_path: Path) -> None:

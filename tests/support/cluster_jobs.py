@@ -50,3 +50,20 @@ def mark_after(folder: Folder, item: tuple[int, tuple[int, ...]]) -> None:
     number, before = item
     assert all((folder.path / f"{other}").exists() for other in before)
     mark(folder, number)
+
+
+def hang_of_seven_once(folder: Folder, item: int) -> None:
+    """Item 7 does not end where it is tried first."""
+    first = folder.path / "hangs"
+    if item == 7 and not first.exists():
+        first.write_text(str(os.getpid()))
+        time.sleep(3600)
+    mark(folder, item)
+
+
+def hang_of_seven(folder: Folder, item: int) -> None:
+    if item == 7:
+        with (folder.path / "hangs").open("a") as tries:
+            tries.write(f"{os.getpid()}\n")
+        time.sleep(3600)
+    mark(folder, item)
