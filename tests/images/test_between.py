@@ -34,7 +34,7 @@ from pancam_graph.images._cache import Arrays
 from pancam_graph.images._features import Features
 from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._splines import Splines
-from pancam_graph.images._terrain import StopTerrain, terrain_arrays, terrain_from
+from pancam_graph.images._terrain import StopTerrain, terrain_arrays, terrain_from, unplaced_arrays
 from pancam_graph.rigs import Eye, Rig, rig_template
 
 QUICK = FrontEndOptions(max_features=1500, max_ties=700)
@@ -205,6 +205,57 @@ def test_directions_that_contradict_each_other_give_no_ties(
         assert len(each.ties) == each.report.kept == 0
         assert each.report.sought == each.report.off_pose
         assert StopTies.of_arrays(each.arrays()).report == each.report
+
+
+def test_stops_apart_and_beside_each_other_see_the_same(
+    simulated: tuple[StopTerrain, tuple[gtsam.Pose3, ...]],
+) -> None:
+    """Each through its own rig: points lie where that of the first has them, pixels where the other does."""
+    terrain, masts = simulated
+    rig = terrain.rigs[1]
+    left = rig.eyes[0]
+    K = left.camera.pinhole.calibration_matrix + np.array([[20.0, 0, 5], [0, 20, 0], [0, 0, 0]])
+    other = replace(rig, eyes=(replace(left, camera=left.camera.with_calibration(K)), *rig.eyes[1:]))
+    both = replace(terrain, rigs=(rig, other))
+    apart = [both.of_stop(stop) for stop in (0, 1)]
+    assert [list(each.drive_row) for each in apart] == [list(range(16)), list(range(16, 32))]
+    assert sum(len(each.image) for each in apart) == len(terrain.image)
+    joined = apart[0].beside(apart[1])
+    assert list(joined.drive_row) == list(range(32))
+    order = np.argsort(terrain.stop, kind="stable")
+    np.testing.assert_array_equal(joined.track, terrain.track[order])
+    np.testing.assert_array_equal(joined.image, terrain.image[order])
+    rows = np.flatnonzero(joined.image == 0)
+    points = terrain.points_m(order[rows])
+    np.testing.assert_array_equal(joined.points_m(rows), points)
+    traverse = terrain.traverse
+    image = next(i for i in range(16, 32) if traverse.image_eye[i] == 0)
+    seen = joined.sighting(rows, image, masts[1])
+    frame = traverse.image_frame[[image]]
+    R, centre = (part[0] for part in other.mast_T_camera(traverse.pan_tilt_rad[frame], np.array([0])))
+    in_mast = (points - masts[1].translation()) @ masts[1].rotation().matrix()
+    expected = other.eyes[0].camera.project((in_mast - centre) @ R)[0]
+    np.testing.assert_allclose(seen.uv_px[seen.valid], expected[seen.valid], atol=1e-6)
+    through_one_rig = terrain.sighting(order[rows], image, masts[1])
+    assert np.abs(seen.uv_px - through_one_rig.uv_px)[seen.valid].max() > 5.0
+
+
+def test_a_stop_that_cannot_be_placed_gives_no_ties(
+    simulated: tuple[StopTerrain, tuple[gtsam.Pose3, ...]],
+) -> None:
+    traverse = simulated[0].traverse
+    nowhere: dict[str, Any] = unplaced_arrays(traverse)
+    empty = terrain_from(traverse, drive_row=np.arange(len(traverse.images)), **nowhere).of_stop(0)
+    matcher = StopMatcher(
+        terrain=empty.beside(simulated[0].of_stop(1)),
+        spline=lambda *_: pytest.fail("nothing is to be sought"),
+        usable=lambda _: pytest.fail("nothing is to be sought"),
+        features=lambda _: Features.none(),
+        options=QUICK,
+    )
+    found = [matcher.ties(*stops) for stops in ((0, 1), (1, 0))]
+    assert [each.report.refusal for each in found] == [Refusal.FEW_ALIKE] * 2
+    assert agreeing(matcher.terrain, *found) == tuple(found)
 
 
 def test_derivatives_of_sightings(simulated: tuple[StopTerrain, tuple[gtsam.Pose3, ...]]) -> None:

@@ -113,6 +113,18 @@ def test_options_rig_pointing_and_masks_are_seen(scene: Traverse) -> None:
         assert [a == b for a, b in zip(keys(other, options), before, strict=True)] == alike
 
 
+@pytest.mark.slow
+def test_the_same_pictures_in_other_rows(scene: Traverse, tmp_path: Path) -> None:
+    """What is kept of a stop may stand in other rows of a drive that has grown before it."""
+    before = found_in(find_observations(scene, QUICK, cache=tmp_path))
+    frame = replace(scene.frames[0], id="another", pan_rad=np.pi)
+    image = replace(scene.images[0], id="another", frame="another", file=None)
+    grown = replace(scene, frames=(frame, *scene.frames), images=(image, *scene.images))
+    after = found_in(find_observations(grown, QUICK, cache=tmp_path))
+    np.testing.assert_array_equal(after.image, before.image + 1)
+    np.testing.assert_array_equal(after.uv_px, before.uv_px)
+
+
 def test_another_version_of_a_library_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     before = digest("features", 1.0)
     assert digest("features", 1.0) == before
