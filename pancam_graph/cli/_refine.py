@@ -1,8 +1,8 @@
 """The subcommand refine: adjust a traverse and write a folder of results."""
 
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable
+from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from pancam_graph.cli._collector import loading
 from pancam_graph.cli._command import Command, Invocation
 from pancam_graph.cli._parser import Assignment, CommandParser, Flag, LateChoice, Several
+from pancam_graph.cli._workers import add_cluster_option, workers
 
 if TYPE_CHECKING:
     from pancam_graph.data import Traverse
@@ -176,13 +177,7 @@ def _add_outputs(parser: CommandParser) -> None:
         help="write heights, an orthoimage, a mesh and a cloud of the ground that stereo frames see; needs "
         "the extra: pip install 'pancam-graph[terrain]'",
     )
-    add(
-        "--cluster",
-        metavar="ADDRESS",
-        help="share the work on pictures among workers of a Dask cluster: tcp://HOST:PORT of its scheduler, "
-        "local for a process a core of this machine, local:N for N; workers need FOLDER and OUT on a file "
-        "system in common; needs the extra: pip install 'pancam-graph[cluster]'",
-    )
+    add_cluster_option(parser)
     add("--csv", action=Flag, help="write residuals.csv too, a line for each observation")
     add(
         "--plots",
@@ -228,9 +223,7 @@ def _work(call: Invocation) -> int:
 
         check_plots(arguments.plots)
     with progress.shown(f"reading {arguments.folder}"), resumable(arguments.out), ExitStack() as clients:
-        client = None
-        if arguments.cluster is not None:
-            client = clients.enter_context(_workers(call))
+        client = clients.enter_context(workers(call))
         traverse = read_input(arguments.folder, *arguments.add)
         if arguments.use_rig is not None:
             traverse = use_rig(traverse, arguments.use_rig)
@@ -285,7 +278,10 @@ def _work(call: Invocation) -> int:
             from pancam_graph.terrain import TerrainOptions
 
             results["terrain"] = TerrainOptions()
-        solution = write_results(solution, arguments.out, **results, progress=progress.counted)
+        with workers(call) if arguments.terrain else nullcontext() as client:
+            solution = write_results(
+                solution, arguments.out, **results, progress=progress.counted, client=client
+            )
         if arguments.plots is not None:
             from pancam_graph.results import write_plots
 
@@ -293,20 +289,6 @@ def _work(call: Invocation) -> int:
             write_plots(solution, arguments.plots)
     print_summary(solution, str(arguments.out), quiet=arguments.quiet)
     return 0 if solution.passed else 1
-
-
-@contextmanager
-def _workers(call: Invocation) -> Iterator[Any]:
-    """A client of the cluster that the user names; its page is told, and with --log each worker has a log."""
-    from pancam_graph.cluster import connected, dashboard, log_workers
-
-    with connected(call.arguments.cluster) as client:
-        page = dashboard(client)
-        if page is not None:
-            call.say(f"the cluster's own page of progress: {page}")
-        if call.arguments.log is not None:
-            log_workers(client, call.arguments.log.with_name(f"{call.arguments.log.name}.workers"))
-        yield client
 
 
 def started(traverse: "Traverse", path: Path, *, incremental: bool) -> "tuple[Traverse, Start]":

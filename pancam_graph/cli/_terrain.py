@@ -6,6 +6,7 @@ from pancam_graph.base.text import shortened
 from pancam_graph.cli._command import Command, Invocation
 from pancam_graph.cli._parser import CommandParser, above_zero, add_images_option
 from pancam_graph.cli._streams import write
+from pancam_graph.cli._workers import add_cluster_option, workers
 
 __all__ = ["TERRAIN"]
 
@@ -51,6 +52,7 @@ def _add_options(parser: CommandParser) -> None:
     )
     add("--ply", action="store_true", help="write clouds as PLY too")
     add_images_option(parser)
+    add_cluster_option(parser)
 
 
 def _work(call: Invocation) -> int:
@@ -65,7 +67,10 @@ def _work(call: Invocation) -> int:
     require_extra()
     with progress.shown(f"reading {arguments.out}"):
         drive = read_drive(arguments.out, arguments.images)
-        terrain = write_terrain_of(drive, arguments.out, options, progress=progress.counted)
+        with workers(call) as client:
+            terrain = write_terrain_of(
+                drive, arguments.out, options, progress=progress.counted, client=client
+            )
     for warning in terrain.warnings:
         write("stderr", shortened(f"warning: {warning}"))
     first, *others = terrain.says()

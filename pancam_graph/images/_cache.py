@@ -116,6 +116,13 @@ class Cache:
                     with suppress(OSError):  # a folder of such a name, or no right to delete
                         path.unlink()
 
+    def forget(self, kind: str) -> None:
+        """Delete the cache's files of a kind."""
+        if self._folder is not None:
+            for path in self._folder.glob(f"{kind}-*{_SUFFIX}"):
+                with suppress(OSError):  # as above
+                    path.unlink()
+
 
 class _Aside:
     """Arrays that memory has no room for and no other folder has: in a temporary folder, gone with this."""

@@ -14,7 +14,7 @@ from pancam_graph.base.options import options_of
 from pancam_graph.base.threads import in_order
 from pancam_graph.data import Matching, Observations, PairMatching, StopMatching, Traverse, mean_sigma_px
 from pancam_graph.images._between import StopTies
-from pancam_graph.images._cache import Cache
+from pancam_graph.images._cache import Cache, digest
 from pancam_graph.images._front_end_options import FrontEndOptions
 from pancam_graph.images._masks import ImageMask, Reason
 from pancam_graph.images._match_pair import PairMatches
@@ -24,7 +24,7 @@ from pancam_graph.images._placed import PlacedStops, TiedTracks
 from pancam_graph.images._read import image_name, listed
 from pancam_graph.images._steps import Progress, Steps
 
-__all__ = ["find_masks", "find_observations"]
+__all__ = ["Masks", "find_masks", "find_observations"]
 
 _LOG = logging.getLogger(__name__)
 _SURE_OVERLAP = 0.1
@@ -140,27 +140,39 @@ def find_masks(
     *,
     progress: Progress | None = None,
     cache: Path | None = None,
-) -> Sequence[ImageMask | None]:
+    client: Any = None,
+) -> "Masks":
     """Which pixels of each image are left out, and why; None for an image without a file or a repeated one.
 
     Sky, saturated pixels and the rover are found in the images, unless `options.masks` is "user". The rover
     is what stands still relative to the mast between stops, in images in which an eye looks the same way at
-    both. Memory holds them packed. Raises as `find_observations` does.
+    both. Memory holds them packed. Workers find them with a `client`. Raises as `find_observations` does.
     """
     options = options_of(FrontEndOptions, options, "find_masks")
     work = Steps(traverse, options, progress, Cache(cache))
-    _make_masks(work)
-    return _Masks(work)
+    with helped(client, work, cache) as helpers:
+        if helpers is not None:
+            work.begin()
+            helpers.do_masks(work)
+        _make_masks(work)
+    return Masks(work)
 
 
-class _Masks(Sequence[ImageMask | None]):
-    """The masks of a drive by row, each unpacked when it is asked for."""
+class Masks(Sequence[ImageMask | None]):
+    """The masks of a drive by row, each unpacked when it is asked for.
+
+    Another process gets them by pickling where they are in a cache.
+    """
 
     def __init__(self, work: Steps) -> None:
         self._work = work
 
     def __len__(self) -> int:
         return len(self._work.traverse.images)
+
+    def digest_of(self, row: int) -> str:
+        """A digest of a picture and its mask."""
+        return digest(self._work.pictures.digests[row], self._work.reasons(row))
 
     @overload
     def __getitem__(self, row: int) -> ImageMask | None: ...

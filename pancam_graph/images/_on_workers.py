@@ -12,13 +12,14 @@ from typing import Any, Literal, NamedTuple
 
 from pancam_graph import cluster
 from pancam_graph.base.errors import InputError
+from pancam_graph.data import Traverse
 from pancam_graph.images._cache import libraries
 from pancam_graph.images._cache_folder import begin_cache
 from pancam_graph.images._placed import PlacedStops
 from pancam_graph.images._steps import Steps
 from pancam_graph.io import picture_file
 
-__all__ = ["Helpers", "helped"]
+__all__ = ["Helpers", "crew_at_work", "helped"]
 
 
 class _Item(NamedTuple):
@@ -38,6 +39,12 @@ class Helpers:
         """The crew is at work."""
         self._crew = crew
 
+    def do_masks(self, work: Steps) -> None:
+        """The mask of each image; the steps must know what masks need of the drive."""
+        items = [_Item("mask", row) for row in work.rows]
+        job = cluster.Job(function=_do_mask, shared=work, name=partial(_name, work), kind=_kind)
+        self._crew.share(job, items, done=partial(work.tell, "masks on workers"))
+
     def do_all(self, placed: PlacedStops) -> None:
         """All steps of a drive, none of which waits for stops that it does not need.
 
@@ -53,6 +60,16 @@ class Helpers:
 def helped(client: Any, work: Steps, folder: Path | None) -> Iterator[Helpers | None]:
     """The workers of a distributed.Client, found able to do the work; None without a client.
 
+    `folder` is that of the cache. Raises as `crew_at_work` does.
+    """
+    with crew_at_work(client, work.traverse, folder) as crew:
+        yield None if crew is None else Helpers(crew)
+
+
+@contextmanager
+def crew_at_work(client: Any, traverse: Traverse, folder: Path | None) -> Iterator[cluster.Crew | None]:
+    """The workers of a distributed.Client, found able to work on pictures; None without a client.
+
     `folder` is that of the cache. Raises InputError without one, and as `cluster.Crew.at_work` does.
     """
     if client is None:
@@ -60,13 +77,13 @@ def helped(client: Any, work: Steps, folder: Path | None) -> Iterator[Helpers | 
         return
     if folder is None:
         raise InputError(
-            "find_observations: expected a folder for the cache, in which workers leave results, found none"
+            "client: expected a folder for the cache, in which workers leave results, found none"
         )
     begin_cache(folder)
     crew = cluster.Crew(client, folder=folder, machine=_machine)
-    files = (picture_file(work.traverse, row) for row in range(len(work.traverse.images)))
+    files = (picture_file(traverse, row) for row in range(len(traverse.images)))
     with crew.at_work(path for path in files if path is not None):
-        yield Helpers(crew)
+        yield crew
 
 
 @cache
@@ -112,6 +129,10 @@ def _plan(placed: PlacedStops) -> tuple[list[_Item], list[list[int]]]:
             add(_Item("ties", one, other), [terrain[placed.group_of[stop]] for stop in (one, other)])
     add_images(work.rows)
     return items, after
+
+
+def _do_mask(work: Steps, item: _Item) -> None:
+    work.figures(item.number)
 
 
 def _do(placed: PlacedStops, item: _Item) -> None:

@@ -1,7 +1,7 @@
 """The image files of a traverse with the user's masks: what is odd about them, and their samples."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from pancam_graph.io import (
     samples_digest,
 )
 
-__all__ = ["PictureFiles", "Pictures", "image_name", "listed", "read_pictures"]
+__all__ = ["PictureFiles", "Pictures", "for_workers", "image_name", "listed", "read_pictures"]
 
 _NAMED = 3
 _HELD_BYTES = 128 << 20
@@ -185,3 +185,19 @@ def listed(names: Sequence[str]) -> str:
     """A few names, and how many more there are."""
     more = len(names) - _NAMED
     return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def for_workers(traverse: Traverse) -> Traverse:
+    """What other processes need of a traverse to work on its pictures, wherever they run.
+
+    That is without observations and what they say.
+    """
+    return replace(
+        traverse,
+        folder=(traverse.folder or Path()).resolve(),
+        observations=None,
+        matching=None,
+        constraints=(),
+        points=None,
+        warnings=(),
+    )

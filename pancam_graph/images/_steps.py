@@ -14,7 +14,6 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,7 +32,7 @@ from pancam_graph.images._match_pair import PairMatches, match_pair
 from pancam_graph.images._overlap import near_stops, overlap_cells, overlapping_pairs
 from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._patch_noise import shared_by_tracks
-from pancam_graph.images._read import PictureFiles, Pictures, read_pictures
+from pancam_graph.images._read import PictureFiles, Pictures, for_workers, read_pictures
 from pancam_graph.images._refine import RefinedTracks, refine_tracks
 from pancam_graph.images._rover import find_rover, rover_partners
 from pancam_graph.images._splines import Splines
@@ -116,7 +115,7 @@ class Steps:
         """All but the caller's progress and what memory holds, with paths that hold in any folder."""
         left = ("_files", "_spline", "_usable")
         state = {**{k: v for k, v in vars(self).items() if k not in left}, "progress": None}
-        state["traverse"] = replace(self.traverse, folder=(self.traverse.folder or Path()).resolve())
+        state["traverse"] = for_workers(self.traverse)
         if "pictures" in state:
             masks = tuple(None if path is None else path.resolve() for path in self.pictures.masks)
             state["pictures"] = replace(self.pictures, masks=masks)

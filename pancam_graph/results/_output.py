@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pancam_graph.data import Solution, Traverse
 from pancam_graph.results._older import ONE_FILE, Older
@@ -33,6 +33,8 @@ class Written:
     """Told of a stage, how many of its parts are done, and how many there are."""
     seconds: Callable[[], float]
     """How long writing has taken so far."""
+    client: Any = None
+    """A distributed.Client whose workers share the work on pictures, or None."""
     mosaics: "WrittenMosaics | None" = None
     """The mosaics, once they are written."""
     terrain: "WrittenTerrain | None" = None

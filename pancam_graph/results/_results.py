@@ -4,7 +4,7 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.whole_files import recover, whole_folder
@@ -79,13 +79,15 @@ def write_results(
     mosaics: "MosaicOptions | None" = None,
     terrain: "TerrainOptions | None" = None,
     progress: Callable[[str, int, int], None] | None = None,
+    client: Any = None,
 ) -> Solution:
     """Write the results of a solution into the folder `out`: all `OUTPUTS` that are asked for.
 
     Everything is written into a folder beside and renamed when complete: an older folder of results stays
     whole until then, and is there as before if anything fails. `csv`: whether residuals are written as CSV
     too. `exports` are names of `EXPORTS`. With options of `mosaics` and of `terrain`, folders of them are
-    among the results; `progress` is told of each. Returns the solution with the time that writing took as its
+    among the results; `progress` is told of each. Workers of `client`, a distributed.Client, match frames for
+    terrain, and must see `out` at the same path. Returns the solution with the time that writing took as its
     `seconds.report`, and with warnings of images that mosaics and terrain lack, or why there is no terrain.
     Raises InputError as `check_out` and `check_exports` do, and where writing fails.
     """
@@ -110,6 +112,7 @@ def write_results(
                 terrain_options=terrain,
                 out=out,
                 progress=progress,
+                client=client,
                 seconds=lambda: time.perf_counter() - started,
             )
             for output in chosen:

@@ -3,9 +3,10 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from pancam_graph import report
-from pancam_graph.base.errors import InputError
+from pancam_graph.base.errors import ClusterError, InputError
 from pancam_graph.base.whole_files import whole_folder
 from pancam_graph.data import Traverse
 from pancam_graph.images import cache_folder
@@ -32,11 +33,12 @@ def write_terrain_of(
     options: TerrainOptions = TerrainOptions(),  # noqa: B008  frozen
     *,
     progress: Callable[[str, int, int], None] | None = None,
+    client: Any = None,
 ) -> Terrain:
     """Write the terrain of a drive into the folder of results `out`, whole; an older one is replaced.
 
-    `drive` is what `read_drive` gives. Raises InputError as `make_terrain` and `write_terrain` do, for other
-    things in the place of the terrain, and where writing fails.
+    `drive` is what `read_drive` gives; `client` is as of `make_terrain`. Raises InputError as `make_terrain`
+    and `write_terrain` do, for other things in the place of the terrain, and where writing fails.
     """
     require_extra()
     path = Path(out) / TERRAIN
@@ -45,7 +47,7 @@ def write_terrain_of(
         raise InputError(
             f"{path}: expected an older terrain or nothing, found other things in it: {strangers[0]}"
         )
-    terrain = make_terrain(drive, options, progress=progress, cache=cache_folder(out))
+    terrain = make_terrain(drive, options, progress=progress, cache=cache_folder(out), client=client)
     try:
         with whole_folder(path) as folder:
             _fill(terrain, drive.traverse, folder, options, progress)
@@ -72,11 +74,15 @@ def _write(written: Written, folder: Path) -> Written:
     assert options is not None  # without options nobody asked for terrain
     try:
         terrain = make_terrain(
-            drive_of(solution), options, progress=written.progress, cache=cache_folder(written.out)
+            drive_of(solution),
+            options,
+            progress=written.progress,
+            cache=cache_folder(written.out),
+            client=written.client,
         )
         shown = _fill(terrain, solution.traverse, folder, options, written.progress)
         warnings = shown.warnings
-    except InputError as error:  # a solve that took long must not be lost for it
+    except (InputError, ClusterError) as error:  # a solve that took long must not be lost for it
         shown, warnings = None, (str(error),)
         folder.rmdir()
     warned = replace(solution, warnings=(*solution.warnings, *warnings))

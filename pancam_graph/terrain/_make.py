@@ -2,24 +2,27 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pancam_graph.base.errors import ImageError, InputError
-from pancam_graph.base.geometry import BoolArray, FloatArray
+from pancam_graph.base.errors import InputError
 from pancam_graph.base.options import options_of
 from pancam_graph.base.threads import in_order
-from pancam_graph.images import ImageMask, Small, even_out, find_masks
+from pancam_graph.cluster import Job
+from pancam_graph.images import Cache, Small, crew_at_work, even_out, find_masks
 from pancam_graph.terrain._agreement import Agreement, agreement_of, finest_agreement
 from pancam_graph.terrain._drive import Drive, Pair, stereo_pairs
 from pancam_graph.terrain._fill import filled
+from pancam_graph.terrain._frames import SURFACE, Frames, Seen
 from pancam_graph.terrain._fused import Fused, fuse
 from pancam_graph.terrain._grid import Layer
 from pancam_graph.terrain._levels import Level, levels_around
 from pancam_graph.terrain._section import Section, section_of
-from pancam_graph.terrain._surface import Points, surface_of
+from pancam_graph.terrain._surface import Points
 from pancam_graph.terrain._terrain_options import TerrainOptions
 
 __all__ = ["Cloud", "Terrain", "make_terrain"]
@@ -73,29 +76,21 @@ class Terrain:
         return lines
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Seen:
-    """What one frame gave: its layer with each pointing, and its points."""
-
-    pair: Pair
-    refined: tuple[Layer | None, ...]
-    """By level of the grid; None where the frame sees nothing of it."""
-    telemetry: tuple[Layer | None, ...]
-    points: Points
-
-
 def make_terrain(
     drive: Drive,
     options: TerrainOptions = TerrainOptions(),  # noqa: B008  frozen
     *,
     progress: Progress | None = None,
     cache: Path | None = None,
+    client: Any = None,
 ) -> Terrain:
     """Match every stereo frame of a drive and fuse what they see, for each stop and for all.
 
     Where two frames see the same cells, `Terrain.agreement` has by how much their surfaces differ, with
     telemetry's pointing and with the refined one. Pictures are read from the traverse's folder, and masks of
-    sky, rover and saturated pixels are found in them (`cache`: where these are kept). Raises InputError where
+    sky, rover and saturated pixels are found in them (`cache`: where these are kept). `client`, a
+    distributed.Client, shares frames among the workers of a Dask cluster, with the same result; they need the
+    cache, and raise ClusterError, as those of `find_observations` do. Raises InputError where
     no frame has two pictures that see in stereo, for a cell that is too small for memory, and where no ground
     is found.
     """
@@ -108,36 +103,18 @@ def make_terrain(
     centres = drive.world_t_camera[rows]
     focal_px = float(np.median([drive.cameras[r].pinhole.fx_px for r in rows]))
     levels = levels_around(centres, options.reach_m, options.cell_m, traverse.rig.mast_height_m, focal_px)
-    masks = find_masks(traverse, progress=progress, cache=cache)
-    telemetry = drive.telemetry()
+    masks = find_masks(traverse, progress=progress, cache=cache, client=client)
     most = sum(drive.cameras[pair.left].width_px * drive.cameras[pair.left].height_px for pair in pairs)
-    every = max(1, int(np.ceil(most / options.most_cloud_points)))
-
-    def seen(pair: Pair) -> _Seen | str | None:
-        left, right = _usable(masks[pair.left]), _usable(masks[pair.right])
-        if left is None or right is None:
-            return f"terrain: frame {traverse.frames[pair.frame].id} is left out: a picture cannot be used"
-        try:
-            surface = surface_of(drive, pair, (left, right), options.reach_m)
-        except ImageError as error:
-            return f"terrain: frame {traverse.frames[pair.frame].id} is left out: {error}"
-        to_telemetry = _to_telemetry(drive, telemetry, pair)
-        refined, before = (
-            tuple(surface.layer(level.grid, (level.nearest_m, level.farthest_m), move) for level in levels)
-            for move in (None, to_telemetry)
-        )
-        if all(layer is None for layer in refined):
-            return None
-        points = surface.points(options.reach_m, every)
-        return _Seen(pair=pair, refined=refined, telemetry=before, points=points)
-
-    def tell(number: int, _: _Seen | str | None) -> None:
-        if progress is not None:
-            progress("terrain", number + 1, len(pairs))
-
-    found = in_order(seen, pairs, tell)
+    frames_of = Frames(
+        drive=drive,
+        levels=levels,
+        reach_m=options.reach_m,
+        every=max(1, int(np.ceil(most / options.most_cloud_points))),
+        masks=masks,
+    )
+    found = _found(frames_of, pairs, progress, cache, client)
     warnings += [each for each in found if isinstance(each, str)]
-    frames = [each for each in found if isinstance(each, _Seen)]
+    frames = [each for each in found if isinstance(each, Seen)]
     if not frames:
         raise InputError(
             "terrain: expected ground that two eyes see, found none: see the masks of the images"
@@ -163,12 +140,46 @@ def make_terrain(
     )
 
 
-def _layers(frames: Sequence[_Seen], level: int) -> tuple[list[Layer], list[Layer]]:
+def _found(
+    frames: Frames, pairs: Sequence[Pair], progress: Progress | None, cache: Path | None, client: Any
+) -> list[Seen | str | None]:
+    """What each frame sees; workers leave it in the cache, which forgets it once it was taken from there."""
+
+    def tell(stage: str, done: int, total: int) -> None:
+        if progress is not None:
+            progress(stage, done, total)
+
+    def told(number: int, _: Seen | str | None) -> None:
+        tell("terrain", number + 1, len(pairs))
+
+    with crew_at_work(client, frames.drive.traverse, cache) as crew:
+        if crew is None:
+            return in_order(frames.seen, pairs, told)
+        kept = Cache(cache)
+        entries = frames.drive.traverse.frames
+        job = Job(
+            function=_keep,
+            shared=(frames, kept),
+            name=lambda pair: f"the surface of frame {entries[pair.frame].id}",
+        )
+        crew.share(job, pairs, done=partial(tell, "terrain on workers"))
+        found = in_order(lambda pair: frames.kept(pair, kept), pairs, told)
+        kept.forget(SURFACE)
+    return found
+
+
+def _keep(shared: tuple[Frames, Cache], pair: Pair) -> None:
+    """Have the surface of a frame in the cache; runs on a worker."""
+    frames, cache = shared
+    frames.kept(pair, cache)
+
+
+def _layers(frames: Sequence[Seen], level: int) -> tuple[list[Layer], list[Layer]]:
     """Layers of frames on one level, with the refined pointing and with telemetry's."""
     return _known(e.refined[level] for e in frames), _known(e.telemetry[level] for e in frames)
 
 
-def _surface(levels: Sequence[Level], frames: Sequence[_Seen], options: TerrainOptions) -> Fused:
+def _surface(levels: Sequence[Level], frames: Sequence[Seen], options: TerrainOptions) -> Fused:
     """The surface of some frames, its coarser levels with it; levels that none of them sees are left out."""
     surfaces = list[Fused]()
     for k, level in enumerate(levels):
@@ -183,7 +194,7 @@ def _known(layers: Iterable[Layer | None]) -> list[Layer]:
     return [layer for layer in layers if layer is not None]
 
 
-def _evened(frames: Sequence[_Seen]) -> list[_Seen]:
+def _evened(frames: Sequence[Seen]) -> list[Seen]:
     """Frames of equal brightness: a gain of each, from what they show of the same cells.
 
     Cells are of the finest level that every frame sees, else of the coarsest; a frame that does not see that
@@ -238,20 +249,7 @@ def _no_stereo(drive: Drive) -> str:
     )
 
 
-def _usable(mask: ImageMask | None) -> BoolArray | None:
-    return None if mask is None else mask.usable(between_stops=True)
-
-
-def _to_telemetry(
-    drive: Drive, telemetry: tuple[FloatArray, FloatArray], pair: Pair
-) -> tuple[FloatArray, FloatArray]:
-    """From the refined world to telemetry's: where the left camera of a frame would have put its points."""
-    i = pair.left
-    turn = telemetry[0][i] @ drive.world_R_camera[i].T
-    return turn, telemetry[1][i] - turn @ drive.world_t_camera[i]
-
-
-def _cloud(frames: Sequence[_Seen]) -> Cloud:
+def _cloud(frames: Sequence[Seen]) -> Cloud:
     parts = [each.points for each in frames]
     joined = {
         name: np.concatenate([getattr(p, name) for p in parts])

@@ -5,6 +5,7 @@ import shutil
 import struct
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,11 +14,15 @@ from pancam_graph import Solution
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray
 from pancam_graph.cli import main
+from pancam_graph.images import Cache, find_masks
 from pancam_graph.io import write_traverse
 from pancam_graph.results import check_out, read_drive, write_results
 from pancam_graph.rigs import stereo_pan_tilt
 from pancam_graph.terrain import Terrain, TerrainOptions, drive_of, make_terrain
 from pancam_graph.terrain import _extra as extra
+from pancam_graph.terrain._drive import Pair, stereo_pairs
+from pancam_graph.terrain._frames import Frames, Seen
+from pancam_graph.terrain._levels import levels_around
 from support.mosaic_scenes import PLACE_M, Scene, solved, without_file
 
 RIG = stereo_pan_tilt(field_rad=np.deg2rad(55.0), width_px=224, height_px=224)
@@ -272,3 +277,57 @@ def test_pictures_of_another_drive_are_refused(results: Path, tmp_path: Path) ->
     write_traverse(other.traverse, tmp_path)
     with pytest.raises(InputError, match=r"images: expected those of .*, found those of another drive"):
         read_drive(results, tmp_path)
+
+
+@pytest.mark.slow
+def test_frames_on_workers_give_the_same_terrain(
+    plane: Solution, terrain: Terrain, client: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All of them are matched by workers, and nothing of them is left in the cache."""
+    told: list[tuple[str, int, int]] = []
+    seen, on_workers = Frames.seen, list[bool]()
+
+    def noted(frames: Frames, pair: Pair) -> Seen | str | None:
+        on_workers.append("masks" in vars(frames) and frames.drive.traverse.observations is None)
+        return seen(frames, pair)
+
+    monkeypatch.setattr(Frames, "seen", noted)
+    cache = tmp_path / "cache"
+    found = make_terrain(
+        drive_of(plane), OPTIONS, cache=cache, client=client, progress=lambda *event: told.append(event)
+    )
+    assert on_workers == [True] * len(terrain.pairs)
+    assert ("terrain on workers", len(terrain.pairs), len(terrain.pairs)) in told
+    assert not list(cache.glob("surface-*"))
+    assert not list(cache.glob("parcel-*"))
+    for one, other in zip(found.drive.levels, terrain.drive.levels, strict=True):
+        for name in ("height_m", "sigma_m", "grey"):
+            assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
+    for stop, cloud in terrain.clouds.items():
+        for name, column in vars(cloud.points).items():
+            assert column.tobytes() == getattr(found.clouds[stop].points, name).tobytes()
+    assert found.says() == terrain.says()
+    assert found.warnings == terrain.warnings
+
+
+@pytest.mark.slow
+def test_what_a_frame_gave_is_kept_whole(plane: Solution, tmp_path: Path) -> None:
+    """Also why it is left out, and that it sees nothing."""
+    drive = drive_of(plane)
+    pairs, _ = stereo_pairs(drive)
+    levels = levels_around(drive.world_t_camera, 5.0, 0.05, drive.traverse.rig.mast_height_m, 200.0)
+    frames = Frames(
+        drive=drive, levels=levels, reach_m=5.0, every=3, masks=find_masks(drive.traverse, cache=tmp_path)
+    )
+    made = frames.kept(pairs[0], Cache(tmp_path))
+    again = frames.kept(pairs[0], Cache(tmp_path))
+    assert isinstance(made, Seen)
+    assert isinstance(again, Seen)
+    assert [layer is None for layer in made.refined] == [layer is None for layer in again.refined]
+    assert again.points.covariance_m2.tobytes() == made.points.covariance_m2.tobytes()
+    for reason in (None, "terrain: frame f is left out: it is torn"):
+        answers = iter([reason])
+        cache = Cache(tmp_path / str(reason is None))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Frames, "seen", lambda *_, answers=answers: next(answers))
+            assert [frames.kept(pairs[0], cache) for _ in range(2)] == [reason] * 2
