@@ -21,7 +21,7 @@ __all__ = ["SURFACE", "Frames", "Seen"]
 SURFACE = "surface"
 """The kind of what a cache keeps of a frame."""
 _LEFT_OUT = "left_out"
-_BANDS = ("height_m", "variance_m2", "grey")
+_BANDS = ("height_m", "variance_m2", "grey", "shared_m2")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,7 +43,8 @@ class Seen:
                 if layer is not None:
                     name = f"{pointing}_{k}"
                     arrays[f"{name}_first"] = np.array([layer.first_row, layer.first_column])
-                    arrays |= {f"{name}_{band}": getattr(layer, band) for band in _BANDS}
+                    bands = {f"{name}_{band}": getattr(layer, band) for band in _BANDS}
+                    arrays |= {n: band for n, band in bands.items() if band is not None}
         return arrays
 
     @staticmethod
@@ -54,7 +55,7 @@ class Seen:
             if f"{name}_first" not in arrays:
                 return None
             row, column = arrays[f"{name}_first"].tolist()
-            bands = {band: arrays[f"{name}_{band}"] for band in _BANDS}
+            bands = {band: arrays[f"{name}_{band}"] for band in _BANDS if f"{name}_{band}" in arrays}
             return Layer(frame=pair.frame, first_row=row, first_column=column, **bands)
 
         refined, telemetry = (
@@ -126,6 +127,7 @@ class Frames:
         """A digest of all that a frame's surface depends on."""
         drive, rows = self.drive, [pair.left, pair.right]
         telemetry = [part[rows] for part in self._telemetry]
+        shared = drive.stereo and (drive.stereo.depth_m, drive.stereo.of(pair.left, pair.right))
         return key_of(
             SURFACE,
             (surface_of, *(type(drive.cameras[row]) for row in rows)),
@@ -135,7 +137,8 @@ class Frames:
             drive.world_R_camera[rows],
             drive.world_t_camera[rows],
             telemetry,
-            drive.angle_sigma_rad[pair.frame],
+            drive.own_tilt_sigma_rad[pair.frame],
+            shared,
             drive.traverse.rig.mast_height_m,
             [self.masks.digest_of(row) for row in rows],
             drive.traverse.frames[pair.frame].id,

@@ -14,6 +14,7 @@ from pancam_graph import Solution
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray
 from pancam_graph.cli import main
+from pancam_graph.data import StereoCovariance
 from pancam_graph.images import Cache, find_masks
 from pancam_graph.io import write_traverse
 from pancam_graph.results import check_out, read_drive, write_results
@@ -301,8 +302,10 @@ def test_frames_on_workers_give_the_same_terrain(
     assert not list(cache.glob("surface-*"))
     assert not list(cache.glob("parcel-*"))
     for one, other in zip(found.drive.levels, terrain.drive.levels, strict=True):
-        for name in ("height_m", "sigma_m", "grey"):
-            assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
+        bands = {name: band for name, band in vars(other).items() if isinstance(band, np.ndarray)}
+        assert len(bands) >= 6
+        for name, band in bands.items():
+            assert getattr(one, name).tobytes() == band.tobytes(), name
     for stop, cloud in terrain.clouds.items():
         for name, column in vars(cloud.points).items():
             assert column.tobytes() == getattr(found.clouds[stop].points, name).tobytes()
@@ -313,8 +316,17 @@ def test_frames_on_workers_give_the_same_terrain(
 @pytest.mark.slow
 def test_what_a_frame_gave_is_kept_whole(plane: Solution, tmp_path: Path) -> None:
     """Also why it is left out, and that it sees nothing."""
-    drive = drive_of(plane)
-    pairs, _ = stereo_pairs(drive)
+    pairs, _ = stereo_pairs(drive_of(plane))
+    covariance = np.zeros((len(pairs), 2, 2, 2, 6))
+    covariance[..., [0, 3, 5]] = 1e-6
+    shared = StereoCovariance(
+        left=np.array([pair.left for pair in pairs]),
+        right=np.array([pair.right for pair in pairs]),
+        extent=np.tile([-1.0, 1.0, -1.0, 1.0], (len(pairs), 1)),
+        depth_m=np.array([0.5, 50.0]),
+        covariance=covariance,
+    )
+    drive = replace(drive_of(plane), stereo=shared)
     levels = levels_around(drive.world_t_camera, 5.0, 0.05, drive.traverse.rig.mast_height_m, 200.0)
     frames = Frames(
         drive=drive, levels=levels, reach_m=5.0, every=3, masks=find_masks(drive.traverse, cache=tmp_path)
@@ -323,7 +335,18 @@ def test_what_a_frame_gave_is_kept_whole(plane: Solution, tmp_path: Path) -> Non
     again = frames.kept(pairs[0], Cache(tmp_path))
     assert isinstance(made, Seen)
     assert isinstance(again, Seen)
-    assert [layer is None for layer in made.refined] == [layer is None for layer in again.refined]
+    for one, other in zip(made.refined + made.telemetry, again.refined + again.telemetry, strict=True):
+        assert (one is None) == (other is None)
+        if one is not None and other is not None:
+            assert (one.frame, one.box) == (other.frame, other.box)
+            for name in ("height_m", "variance_m2", "grey"):
+                assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
+    own, kept = made.refined[0], again.refined[0]
+    assert own is not None
+    assert kept is not None
+    assert own.shared_m2 is not None
+    assert kept.shared_m2 is not None
+    assert own.shared_m2.tobytes() == kept.shared_m2.tobytes()
     assert again.points.covariance_m2.tobytes() == made.points.covariance_m2.tobytes()
     for reason in (None, "terrain: frame f is left out: it is torn"):
         answers = iter([reason])
@@ -331,3 +354,16 @@ def test_what_a_frame_gave_is_kept_whole(plane: Solution, tmp_path: Path) -> Non
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(Frames, "seen", lambda *_, answers=answers: next(answers))
             assert [frames.kept(pairs[0], cache) for _ in range(2)] == [reason] * 2
+
+
+@pytest.mark.slow
+def test_terrain_from_the_command_line_on_workers(results: Path, tmp_path: Path) -> None:
+    pytest.importorskip("distributed", reason="needs the extra pancam-graph[cluster]")
+    files = []
+    for words in ([], ["--cluster", "local:1"]):
+        out = tmp_path / f"out{len(words)}"
+        shutil.copytree(results, out)
+        assert main(["terrain", str(out), "--cell", "0.05", "--reach", "5", *words]) == 0
+        files.append({path.name: path.read_bytes() for path in (out / "terrain").iterdir() if path.is_file()})
+    assert files[0].keys() == files[1].keys()
+    assert {name for name in files[0] if files[0][name] != files[1][name]} <= {"cloud.laz"}  # it has a date
