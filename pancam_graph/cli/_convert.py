@@ -13,9 +13,9 @@ __all__ = ["CONVERT"]
 _DESCRIPTION = """\
 Write results, a drive or a camera in a format of another program.
 
-IN is a folder of results, a folder that refine reads (as telemetry has it), a .cahvor file, or a .tpt or .nav
-of marsnav or an ISIS control network (.csv), which are taken into the drive of --images. The ending of OUT
-says the format (.nav, .tpt, .rvf, .csv), or --to:
+IN is a folder of results, a folder that refine reads (as telemetry has it), a .cahvor file, or a .tpt, .nav
+or .rvf of VICAR or an ISIS control network (.csv), which are taken into the drive of --images. The ending of
+OUT says the format (.nav, .tpt, .rvf, .csv), or --to:
 
   nav, nav-text    pointing corrections of marsnav, XML and text
   tpt, tpt-text    tie points of marsnav, XML and the older text
@@ -29,6 +29,7 @@ says the format (.nav, .tpt, .rvf, .csv), or --to:
   csm              CSM Frame state of each image for ISIS and the Ames Stereo Pipeline
   control-network  ISIS control network as CSV
   tables           tables of all results with sigmas, CSV
+  parquet          the same as Parquet
   traverse         a drive that refine reads, with what was taken in
 
 docs/doors.md says what each format keeps and loses.
@@ -53,8 +54,8 @@ def _add_options(parser: CommandParser) -> None:
         "--images",
         type=Path,
         metavar="FOLDER",
-        help="the folder of the pictures of a .tpt, a .nav or a control network; of results, the folder that "
-        "was refined, where it is not any more where it was then",
+        help="the folder of the pictures of a .tpt, a .nav, an .rvf or a control network; of results, the "
+        "folder that was refined, where it is not any more where it was then",
     )
     add("--overwrite", action=Flag, help="replace a file, or a folder of an older conversion, that is there")
 

@@ -37,10 +37,10 @@ def convert(
     """Write a folder or a file as a file or a folder of another program.
 
     `path` is a folder of results, a folder of a drive (as telemetry has it), a `.cahvor` file, or a `.tpt`,
-    `.nav` or control network (`.csv`), which are taken into the drive of the folder `images`. `to` is a name
-    of `DOORS`; None: the ending of `out` says it, else such a file becomes a drive. For results, `images` is
-    the folder that was refined, where it is not any more where it was then. Whole or not at all; with
-    `overwrite` an older file, or an older folder of ours, is replaced.
+    `.nav`, `.rvf` or control network (`.csv`), which are taken into the drive of the folder `images`. `to` is
+    a name of `DOORS`; None: the ending of `out` says it, else such a file becomes a drive. For results,
+    `images` is the folder that was refined, where it is not any more where it was then. Whole or not at all;
+    with `overwrite` an older file, or an older folder of ours, is replaced.
 
     Raises InputError for a format that is none, for what it cannot say, for an `out` that is there, and as
     the readers do.

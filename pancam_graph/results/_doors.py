@@ -122,6 +122,12 @@ def _tables() -> Writer:
     return write_tables
 
 
+def _parquet() -> Writer:
+    from pancam_graph.results.formats._tables import write_parquet
+
+    return write_parquet
+
+
 def _traverse() -> Writer:
     from pancam_graph.results.formats._traverse import write_drive
 
@@ -161,6 +167,7 @@ _ALL = (
         endings=(".csv",),
     ),
     Door(name="tables", says="tables of all results with sigmas, CSV", writer=_tables),
+    Door(name="parquet", says="the same as Parquet", writer=_parquet),
     Door(name="traverse", says="a drive that refine reads", writer=_traverse),
 )
 DOORS = {door.name: door for door in _ALL}

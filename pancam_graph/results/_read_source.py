@@ -23,7 +23,14 @@ from pancam_graph.data import (
     Traverse,
 )
 from pancam_graph.io import NpzFile, prefixed, read_cahvor, read_input, with_network
-from pancam_graph.io.vicar import picture_identities, read_nav, read_ties, with_pointing, with_ties
+from pancam_graph.io.vicar import (
+    picture_identities,
+    read_nav,
+    read_ties,
+    with_pointing,
+    with_rovers,
+    with_ties,
+)
 from pancam_graph.results._ply import read_points
 from pancam_graph.results._solution_json import SolutionFile
 from pancam_graph.results._solved_folder import SOLUTION_JSON, camera_poses, read_solved
@@ -240,8 +247,8 @@ def _pair(first: float | None, second: float | None) -> list[float]:
 def read_any(path: Path, images: Path | None) -> Source:
     """The source of a path: a folder of results, a folder of a drive, or a file.
 
-    A file of ties, pointings or a control network is taken into the drive of the folder `images`; any other
-    is read as a `.cahvor` file. Raises InputError as the reader does.
+    A file of ties, pointings, rover poses or a control network is taken into the drive of the folder
+    `images`; any other is read as a `.cahvor` file. Raises InputError as the reader does.
     """
     if path.is_dir():
         if (path / SOLUTION_JSON).exists():
@@ -273,6 +280,7 @@ def _with_pointing(traverse: Traverse, path: Path) -> Traverse:
 TAKEN_IN: Mapping[str, Callable[[Traverse, Path], Traverse]] = {
     ".tpt": _with_ties,
     ".nav": _with_pointing,
+    ".rvf": with_rovers,
     ".csv": with_network,
 }
 """What takes a file of another program into a drive, by the file's ending."""

@@ -1,5 +1,7 @@
 """Control networks, tables, and drives made of files of other programs: what they say in numbers."""
 
+import csv
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -110,6 +112,32 @@ def test_tables_hold_what_the_solution_does(tmp_path: Path) -> None:
     assert sorted(p.name for p in (tmp_path / "tables").iterdir()) == sorted(
         ["export.json", *(f"{n}.csv" for n in ("stops", "frames", "images", "points", "observations", "rig"))]
     )
+
+
+def test_parquet_has_the_tables_with_nulls_for_empty_cells(tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is an extra (parquet)")
+    solution = solved()
+    written(solution, tmp_path / "csv", "tables")
+    written(solution, tmp_path / "parquet", "parquet")
+    for file in (tmp_path / "csv").glob("*.csv"):
+        with file.open(newline="") as stream:
+            header, *lines = csv.reader(stream)
+        table = parquet.read_table(tmp_path / "parquet" / f"{file.stem}.parquet")
+        assert table.column_names == header
+        assert table.num_rows == len(lines)
+        for i, name in enumerate(header):
+            cells = [
+                "" if v is None else v if isinstance(v, str) else repr(v) for v in table[name].to_pylist()
+            ]
+            assert cells == [line[i] for line in lines], (file.stem, name)
+
+
+def test_parquet_without_its_package_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(
+        InputError, match=r"parquet: expected the Python package pyarrow, found none: pip inst"
+    ):
+        written(solved(), tmp_path / "parquet", "parquet")
 
 
 # --- hostile files ---

@@ -21,4 +21,5 @@ from pancam_graph.io.vicar._traverse_of_files import TieSigmas as TieSigmas
 from pancam_graph.io.vicar._traverse_of_files import image_rows as image_rows
 from pancam_graph.io.vicar._traverse_of_files import joined as joined
 from pancam_graph.io.vicar._traverse_of_files import with_pointing as with_pointing
+from pancam_graph.io.vicar._traverse_of_files import with_rovers as with_rovers
 from pancam_graph.io.vicar._traverse_of_files import with_ties as with_ties

@@ -20,11 +20,12 @@ from pancam_graph.data import (
     Traverse,
 )
 from pancam_graph.io._json import prefixed
+from pancam_graph.io._site_files import rover_poses
 from pancam_graph.io.vicar._identity import PictureIdentity, picture_identities
 from pancam_graph.io.vicar._nav_file import NavFile
 from pancam_graph.io.vicar._tie_file import PAIR_TYPES, TIE_TYPES, Tie, TieFile
 
-__all__ = ["Mark", "TieSigmas", "image_rows", "joined", "with_pointing", "with_ties"]
+__all__ = ["Mark", "TieSigmas", "image_rows", "joined", "with_pointing", "with_rovers", "with_ties"]
 
 _SITE_NAMES = {"SITE", "SITE_FRAME"}
 _IN_SITE = frozenset({1, 4, 5, 6, 7, 8})
@@ -338,6 +339,40 @@ def with_pointing(traverse: Traverse, file: NavFile, path: Path) -> Traverse:
         )
     with prefixed(path):
         return replace(traverse, frames=tuple(frames), warnings=(*traverse.warnings, *said))
+
+
+def with_rovers(traverse: Traverse, path: Path) -> Traverse:
+    """A traverse whose stops are where an `.rvf` has the rover in their site; sigmas stay.
+
+    Stops are known by site and drive of their images' labels, without labels by their rows. Raises InputError
+    for a rig that does not know where the mast is on the rover, and where no stop of the file is there.
+    """
+    mounted = traverse.rig.rover_T_mast
+    if mounted is None:
+        raise InputError(
+            f"{path}: expected a rig whose place on the rover is known (rover_T_mast), found none in "
+            f"{traverse.folder or traverse.name}"
+        )
+    identities = picture_identities(traverse)
+    place_of = {int(traverse.image_stop[row]): who.place for row, who in enumerate(identities)}
+    site = place_of[min(place_of)][0] if place_of else 0
+    poses = rover_poses(path, site)
+    stops = list(traverse.stops)
+    for row, place in place_of.items():
+        if place in poses:
+            stops[row] = replace(stops[row], world_T_mast=poses[place] * mounted)
+    n = sum(place in poses for place in place_of.values())
+    if not n:
+        known = ", ".join(f"{a}/{b}" for a, b in sorted(set(place_of.values()))[:_NAMED])
+        found = ", ".join(f"{a}/{b}" for a, b in sorted(poses)[:_NAMED]) or "none"
+        raise InputError(
+            f"{path}: expected rover poses in site {site} of the stops (site/drive {known}), found {found}"
+        )
+    said = []
+    if n < len(stops):
+        said.append(f"{path.name}: {len(stops) - n} of {len(stops)} stops are not in it and stay")
+    with prefixed(path):
+        return replace(traverse, stops=tuple(stops), warnings=(*traverse.warnings, *said))
 
 
 def _mean(first: FloatArray, apart: FloatArray) -> tuple[float, float]:

@@ -1,19 +1,21 @@
-"""Tables of all results, with sigmas: CSV, a table a kind of thing."""
+"""Tables of all results, with sigmas: CSV or Parquet, a table a kind of thing."""
 
 import csv
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from pancam_graph.base.extras import needed
 from pancam_graph.base.geometry import FloatArray, wxyz_from_rotation
 from pancam_graph.base.text import table_cell
 from pancam_graph.data import rms_px
 from pancam_graph.results._exported import write_export_json
 from pancam_graph.results.formats._source import Source
 
-__all__ = ["write_tables"]
+__all__ = ["write_parquet", "write_tables"]
 
 _POSE = ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 _PLACE = ("latitude_deg", "longitude_deg", "height_m")
@@ -26,19 +28,44 @@ def write_tables(source: Source, folder: Path) -> None:
     Numbers have all digits, a cell is empty where one is not known. Poses are of the mast and of the camera
     in the world; sigmas of a stop are of its tangent, in mast axes.
     """
-    for name, table in (
-        ("stops", _stops(source)),
-        ("frames", _frames(source)),
-        ("images", _images(source)),
-        ("points", _points(source)),
-        ("observations", _observations(source)),
-        ("rig", _rig(source)),
-    ):
+    for name, table in _tables(source):
         (folder / f"{name}.csv").write_bytes(_csv(*table))
     write_export_json(folder, "tables", {"frame": "world"})
 
 
+def write_parquet(source: Source, folder: Path) -> None:
+    """Write the tables of `write_tables` as Parquet: text, whole numbers and doubles, null where not known.
+
+    Raises InputError without the package of the extra `parquet`.
+    """
+    arrow, parquet = needed("pyarrow", "parquet"), needed("pyarrow.parquet", "parquet")
+    for name, (header, rows) in _tables(source):
+        columns = zip(*rows, strict=True)
+        cells = [list(column) for column in columns] or [[] for _ in header]
+        table = {title: _arrow(arrow, column) for title, column in zip(header, cells, strict=True)}
+        parquet.write_table(arrow.table(table), folder / f"{name}.parquet")
+    write_export_json(folder, "parquet", {"frame": "world"})
+
+
+def _arrow(arrow: Any, column: list[object]) -> Any:
+    """A column as Parquet has it; of no rows one of doubles."""
+    if any(isinstance(value, str) for value in column):
+        return arrow.array([str(value) or None for value in column], type=arrow.string())
+    if column and all(isinstance(value, int | np.integer) for value in column):
+        return arrow.array(column, type=arrow.int64())
+    return arrow.array(column, type=arrow.float64(), from_pandas=True)
+
+
 _Table = tuple[Sequence[str], Iterable[Sequence[object]]]
+
+
+def _tables(source: Source) -> Iterator[tuple[str, _Table]]:
+    yield "stops", _stops(source)
+    yield "frames", _frames(source)
+    yield "images", _images(source)
+    yield "points", _points(source)
+    yield "observations", _observations(source)
+    yield "rig", _rig(source)
 
 
 def _stops(source: Source) -> _Table:
