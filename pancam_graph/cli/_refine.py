@@ -178,6 +178,14 @@ def _add_outputs(parser: CommandParser) -> None:
         "the extra: pip install 'pancam-graph[terrain]'",
     )
     add_cluster_option(parser)
+    add(
+        "--stretches",
+        type=int,
+        default=1,
+        metavar="N",
+        help="eliminate a long drive in N stretches of its stops, one of which is in memory at a time, the "
+        "others on disk (in TMPDIR); the result is the same (%(default)s)",
+    )
     add("--csv", action=Flag, help="write residuals.csv too, a line for each observation")
     add(
         "--plots",
@@ -203,7 +211,7 @@ def _work(call: Invocation) -> int:
 
     arguments, progress = call.arguments, call.progress
     chosen: dict[str, Any] = {
-        n: getattr(arguments, n) for n in ("model", "landmarks", "method", "loss", "rig")
+        n: getattr(arguments, n) for n in ("model", "landmarks", "method", "loss", "rig", "stretches")
     }
     chosen.update(criteria(arguments.stop))
     chosen["rescale_noise"] = None if arguments.noise is None else arguments.noise == "estimated"

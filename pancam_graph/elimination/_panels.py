@@ -35,13 +35,22 @@ class Pattern:
     """For each group the first column of each of these in its panel, and the number of columns."""
 
 
-def pattern(dim: IntArray, cliques: Iterable[Iterable[int]], *, last: int | None = None) -> Pattern:
+def pattern(
+    dim: IntArray,
+    cliques: Iterable[Iterable[int]],
+    *,
+    last: int | None = None,
+    stage: IntArray | None = None,
+) -> Pattern:
     """Order of elimination by minimum degree, counted in columns, and its fill-in.
 
     `cliques` are sets of groups that some factor joins; `last` is a group that is eliminated after all others
-    whatever its degree.
+    whatever its degree. Groups of a later `stage` (groups,) are eliminated after those of earlier ones.
     """
     n = len(dim)
+    stage = np.zeros(n, dtype=np.int64) if stage is None else stage.copy()
+    if last is not None:
+        stage[last] = stage.max() + 1
     near: list[set[int]] = [set() for _ in range(n)]
     for clique in {frozenset(c) for c in cliques}:
         for g in clique:
@@ -50,10 +59,8 @@ def pattern(dim: IntArray, cliques: Iterable[Iterable[int]], *, last: int | None
     left = np.ones(n, dtype=bool)
     order: list[int] = []
     reach: list[set[int]] = [set() for _ in range(n)]
-    for i in range(n):
-        if last is not None:
-            left[last] = i == n - 1
-        g = int(np.argmin(np.where(left, degree, np.iinfo(np.int64).max)))
+    for now in np.sort(stage).tolist():
+        g = int(np.argmin(np.where(left & (stage == now), degree, np.iinfo(np.int64).max)))
         left[g] = False
         order.append(g)
         reach[g] = near[g] - {g}

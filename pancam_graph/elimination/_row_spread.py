@@ -6,6 +6,7 @@ import numpy as np
 
 from pancam_graph.base.geometry import FloatArray
 from pancam_graph.elimination._panels import Covariance
+from pancam_graph.elimination._stretched_system import StretchedSystem
 from pancam_graph.elimination._system import LandmarkSystem
 
 __all__ = ["RowSpread"]
@@ -14,7 +15,7 @@ __all__ = ["RowSpread"]
 class RowSpread:
     """Covariances of residuals of landmarks of one system; what they share is computed once."""
 
-    def __init__(self, system: LandmarkSystem, covariance: Covariance) -> None:
+    def __init__(self, system: LandmarkSystem | StretchedSystem, covariance: Covariance) -> None:
         """A system at its last linearisation, and the covariance of its variables."""
         self._system, self._covariance = system, covariance
         self._joint: dict[tuple[int, ...], FloatArray] = {}

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from itertools import pairwise
+from itertools import islice, pairwise
 from threading import local
 from typing import TypeVar
 
@@ -11,12 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
+from pancam_graph.base.scratch import Scratch
 from pancam_graph.base.threads import in_parallel
 from pancam_graph.cameras import Fields
 from pancam_graph.elimination._blocks import Block, Layout, blocks_of
 from pancam_graph.elimination._fields import FieldPart, FieldSystem
 from pancam_graph.elimination._linkage import Linkage, Posture
-from pancam_graph.elimination._panels import Covariance, Panels, pattern
+from pancam_graph.elimination._panels import Covariance, Panels, Pattern, pattern
+from pancam_graph.elimination._strays import Strays, is_halfway
 from pancam_graph.landmarks import (
     SQUARED,
     CameraViews,
@@ -24,10 +26,6 @@ from pancam_graph.landmarks import (
     Loss,
     Measurements,
     kernel,
-    over_landmarks,
-    rays_of,
-    refine,
-    triangulate,
 )
 
 __all__ = ["LandmarkSystem", "Room"]
@@ -39,24 +37,6 @@ _PARTS = 8
 work."""
 _ROOM = 6_000_000
 """Numbers in the dense systems of a wave of chunks: 48 MB."""
-_STRAY = 1.0
-"""Cost per observation beyond which a landmark is a stray and is refined: at least twice the cost by
-noise."""
-_LOST = 0.5 * 5.0**2
-"""Cost per observation after refinement, as of residuals of 5 sigma, beyond which a stray is triangulated."""
-_TOUCHED = 1e-2
-"""Relative change of its cost by a step below which a landmark is no stray."""
-_HALFWAY = (1e-3, 0.1)
-"""Relative decreases of the cost by a step between which all landmarks are refined after it. After a longer
-step only strays are; after a shorter one, back substitution places landmarks well. Between, it leaves enough
-of second order to need one more step of the cameras."""
-_REFINED = 0.1
-"""Refinement of a stray ends when its expected decrease is at most this share of its cost."""
-_CREEPING = 1e-4
-"""Both shares with a robust loss: its weights let a landmark with an outlier go on by small steps, of which
-each would need a step of the cameras."""
-_STRAY_GRAIN = 256
-"""Strays that one thread takes at once."""
 _COST_GRAIN = 8192
 """Landmarks whose cost one thread computes at once."""
 _SMALLEST_SUM = 200_000
@@ -122,11 +102,13 @@ class LandmarkSystem:
         last: int | None = None,
         refined: bool = False,
         room: Room | None = None,
+        structure: Pattern | None = None,
     ) -> None:
         """Arrange observations and landmarks; `cliques` are groups that other factors join.
 
         `last` is the group that is eliminated last; None: the one that leaves the least work. `refined`:
-        after a step all landmarks are refined, not only strays.
+        after a step all landmarks are refined, not only strays. `structure` is that of a system of which
+        these are some of the landmarks; None: they are all.
         """
         self.linkage, self.loss, self._refined = linkage, loss, refined
         self._measurements = measurements
@@ -137,7 +119,7 @@ class LandmarkSystem:
         self.vector = landmarks.vector[self.landmark_row]
         """(landmarks, 4) at the point of linearisation"""
         self.origin_m = landmarks.origin_m[self.landmark_row]
-        self.structure = pattern(linkage.group_dim, [*reach.values(), *cliques], last=last)
+        self.structure = structure or pattern(linkage.group_dim, [*reach.values(), *cliques], last=last)
         self._panels = Panels(self.structure)  # stays 0, and without memory where it is large
         self._layout = Layout.of(linkage)
         edges = np.flatnonzero(np.diff(first[self.landmark_row], prepend=-1, append=-1))
@@ -155,6 +137,8 @@ class LandmarkSystem:
         if linkage.fields is not None:
             self._fields = FieldSystem(linkage.fields, self.sights.image, self.sights.uv_px, self._begin)
         self._plain: tuple[Fields, kernel.Sights] | None = None
+        self._on_disk: Scratch | None = None
+        self._arms_on_disk: Scratch | None = None
         self._memory = room or Room()
         self._moved, self._moved_cost = np.empty_like(self.vector), np.zeros(n)
         self._has_moved = False
@@ -244,18 +228,19 @@ class LandmarkSystem:
             chain=np.ascontiguousarray(posture.chain),
         )
 
-    def linearise(self, posture: Posture) -> Panels:
+    def linearise(self, posture: Posture, into: Panels | None = None) -> Panels:
         """The reduced normal equations (S, s) of the cameras' variables.
 
         These are the normal equations of cameras and landmarks (thesis eq. 3.40) with landmarks eliminated
-        (eq. 3.42), linearised at the given posture and at the landmarks' linearisation point.
+        (eq. 3.42), linearised at the given posture and at the landmarks' linearisation point. They are added
+        to those of other landmarks, `into`, if these are given.
         """
         bearings, sights = self.bearings(posture), self._sights_at(posture.views)
         if self._rests:
-            self.reduced = self.reduced._replace(arms=np.empty(6 * len(sights.pair)))
+            self.reduced = self.reduced._replace(arms=self._room_for_arms())
         self._posture, self._rests = posture, False
         eliminate = kernel.eliminate_poses if bearings.chain.shape[1] == 6 else kernel.eliminate_calibrations
-        panels = self._panels.blank()
+        panels = into or self._panels.blank()
         for wave in self._waves:
             systems = self._room(wave)
             n_entries = sum(len(S) for S, _ in systems)
@@ -324,9 +309,40 @@ class LandmarkSystem:
             self._plain = views.fields, self.sights._replace(uv_px=np.ascontiguousarray(uv_px))
         return self._plain[1]
 
+    def _room_for_arms(self) -> FloatArray:
+        n = 6 * len(self.sights.pair)
+        if self._on_disk is None:
+            return np.empty(n)
+        self._arms_on_disk = Scratch([((n,), np.float64)])
+        return self._arms_on_disk.arrays[0]
+
+    def put_on_disk(self) -> None:
+        """Move all arrays of observations and of landmarks to a temporary file; see `let_go`."""
+        m = self._measurements
+        own = (self.vector, self.origin_m, self._moved, self._moved_cost)
+        of_m = (m.row, m.image, m.landmark, m.uv_px, m.whitening)
+        of_reduced = (self.reduced.factor, self.reduced.gamma, self.reduced.cost, self.reduced.undetermined)
+        self._on_disk = Scratch.of([*own, *of_m, *of_reduced, *self.sights])
+        stored = iter(self._on_disk.arrays)
+        self.vector, self.origin_m, self._moved, self._moved_cost = islice(stored, len(own))
+        names = ("row", "image", "landmark", "uv_px", "whitening")
+        self._measurements = replace(m, **dict(zip(names, islice(stored, len(of_m)), strict=True)))
+        factor, gamma, cost, undetermined = islice(stored, len(of_reduced))
+        self.sights = kernel.Sights(*stored)
+        self.reduced = kernel.Reduced(
+            factor=factor, gamma=gamma, arms=self._room_for_arms(), cost=cost, undetermined=undetermined
+        )
+
+    def let_go(self) -> None:
+        """Take what is on disk out of memory, until it is needed again."""
+        for stored in (self._on_disk, self._arms_on_disk):
+            if stored is not None:
+                stored.let_go()
+
     def rest(self) -> None:
         """Give back the memory of products of landmarks with cameras: what needs them linearises again."""
         self.reduced, self._memory = self.reduced._replace(arms=np.empty(0)), Room()
+        self._arms_on_disk = None
         self._rests = True
 
     def put_back(self, panels: Panels, g: int) -> tuple[FloatArray, FloatArray]:
@@ -394,6 +410,12 @@ class LandmarkSystem:
         triangulated. `posture` is that after the step. A landmark that cannot be brought in front of its
         cameras costs kernel.BEHIND_COST.
         """
+        self.follow(posture, step)
+        self.replace_strays(posture, halfway=is_halfway(self.linearised_cost, self.moved_cost))
+        return self._by_block(self._moved_cost)
+
+    def follow(self, posture: Posture, step: FloatArray) -> None:
+        """The first half of `try_step`: back substitution."""
         bearings, sights, reduced = self.bearings(posture), self._sights_at(posture.views), self.reduced
         steps = [np.append(step, 0.0)[block.source] for block in self.blocks]
         if self._fields is not None:
@@ -409,8 +431,25 @@ class LandmarkSystem:
 
         in_parallel(work, len(self.chunks), grain=1)
         self._has_moved = True
-        self._replace_strays(posture.views, bearings)
-        return self._by_block(self._moved_cost)
+
+    def replace_strays(self, posture: Posture, *, halfway: bool) -> None:
+        """The second half of `try_step`; `halfway`: all landmarks count as strays."""
+        strays = Strays(
+            measurements=self._measurements,
+            landmark_row=self.landmark_row,
+            origin_m=self.origin_m,
+            begin=self._begin,
+            loss=self.loss,
+        )
+        self.regained = strays.replace(
+            posture.views,
+            self._sights_at(posture.views),
+            self.bearings(posture),
+            self.reduced.cost,
+            self._moved,
+            self._moved_cost,
+            all_of_them=halfway or self._refined,
+        )
 
     def cost_at(self, posture: Posture) -> float:
         """True cost with landmarks at the linearisation point and cameras in another posture."""
@@ -425,72 +464,10 @@ class LandmarkSystem:
         in_parallel(work, len(cost), grain=_COST_GRAIN)
         return float(cost.sum())
 
-    def _replace_strays(self, views: CameraViews, bearings: kernel.Bearings) -> None:
-        """Place landmarks anew that a step left behind a camera or with a large cost.
-
-        A stray is refined from its place after the step; if its cost remains large, it is triangulated from
-        its rays. Halfway to the optimum all landmarks are refined.
-        """
-        sights = self._sights_at(views)
-        seen = self._seen_by(sights, bearings.cameras)
-        counts = self._counts
-        before, after = self.reduced.cost, self._moved_cost
-        # A landmark whose cost hardly changes is placed as well as before, however large its cost.
-        share, settled = (_TOUCHED, _REFINED) if self.loss.kind == kernel.NONE else (_CREEPING, _CREEPING)
-        touched = np.abs(after - before) > share * before
-        is_stray = (after > _LOST * counts) | touched & (after > _STRAY * counts)
-        least, most = _HALFWAY
-        is_halfway = least * before.sum() < before.sum() - after.sum() < most * before.sum()
-        strays = np.flatnonzero(is_stray | self._refined | is_halfway)
-        self.regained = 0.0
-        if len(strays) == 0:
-            return
-        weight, loss, refined = np.ones(len(seen.image)), self.loss, self._moved.copy()
-        given = self.origin_m, weight, loss.kind, loss.width, True, settled
-        over_landmarks(kernel.refine, strays, seen, *given, refined, grain=_STRAY_GRAIN)
-        self._take_if_better(strays, refined[strays], sights, bearings)
-
-        strays = strays[self._moved_cost[strays] > _LOST * counts[strays]]
-        if len(strays) == 0:
-            return
-        m, lost = self._measurements, np.zeros(len(counts), dtype=bool)
-        lost[self.landmark_row[strays]] = True
-        part, rows = m.part(np.flatnonzero(lost[m.landmark])), np.cumsum(lost)[self.landmark_row[strays]] - 1
-        weight = weight[: len(part.image)]
-        of_image = (part.row >= 0).astype(float)  # sensors have no rays
-        placed = triangulate(*rays_of(part, views), part.landmark, of_image)
-        placed = placed.about(self._given(self.origin_m)[lost])
-        placed = refine(placed, part, views, weight, self.loss, beyond_infinity=True)
-        self._take_if_better(strays, placed.vector[rows], sights, bearings)
-
-    def _seen_by(self, sights: kernel.Sights, cameras: kernel.Cameras) -> kernel.Seen:
-        """Observations for loops over landmarks, in the order of elimination."""
-        return kernel.Seen(
-            begin=self._begin,
-            image=sights.image,
-            uv_px=sights.uv_px,
-            whitening=sights.whitening,
-            cameras=cameras,
-        )
-
     @cached_property
     def _begin(self) -> IntArray:
         """(landmarks + 1,) first observation of each landmark in the order of elimination, and n."""
         return self.sights.occurrence_begin[self.sights.landmark_begin]
-
-    @cached_property
-    def _counts(self) -> IntArray:
-        """(landmarks,) number of observations of each landmark in the order of elimination."""
-        return np.diff(self._begin)
-
-    def _take_if_better(
-        self, strays: IntArray, vector: FloatArray, sights: kernel.Sights, bearings: kernel.Bearings
-    ) -> None:
-        cost, loss = np.empty(len(strays)), self.loss
-        kernel.landmark_costs(sights, bearings, strays, vector, self.origin_m, loss.kind, loss.width, cost)
-        better = cost < self._moved_cost[strays]
-        self.regained += float(np.sum((self._moved_cost[strays] - cost)[better]))
-        self._moved[strays[better]], self._moved_cost[strays[better]] = vector[better], cost[better]
 
     def _given(self, array: NDArray[_T]) -> NDArray[_T]:
         """Rows in the order in which landmarks were given."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray
-from pancam_graph.elimination import Panels, Posture, Root
+from pancam_graph.elimination import LandmarkSystem, Panels, Posture, Root
 from pancam_graph.graph import FactorTemplate, graph_of
 from pancam_graph.landmarks import Loss
 from pancam_graph.solve._eliminated import EliminatedSolver
@@ -70,7 +70,9 @@ class _Point:
 
     def __init__(self, problem: Problem, loss: Loss) -> None:
         self.template, self.factors, self.values = problem.template, problem.factors, problem.values
-        self.system, self.rows = system_of(problem, loss)
+        system, self.rows = system_of(problem, loss)
+        assert isinstance(system, LandmarkSystem)  # the options have seen to it
+        self.system = system
         self.n_observations = int(problem.kept.sum())
         self.held = self.template.held_by_group
         self.held_columns = all_columns(self.template.linkage, self.held)

@@ -8,10 +8,10 @@ import scipy
 from pancam_graph.base.errors import SolveError
 from pancam_graph.base.geometry import BoolArray, FloatArray
 from pancam_graph.data import State
-from pancam_graph.elimination import Covariance, FreeDirectionError, JointCovariance, LandmarkSystem, Root
+from pancam_graph.elimination import Covariance, FreeDirectionError, JointCovariance, Root
 from pancam_graph.graph import FactorTemplate, Kind, index_of, kind_of
 from pancam_graph.landmarks import Landmarks
-from pancam_graph.solve._problem import Problem
+from pancam_graph.solve._problem import EliminatedLandmarks, Problem
 from pancam_graph.solve._reduced import ReducedSystem, loosened_root
 
 __all__ = ["Uncertainty", "covariance_of", "uncertainty"]
@@ -72,7 +72,7 @@ def uncertainty(
     )
 
 
-def _linearised_at(problem: Problem, reduced: ReducedSystem, landmarks: Landmarks) -> LandmarkSystem:
+def _linearised_at(problem: Problem, reduced: ReducedSystem, landmarks: Landmarks) -> EliminatedLandmarks:
     """A problem's landmark system linearised at these landmarks; the reduced one's where they are its own."""
     if problem.landmarks is landmarks:
         return reduced.system

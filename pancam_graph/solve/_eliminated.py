@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pancam_graph.base.geometry import IntArray
-from pancam_graph.elimination import LandmarkSystem, Root
+from pancam_graph.elimination import Root
 from pancam_graph.graph import HardTemplate
 from pancam_graph.landmarks import SQUARED, CameraViews, Loss
 from pancam_graph.solve._joint import JointSystem, OnLastGroup
 from pancam_graph.solve._optimise import Iteration, Outcome, optimise
-from pancam_graph.solve._problem import Problem, Solver, system_of
+from pancam_graph.solve._problem import EliminatedLandmarks, Problem, Solver, system_of
 from pancam_graph.solve._reduced import ReducedSystem
 from pancam_graph.solve._stopping import LEFT_SIGMAS, StopRule
 
@@ -100,7 +100,7 @@ class EliminatedSolver(Solver):
         self,
         problem: Problem,
         outcome: Outcome,
-        system: LandmarkSystem,
+        system: EliminatedLandmarks,
         rows: IntArray,
         joint: Root | None = None,
         views: CameraViews | None = None,
@@ -124,7 +124,7 @@ class Ended:
 
     problem: Problem
     """The problem with its values at the optimum."""
-    system: LandmarkSystem
+    system: EliminatedLandmarks
     """The eliminated system of the observations that take part."""
     rows: IntArray
     """(n,) rows of the system's landmarks among all."""
@@ -142,7 +142,7 @@ class Ended:
         return ReducedSystem.by_root(self.system, self.rows, self.joint).firm(self.problem)
 
 
-def _gain_ahead(system: LandmarkSystem, root: Callable[[], Root]) -> float | None:
+def _gain_ahead(system: EliminatedLandmarks, root: Callable[[], Root]) -> float | None:
     """Decrease of the linearised cost by the next step; None while strays are still placed anew."""
     if system.regained > _FOLLOWING * system.moved_cost:
         return None

@@ -15,10 +15,10 @@ import gtsam
 import numpy as np
 
 from pancam_graph.base.geometry import FloatArray, IntArray
-from pancam_graph.elimination import LandmarkSystem, Linkage, Panels, Posture, Root
+from pancam_graph.elimination import Linkage, Panels, Posture, Root
 from pancam_graph.landmarks import CameraViews
 from pancam_graph.solve._optimise import MOST_DAMPING, InOrder, parameters_of
-from pancam_graph.solve._problem import Problem
+from pancam_graph.solve._problem import EliminatedLandmarks, Problem
 from pancam_graph.solve._reduced import joint_panels
 from pancam_graph.solve._stopping import StopRule
 
@@ -70,7 +70,7 @@ class JointSystem:
     The landmarks are state of this object, as in LandmarkBlocks, so it serves one optimiser at a time.
     """
 
-    def __init__(self, problem: Problem, system: LandmarkSystem) -> None:
+    def __init__(self, problem: Problem, system: EliminatedLandmarks) -> None:
         self.template, self.factors, self.system = problem.template, problem.factors, system
         self.values = problem.values
         """Values of the variables at which it is linearised"""

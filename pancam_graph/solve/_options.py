@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+import numpy as np
+
 from pancam_graph.base.errors import InputError
 from pancam_graph.data import RigTreatment, Sharing
 from pancam_graph.graph import DEFAULT_FLEX, Flex, Model, Tie
@@ -62,6 +64,10 @@ class SolveOptions(StopRule):
     """Whether the solution has the covariance of each terrain point."""
     stereo_covariances: bool = False
     """Whether the solution has covariances of places that stereo pairs see (`Solution.stereo_covariance`)."""
+    stretches: int = 1
+    """In how many stretches of successive stops the drive is eliminated: landmarks of one are in memory at
+    a time, those of the others on disk (in TMPDIR). The result is the same but for rounding. 1: all are in
+    memory. More need a rigid mast with a hard tie, eliminated landmarks and the method joint."""
 
     def __post_init__(self) -> None:
         """Check the choices."""
@@ -104,6 +110,13 @@ class SolveOptions(StopRule):
             raise InputError(
                 "field: expected none but with the model mast, a hard tie, eliminated landmarks, the joint "
                 "method and a rig that is not considered"
+            )
+        if not isinstance(self.stretches, int | np.integer) or self.stretches < 1:
+            raise InputError(f"stretches: expected a whole number of 1 or more, found {self.stretches}")
+        if self.stretches > 1 and not self.is_usual:
+            raise InputError(
+                "stretches: expected 1 but with the model mast, a hard tie, eliminated landmarks and the "
+                f"joint method; found {self.stretches}"
             )
         if not self.outlier_sigma > 0:
             raise InputError(f"outlier_sigma: expected a number above 0, found {self.outlier_sigma}")

@@ -153,6 +153,7 @@ def prepare(
         accepted=np.ones(len(measurements.row), dtype=bool),
         values=values,
         landmarks=Landmarks(vector=np.zeros((n, 4)), origin_m=np.zeros((n, 3))),
+        stretches=_stretches(traverse, options),
     ).seen_by(views)
     require_constraints(traverse, options, problem)
     return Prepared(
@@ -272,6 +273,16 @@ def _first_state(traverse: Traverse, start: Start, cameras: FreeCameras | None) 
         landmarks_m=np.zeros((0, 3)),
         rig=rig,
     )
+
+
+def _stretches(traverse: Traverse, options: SolveOptions) -> int:
+    """The number of stretches. Raises InputError where stops are fewer."""
+    if options.stretches > max(len(traverse.stops), 1):
+        raise InputError(
+            f"stretches: expected no more than there are stops ({len(traverse.stops)}), "
+            f"found {options.stretches}"
+        )
+    return options.stretches
 
 
 def _factors(template: FactorTemplate, values: gtsam.Values, factors: UserFactors | None) -> Factors:

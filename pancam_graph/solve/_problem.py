@@ -10,14 +10,17 @@ import numpy as np
 
 from pancam_graph.base.errors import SolveError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
-from pancam_graph.elimination import LandmarkSystem
+from pancam_graph.elimination import LandmarkSystem, StretchedSystem
 from pancam_graph.graph import Factors, FactorTemplate, HardTemplate, LetGo
 from pancam_graph.landmarks import SQUARED, CameraViews, Landmarks, Loss, Measurements, refine, residuals
 from pancam_graph.solve._optimise import Iteration, Outcome
 from pancam_graph.solve._stopping import StopRule
 from pancam_graph.solve._ties import Ties
 
-__all__ = ["Problem", "Solver", "reach_m", "system_of"]
+__all__ = ["EliminatedLandmarks", "Problem", "Solver", "reach_m", "system_of"]
+
+EliminatedLandmarks = LandmarkSystem | StretchedSystem
+"""The landmarks of a problem, in memory or stretch by stretch."""
 
 _FURTHEST_PARALLAX_SIGMAS = 0.01
 """World points are no farther than the distance where their parallax is this many sigmas of a pixel."""
@@ -40,6 +43,8 @@ class Problem:
     landmarks: Landmarks
     ties: Ties | None = None
     """Constraints on landmarks, by the template's sensors; None: there are none."""
+    stretches: int = 1
+    """In how many stretches the drive is eliminated; 1: in one, in memory."""
 
     @cached_property
     def views(self) -> CameraViews:
@@ -235,7 +240,7 @@ def system_of(
     cliques: Iterable[Iterable[int]] = (),
     *,
     last: int | None = None,
-) -> tuple[LandmarkSystem, IntArray]:
+) -> tuple[EliminatedLandmarks, IntArray]:
     """The landmark system of the observations that take part, and the rows of its landmarks among all.
 
     `cliques` are further sets of groups between which its square root shall have blocks; `last` is a group
@@ -256,5 +261,18 @@ def system_of(
     template = problem.template
     cliques = [*template.cliques, *problem.factors.joined(template.linkage), *cliques]
     refined = template.refines_landmarks
+    if problem.stretches > 1:
+        stretched = StretchedSystem(
+            template.linkage,
+            m,
+            landmarks,
+            loss,
+            stretches=problem.stretches,
+            n_stops=len(template.traverse.stops),
+            cliques=cliques,
+            last=last,
+            refined=refined,
+        )
+        return stretched, rows
     system = LandmarkSystem(template.linkage, m, landmarks, loss, cliques=cliques, last=last, refined=refined)
     return system, rows

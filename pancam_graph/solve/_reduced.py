@@ -7,9 +7,9 @@ import gtsam
 import numpy as np
 
 from pancam_graph.base.geometry import FloatArray, IntArray
-from pancam_graph.elimination import LandmarkSystem, Linkage, Panels, Root, Rows, with_rows
+from pancam_graph.elimination import Linkage, Panels, Root, Rows, with_rows
 from pancam_graph.graph import Factors, FactorTemplate, Kind, graph_of, kind_of
-from pancam_graph.solve._problem import Problem, system_of
+from pancam_graph.solve._problem import EliminatedLandmarks, Problem, system_of
 
 __all__ = [
     "ReducedSystem",
@@ -25,7 +25,7 @@ __all__ = [
 class ReducedSystem:
     """The system in the variables of cameras at a problem's values, all factors included."""
 
-    system: LandmarkSystem
+    system: EliminatedLandmarks
     """Of the landmarks, linearised at these values."""
     rows: IntArray
     """(n,) rows of its landmarks among all."""
@@ -35,14 +35,14 @@ class ReducedSystem:
     """Decrease of the linearised cost by the step of the cameras, as the normal equations have it."""
 
     @staticmethod
-    def by_root(system: LandmarkSystem, rows: IntArray, root: Root) -> "ReducedSystem":
+    def by_root(system: EliminatedLandmarks, rows: IntArray, root: Root) -> "ReducedSystem":
         """The same of a square root of the normal equations."""
         return ReducedSystem(system=system, rows=rows, root=root, gain=root.gain())
 
     @staticmethod
     def of(
         problem: Problem,
-        arranged: tuple[LandmarkSystem, IntArray] | None = None,
+        arranged: tuple[EliminatedLandmarks, IntArray] | None = None,
         *,
         without: Mapping[int, FloatArray] | None = None,
     ) -> "ReducedSystem":
@@ -69,7 +69,7 @@ def panels_of(problem: Problem) -> Panels:
 
 
 def landmark_panels(
-    problem: Problem, system: LandmarkSystem, *, without: Mapping[int, FloatArray] | None = None
+    problem: Problem, system: EliminatedLandmarks, *, without: Mapping[int, FloatArray] | None = None
 ) -> Panels:
     """The same, of a landmark system that exists already and is linearised again.
 
@@ -89,7 +89,7 @@ def joint_panels(template: FactorTemplate, factors: Factors, values: gtsam.Value
     return panels
 
 
-def loosened_root(problem: Problem, system: LandmarkSystem, factor: float) -> Root:
+def loosened_root(problem: Problem, system: EliminatedLandmarks, factor: float) -> Root:
     """The square root at a problem's values, with the sigmas of all priors multiplied by a factor.
 
     Ties and given factors are unchanged. `system` is the problem's, and is linearised again.
@@ -106,7 +106,7 @@ def loosened_root(problem: Problem, system: LandmarkSystem, factor: float) -> Ro
     return _firm_root(problem, system, panels.root(), factor)
 
 
-def _firm_root(problem: Problem, system: LandmarkSystem, root: Root, factor: float = 1.0) -> Root:
+def _firm_root(problem: Problem, system: EliminatedLandmarks, root: Root, factor: float = 1.0) -> Root:
     """A root, or one by QR where a weak prior of the problem is lost in rounding errors and QR keeps it.
 
     `root` is that of `loosened_root` with this factor.
@@ -119,7 +119,9 @@ def _firm_root(problem: Problem, system: LandmarkSystem, root: Root, factor: flo
     return _root_by_qr(problem, system, motion, factor)
 
 
-def _root_by_qr(problem: Problem, system: LandmarkSystem, motion: FloatArray | None, factor: float) -> Root:
+def _root_by_qr(
+    problem: Problem, system: EliminatedLandmarks, motion: FloatArray | None, factor: float
+) -> Root:
     """The square root of `loosened_root`, by QR of the rows of landmarks and of all other factors.
 
     `motion` is the common motion of all poses that images cannot tell, if there is one.
