@@ -1,6 +1,6 @@
 """Symmetric block-sparse systems: order of elimination, square root, and entries of the inverse."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import lru_cache
@@ -11,11 +11,14 @@ import numpy as np
 from pancam_graph.base.errors import SolveError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
 from pancam_graph.base.lapack import lapack
+from pancam_graph.base.scratch import Scratch
 
 __all__ = ["Covariance", "FreeDirectionError", "Panels", "Pattern", "Root", "pattern"]
 
 _RANK_TOLERANCE = 1e-12
 """A pivot counts as zero up to this share of its diagonal entry before elimination."""
+_AT_ONCE = 4_000_000
+"""Numbers of a system on disk that are in memory at a time: 32 MB."""
 _ROUNDED = 1e-9
 """A pivot below this share may be off by a percent: rounding errors reach 5e-12 of that entry."""
 
@@ -85,14 +88,19 @@ class FreeDirectionError(SolveError):
 class Panels:
     """Upper half of a symmetric system (S, s): one dense panel per group, s as a last column."""
 
-    def __init__(self, structure: Pattern) -> None:
+    def __init__(self, structure: Pattern, *, on_disk: bool = False) -> None:
+        """0; `on_disk`: in a temporary file, for structures that memory has no room for (see `let_go`)."""
         self.structure = structure
         self.width = np.array([begin[-1] + 1 for begin in structure.begin], dtype=np.int64)
         """(groups,) columns of each panel"""
         self.begin = np.zeros(len(structure.dim) + 1, dtype=np.int64)
         """(groups + 1,) first of the numbers of each panel"""
         np.cumsum(structure.dim * self.width, out=self.begin[1:])
-        self.numbers = np.zeros(int(self.begin[-1]))
+        self.scratch = Scratch([((int(self.begin[-1]),), np.float64)]) if on_disk else None
+        """Where they are on disk; None: they are in memory."""
+        self.numbers: FloatArray = (
+            np.zeros(int(self.begin[-1])) if self.scratch is None else self.scratch.arrays[0]
+        )
         """Of all panels, one after the other, row by row."""
         self.panel = self._views()
         self._place = [
@@ -102,7 +110,19 @@ class Panels:
 
     def blank(self) -> "Panels":
         """A system of the same structure that is 0."""
-        return self._with(np.zeros(len(self.numbers)))
+        twin = copy(self)
+        if self.scratch is None:
+            twin.numbers = np.zeros(len(self.numbers))
+        else:
+            twin.scratch = Scratch([(self.numbers.shape, np.float64)])
+            twin.numbers = twin.scratch.arrays[0]
+        twin.panel = twin._views()
+        return twin
+
+    def let_go(self) -> None:
+        """Take panels that are on disk out of memory, until they are needed again."""
+        if self.scratch is not None:
+            self.scratch.let_go()
 
     def _views(self) -> list[FloatArray]:
         """The panel of each group, in `numbers`."""
@@ -154,13 +174,12 @@ class Panels:
         self.panel[g][rows, -1] += right
 
     def copy(self) -> "Panels":
-        """The same system in memory of its own."""
-        return self._with(self.numbers.copy())
-
-    def _with(self, numbers: FloatArray) -> "Panels":
-        twin = copy(self)
-        twin.numbers = numbers
-        twin.panel = twin._views()
+        """The same system in memory, or on disk, of its own."""
+        twin = self.blank()
+        for begin in range(0, len(self.numbers), _AT_ONCE):
+            twin.numbers[begin : begin + _AT_ONCE] = self.numbers[begin : begin + _AT_ONCE]
+            self.let_go()
+            twin.let_go()
         return twin
 
     def hold(self, held: dict[int, IntArray]) -> None:
@@ -213,7 +232,7 @@ class Panels:
         return total
 
     def root(self) -> "Root":
-        """Square root R'R = S with R'e = s, rows by group; destroys the panels.
+        """Square root R'R = S with R'e = s, rows by group, which take the place of the panels.
 
         Rank-revealing: where S is singular, as the free gauge of position and orientation makes it with
         images alone, a group has fewer rows than columns.
@@ -222,12 +241,15 @@ class Panels:
         rows: list[FloatArray] = [np.zeros((0, 0))] * len(st.dim)
         # Pivots are compared with the diagonal before elimination: one tiny beside it is rounding.
         summed = [panel.diagonal().copy() for panel in self.panel]
+        self.let_go()
         least = 1.0
-        for g in st.order:
-            rows[g], pivot = _root_of_panel(self.panel[g], summed[g])
+        for g in _in_turn(st, st.order, self.scratch):
+            found, pivot = _root_of_panel(self.panel[g], summed[g])
+            rows[g] = self.panel[g][: len(found)]
+            rows[g][:] = found
             least = min(least, pivot)
             self._pass_on(g, rows[g])
-        return Root(structure=st, rows=tuple(rows), least_pivot=least)
+        return Root(structure=st, rows=tuple(rows), least_pivot=least, scratch=self.scratch)
 
     def _pass_on(self, g: int, rows: FloatArray) -> None:
         st = self.structure
@@ -240,6 +262,19 @@ class Panels:
         begin, after = st.begin[g] - n, st.after[g]
         for i in range(1, len(after)):
             self.add_rows(i, after, begin, update, update[:, -1])
+
+
+def _in_turn(structure: Pattern, order: Iterable[int], scratch: Scratch | None) -> Iterator[int]:
+    """Groups of an order; what is on disk of them leaves memory on the way, and at the end."""
+    held = 0
+    for g in order:
+        yield g
+        held += int(structure.dim[g] * structure.begin[g][-1])
+        if scratch is not None and held > _AT_ONCE:
+            scratch.let_go()
+            held = 0
+    if scratch is not None:
+        scratch.let_go()
 
 
 def _root_of_panel(panel: FloatArray, summed: FloatArray) -> tuple[FloatArray, float]:
@@ -282,6 +317,8 @@ class Root:
     """For each group (rank, columns of its panel + 1): R, and e as the last column."""
     least_pivot: float = 1.0
     """Smallest pivot, as a share of its diagonal entry before elimination; 1 where no digits were lost."""
+    scratch: Scratch | None = None
+    """Where rows are on disk; None: they are in memory."""
 
     @property
     def leaves_free(self) -> bool:
@@ -292,6 +329,9 @@ class Root:
     def is_rounded(self) -> bool:
         """Whether rounding errors of the normal equations may have a part in what holds some direction."""
         return self.leaves_free or self.least_pivot < _ROUNDED
+
+    def _in_turn(self, order: Iterable[int]) -> Iterator[int]:
+        return _in_turn(self.structure, order, self.scratch)
 
     def gain(self) -> float:
         """Decrease of the linearised cost by the step that solves the system: |e|^2 / 2."""
@@ -306,7 +346,7 @@ class Root:
         st = self.structure
         begin = np.concatenate([[0], np.cumsum(st.dim)])
         x = np.zeros(int(begin[-1]))
-        for g in reversed(st.order):
+        for g in self._in_turn(reversed(st.order)):
             if known is not None and g in known:
                 x[begin[g] : begin[g + 1]] = known[g]
                 continue
@@ -331,7 +371,7 @@ class Root:
         st = self.structure
         begin = np.concatenate([[0], np.cumsum(st.dim)])
         y = np.array(right, dtype=float)
-        for g in st.order:
+        for g in self._in_turn(st.order):
             n, rows = int(st.dim[g]), self.rows[g]
             if len(rows) < n:
                 raise FreeDirectionError(g, _loosest(rows[:, :n]))
@@ -356,7 +396,7 @@ class Root:
         x = np.zeros((int(begin[-1]), columns.stop - columns.start))
         x[begin[g] + columns.start : begin[g] + columns.stop] = np.eye(x.shape[1])
         x = self.forward(x)
-        for h in reversed(st.order):
+        for h in self._in_turn(reversed(st.order)):
             n, rows = int(st.dim[h]), self.rows[h]
             of_group = slice(begin[h], begin[h + 1])
             rest = np.concatenate([x[:0], *(x[begin[k] : begin[k + 1]] for k in st.after[h][1:])])
@@ -388,7 +428,8 @@ class Root:
         children = np.bincount([a[1] for a in st.after if len(a) > 1], minlength=len(st.dim))
         factors: dict[int, FloatArray] = {}
         blocks: dict[tuple[int, int], FloatArray] = {}
-        for g in reversed(st.order):
+        store = None if self.scratch is None else Panels(st, on_disk=True)
+        for g in self._in_turn(reversed(st.order)):
             n, rows, (_, *rest) = int(st.dim[g]), self.rows[g], st.after[g]
             if len(rows) < n:
                 raise FreeDirectionError(g, _loosest(rows[:, :n]))
@@ -407,9 +448,13 @@ class Root:
             if children[g]:
                 factors[g] = factor
             own = lapack().dtrmm(1.0, factor, factor[:n], side=1, trans_a=1)
+            if store is not None:
+                kept = store.panel[g][:, :-1]
+                kept[:] = own
+                own = kept
             for h, first, last in zip(st.after[g], st.begin[g], st.begin[g][1:], strict=False):
                 blocks[g, h] = own[:, first:last]
-        return Covariance(blocks)
+        return Covariance(blocks, None if store is None else store.scratch)
 
 
 def _factor_of_some(factor: FloatArray, begin: IntArray, wanted: BoolArray) -> FloatArray:
@@ -446,8 +491,15 @@ def _block(blocks: dict[tuple[int, int], FloatArray], g: int, h: int) -> FloatAr
 class Covariance:
     """Blocks of the inverse of a system, for pairs of groups that a clique joins."""
 
-    def __init__(self, blocks: dict[tuple[int, int], FloatArray]) -> None:
-        self._blocks = blocks
+    def __init__(self, blocks: dict[tuple[int, int], FloatArray], scratch: Scratch | None = None) -> None:
+        """Blocks by pairs of groups; `scratch` is where they are on disk, None: they are in memory."""
+        self._blocks, self._scratch = blocks, scratch
+        self.let_go()
+
+    def let_go(self) -> None:
+        """Take blocks that are on disk out of memory, until they are needed again."""
+        if self._scratch is not None:
+            self._scratch.let_go()
 
     def release(self, held: dict[int, IntArray]) -> None:
         """Set the variance of columns that were held to 0."""

@@ -90,9 +90,10 @@ class StretchedSystem:
 
     def linearise(self, posture: Posture) -> Panels:
         """As of a LandmarkSystem."""
-        panels = Panels(self.structure)
+        panels = Panels(self.structure, on_disk=True)
         for part in self._visits():
             part.linearise(posture, panels)
+            panels.let_go()
         return panels
 
     def try_step(self, posture: Posture, step: FloatArray) -> FloatArray:
