@@ -464,7 +464,7 @@ def test_the_cost_elsewhere_with_landmarks_held(loss: LossName) -> None:
 
 @pytest.mark.parametrize("shared", [False, True])
 def test_landmarks_follow_a_step_of_free_calibrations(shared: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pancam_graph.elimination._system._STRAY", np.inf)  # nothing is refined after it
+    monkeypatch.setattr("pancam_graph.elimination._strays._STRAY", np.inf)  # nothing is refined after it
     rigged, loss = Rigged(shared=shared), loss_of("huber")
     n = int(rigged.begin[-1])
     expected = dense_of(rigged.after, n, rigged.m, rigged.landmarks, loss)

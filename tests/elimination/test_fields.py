@@ -96,7 +96,7 @@ def test_fields_eliminate_as_dense_ones(loss: LossName) -> None:
 
 
 def test_landmarks_follow_a_step_of_fields(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pancam_graph.elimination._system._STRAY", np.inf)  # nothing is refined after it
+    monkeypatch.setattr("pancam_graph.elimination._strays._STRAY", np.inf)  # nothing is refined after it
     fielded = Fielded()
     system = LandmarkSystem(fielded.linkage, fielded.m, fielded.landmarks)
     system.linearise(fielded.posture(fielded.after(np.zeros(COLUMNS))))

@@ -10,7 +10,7 @@ import pytest
 
 from pancam_graph import SimulationOptions, SolveOptions, simulate
 from pancam_graph.base.geometry import FloatArray
-from pancam_graph.elimination import Posture
+from pancam_graph.elimination import LandmarkSystem, Posture
 from pancam_graph.factors import LandmarkBlocks
 from pancam_graph.graph import Flex, read_variable
 from pancam_graph.landmarks import CameraViews, Loss, LossName, loss_of
@@ -75,6 +75,7 @@ def dense(problem: Problem, loss: Loss) -> Dense:
 
 def blocks_of(problem: Problem, loss: Loss) -> tuple[LandmarkBlocks, gtsam.NonlinearFactorGraph]:
     system, _ = system_of(problem, loss)
+    assert isinstance(system, LandmarkSystem)
     blocks = LandmarkBlocks(system, read_variable, problem.template.posture)
     graph = gtsam.NonlinearFactorGraph()
     for factor in blocks.factors():
@@ -169,7 +170,7 @@ def test_error_where_it_is_linearised_is_half_the_squares_of_the_linear_system(
 def test_error_elsewhere_is_the_true_cost_of_the_landmarks_that_followed(
     model: str, loss: LossName, size: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pancam_graph.elimination._system._STRAY", np.inf)  # nothing is refined after it
+    monkeypatch.setattr("pancam_graph.elimination._strays._STRAY", np.inf)  # nothing is refined after it
     monkeypatch.setattr("pancam_graph.graph.SoftTemplate.refines_landmarks", False)
     problem, chosen = problem_of(model), loss_of(loss)
     expected, link = dense(problem, chosen), problem.template.linkage
@@ -275,6 +276,7 @@ def test_each_factor_holds_the_cost_of_its_own_stop_elsewhere() -> None:
 def test_an_exception_of_the_posture_reaches_the_caller_of_the_optimiser() -> None:
     problem = problem_of("hard", off=1e-3)
     system, _ = system_of(problem)
+    assert isinstance(system, LandmarkSystem)
     calls = []
 
     def posture(values: gtsam.Values) -> Posture:

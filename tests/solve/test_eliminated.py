@@ -10,7 +10,7 @@ import pytest
 
 from pancam_graph import SimulationOptions, Solution, SolveOptions, Traverse, simulate, solve
 from pancam_graph.base.geometry import HEAD_R_FORWARD_CAMERA, FloatArray
-from pancam_graph.elimination import _system
+from pancam_graph.elimination import _strays
 from pancam_graph.graph import ExplicitLandmarks, Flex, SoftTemplate
 from pancam_graph.initialise import Start
 from pancam_graph.landmarks import LossName
@@ -421,8 +421,8 @@ def test_landmarks_are_refined_halfway_to_the_optimum(monkeypatch: pytest.Monkey
     options = SimulationOptions(stops=6, pans=6, points_per_image=10)
     prepared = prepare(simulate(mer_navcam(), options, seed=1).traverse, SolveOptions(loss="none"))
     left = []
-    for band in ((1.0, 0.0), _system._HALFWAY):  # the first is empty
-        monkeypatch.setattr(_system, "_HALFWAY", band)
+    for band in ((1.0, 0.0), _strays._HALFWAY):  # the first is empty
+        monkeypatch.setattr(_strays, "_HALFWAY", band)
         costs = fit(screen(prepared)).outcome.costs
         left.append(costs[3] - costs[-1])
     assert left[0] > 1e-5
