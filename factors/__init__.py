@@ -4,7 +4,7 @@ One module a factor: `mast` (pan-tilt chain, 6 rows), `mast_projection` (a point
 rows), `camera_projection` (a point seen by a camera that is no pinhole, 2 rows), `circle` (thesis eq. 4.8, 3
 rows), `projective` (projection matrix, 12 rows), `joint_prior` (vectors with correlated errors), `encoder`
 (angles and their readings), `stop_position`, `stop_distance`, `stop_heading` (what is known of masts),
-`seen_direction` (what lies in a known direction, as the sun, at a pixel, 2 rows).
+`seen` (what lies in a known direction or at a known place, at a pixel, 2 rows).
 Factors that GTSAM has (priors of one variable, relative poses, projections of a pinhole) are taken from
 GTSAM.
 """
@@ -32,10 +32,12 @@ from pancam_graph.factors.mast_projection import mast_projection_factor as mast_
 from pancam_graph.factors.mast_projection import mast_projection_residual as mast_projection_residual
 from pancam_graph.factors.projective import projective_factor as projective_factor
 from pancam_graph.factors.projective import projective_residual as projective_residual
-from pancam_graph.factors.seen_direction import SeenPixel as SeenPixel
-from pancam_graph.factors.seen_direction import camera_direction_factor as camera_direction_factor
-from pancam_graph.factors.seen_direction import mast_direction_factor as mast_direction_factor
-from pancam_graph.factors.seen_direction import seen_direction_residual as seen_direction_residual
+from pancam_graph.factors.seen import Seen as Seen
+from pancam_graph.factors.seen import SeenDirection as SeenDirection
+from pancam_graph.factors.seen import SeenPixel as SeenPixel
+from pancam_graph.factors.seen import SeenPlace as SeenPlace
+from pancam_graph.factors.seen import camera_seen_factor as camera_seen_factor
+from pancam_graph.factors.seen import mast_seen_factor as mast_seen_factor
 from pancam_graph.factors.stop_distance import stop_distance_factor as stop_distance_factor
 from pancam_graph.factors.stop_distance import stop_distance_residual as stop_distance_residual
 from pancam_graph.factors.stop_heading import stop_heading_factor as stop_heading_factor

@@ -4,6 +4,8 @@ from pancam_graph.data._constraints import CONSTRAINTS as CONSTRAINTS
 from pancam_graph.data._constraints import EXACT as EXACT
 from pancam_graph.data._constraints import Constraint as Constraint
 from pancam_graph.data._constraints import FrameDirection as FrameDirection
+from pancam_graph.data._constraints import FramePoint as FramePoint
+from pancam_graph.data._constraints import FrameSeen as FrameSeen
 from pancam_graph.data._constraints import Landmark as Landmark
 from pancam_graph.data._constraints import LandmarkAzimuth as LandmarkAzimuth
 from pancam_graph.data._constraints import LandmarkDistance as LandmarkDistance

@@ -21,6 +21,8 @@ __all__ = [
     "EXACT",
     "Constraint",
     "FrameDirection",
+    "FramePoint",
+    "FrameSeen",
     "Landmark",
     "LandmarkAzimuth",
     "LandmarkDistance",
@@ -76,16 +78,9 @@ class Constraint:
         return () if one is None else (one,)
 
     @property
-    def frames(self) -> tuple[str, ...]:
-        """Ids of the frames that it is about."""
-        one = getattr(self, "frame", None)
-        return () if one is None else (one,)
-
-    @property
     def about(self) -> str:
         """Its kind, and what it is about, in words."""
-        things = *self.landmarks, *self.stops, *self.frames
-        return f"{self.kind} of {' and '.join(str(one) for one in things)}"
+        return f"{self.kind} of {' and '.join(str(one) for one in (*self.landmarks, *self.stops))}"
 
     def contradicts(self, other: "Constraint") -> bool:
         """Whether both are exact (sigma 0), about the same, and differ."""
@@ -416,35 +411,52 @@ class StopHeading(_Measured):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class FrameDirection(Constraint):
-    """A feature without parallax, in a known direction, at a pixel of a picture: the sun, a star, a far peak.
+class FrameSeen(Constraint):
+    """Something known at a pixel of a frame's picture."""
 
-    The direction is the apparent one: where air bends light, as it is seen from the ground.
-    """
-
-    kind = "frame-direction"
     frame: str
     """Id of the frame."""
     camera: str
     """Name of the eye that took the picture."""
     u_px: float
     v_px: float
-    """Where the feature is in the picture, of the sun the middle of its disc."""
+    """Where it is in the picture."""
     sigma_px: float
     """Standard deviation of each coordinate, pixels."""
+
+    def __post_init__(self) -> None:
+        """Check numbers."""
+        for name in ("u_px", "v_px"):
+            _number(name, getattr(self, name))
+        if _number("sigma_px", self.sigma_px) <= 0:
+            raise InputError(f"sigma_px: expected a number above 0, found {self.sigma_px}")
+
+    @property
+    def about(self) -> str:
+        """Its kind, frame and camera, in words."""
+        return f"{self.kind} of {self.frame} {self.camera}"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FrameDirection(FrameSeen):
+    """A feature without parallax, in a known direction, at a pixel of a picture: the sun, a star, a far peak.
+
+    The direction is the apparent one: where air bends light, as it is seen from the ground. Of the sun the
+    pixel is the middle of its disc.
+    """
+
+    kind = "frame-direction"
     azimuth_rad: float
     """Anticlockwise from the world's x axis, seen from above."""
     elevation_rad: float
-    """Positive upwards, between -pi / 2 and pi / 2."""
+    """Positive upwards, from -pi / 2 to pi / 2."""
     sigma_rad: float = 0.0
     """Standard deviation of the direction along each axis across it; 0: pixels alone are uncertain."""
 
     def __post_init__(self) -> None:
         """Check numbers."""
-        for name in ("u_px", "v_px", "azimuth_rad"):
-            _number(name, getattr(self, name))
-        if _number("sigma_px", self.sigma_px) <= 0:
-            raise InputError(f"sigma_px: expected a number above 0, found {self.sigma_px}")
+        super().__post_init__()
+        _number("azimuth_rad", self.azimuth_rad)
         if _number("sigma_rad", self.sigma_rad) < 0:
             raise InputError(f"sigma_rad: expected 0 (exact) or a positive number, found {self.sigma_rad}")
         if abs(_number("elevation_rad", self.elevation_rad)) > np.pi / 2:
@@ -453,21 +465,34 @@ class FrameDirection(Constraint):
             )
 
     @property
-    def about(self) -> str:
-        """Its kind, frame and camera, in words."""
-        return f"{self.kind} of {self.frame} {self.camera}"
-
-    @property
     def direction(self) -> FloatArray:
         """(3,) unit vector of the world."""
-        level = np.cos(self.elevation_rad)
-        return np.array(
-            [
-                level * np.cos(self.azimuth_rad),
-                level * np.sin(self.azimuth_rad),
-                np.sin(self.elevation_rad),
-            ]
-        )
+        a, e = self.azimuth_rad, self.elevation_rad
+        return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FramePoint(FrameSeen):
+    """A point of known position at a pixel of a picture: a fiducial that one picture alone sees."""
+
+    kind = "frame-point"
+    position_m: Sequence[float]
+    """(3,) coordinates in the world."""
+    sigma_m: float
+    """Standard deviation of each coordinate; 0: exact."""
+
+    def __post_init__(self) -> None:
+        """Check numbers."""
+        super().__post_init__()
+        if np.isnan(_three("position_m", self.position_m)).any():
+            raise InputError(f"position_m: expected three numbers, found {list(self.position_m)}")
+        if _number("sigma_m", self.sigma_m) < 0:
+            raise InputError(f"sigma_m: expected 0 (exact) or a positive number, found {self.sigma_m}")
+
+    @property
+    def place_m(self) -> FloatArray:
+        """(3,) coordinates in the world."""
+        return _three("position_m", self.position_m)
 
 
 CONSTRAINTS: tuple[type[Constraint], ...] = (
@@ -485,6 +510,7 @@ CONSTRAINTS: tuple[type[Constraint], ...] = (
     StopDistance,
     StopHeading,
     FrameDirection,
+    FramePoint,
 )
 """All kinds, in the order in which error messages name them."""
 

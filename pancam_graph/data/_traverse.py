@@ -19,7 +19,7 @@ from pancam_graph.base.arrays import float_array, int_array
 from pancam_graph.base.choices import expected_one_of, nearest, some_of
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, compose, pose_arrays
-from pancam_graph.data._constraints import Constraint, FrameDirection, Landmark
+from pancam_graph.data._constraints import Constraint, FrameSeen, Landmark
 from pancam_graph.data._matching import Matching
 from pancam_graph.data._noise import PixelNoise, mean_sigma_px
 from pancam_graph.data._points import NamedPoints
@@ -347,7 +347,7 @@ class Traverse:
             for stop in one.stops:
                 if stop not in stops:
                     raise InputError(expected_one_of(f"{where}: stop", stop, stops))
-            if isinstance(one, FrameDirection):
+            if isinstance(one, FrameSeen):
                 self._require_in_picture(one, where)
             for landmark in one.landmarks:
                 self.track_of(landmark, f"{where}: landmark")
@@ -364,8 +364,8 @@ class Traverse:
                     )
             before.append(i)
 
-    def _require_in_picture(self, one: FrameDirection, where: str) -> None:
-        """Raise InputError for a direction seen in a picture that there is not, or beside it."""
+    def _require_in_picture(self, one: FrameSeen, where: str) -> None:
+        """Raise InputError for something seen in a picture that there is not, or beside it."""
         for what, name, names in (
             ("frame", one.frame, [f.id for f in self.frames]),
             ("camera", one.camera, [eye.name for eye in self.rig.eyes]),
@@ -385,8 +385,8 @@ class Traverse:
                 f"({one.u_px:g}, {one.v_px:g})"
             )
 
-    def image_of(self, one: FrameDirection) -> int | None:
-        """Row of the image in which a feature of known direction is; None where there is no such image."""
+    def image_of(self, one: FrameSeen) -> int | None:
+        """Row of the image that something is seen in; None where there is no such image."""
         seen = one.frame, one.camera
         return next((i for i, image in enumerate(self.images) if (image.frame, image.camera) == seen), None)
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from pancam_graph.data import (
     Constraint,
-    FrameDirection,
+    FrameSeen,
     LandmarkDistance,
     StopDistance,
     StopHeading,
@@ -17,8 +17,8 @@ from pancam_graph.data import (
     Traverse,
 )
 from pancam_graph.factors import Key, stop_distance_factor, stop_heading_factor, stop_position_factor
-from pancam_graph.graph._direction_factors import require_in_sight
 from pancam_graph.graph._given import GivenFactor
+from pancam_graph.graph._seen_factors import require_in_sight
 from pancam_graph.graph._template import FactorTemplate
 
 __all__ = ["landmark_constraints", "stop_constraints"]
@@ -27,15 +27,15 @@ __all__ = ["landmark_constraints", "stop_constraints"]
 def stop_constraints(traverse: Traverse, template: FactorTemplate) -> Iterator[GivenFactor]:
     """The constraints of a traverse that are about stops and frames, on a template of its drive.
 
-    Raises InputError for a direction that its camera cannot see, or that is of no camera of the template's.
+    Raises InputError for what its camera cannot see, and for a template without lenses.
     """
     for i, one in enumerate(traverse.constraints):
         if one.landmarks:
             continue
         name = f"constraints[{i}] ({one.about})"
-        if isinstance(one, FrameDirection):
+        if isinstance(one, FrameSeen):
             require_in_sight(traverse, one, template.image_of(one), name)
-            factor: gtsam.NonlinearFactor | None = template.direction_factor(one)
+            factor: gtsam.NonlinearFactor | None = template.seen_factor(one)
         else:
             factor = _factor(one, [template.keys.mast(stop) for stop in one.stops])
         if factor is not None:

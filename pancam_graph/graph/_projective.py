@@ -18,7 +18,7 @@ from pancam_graph.cameras import (
     projection_tangents,
     split_projections,
 )
-from pancam_graph.data import ENTRIES, FrameDirection, Refined, RigCorrection, State, Traverse
+from pancam_graph.data import ENTRIES, FrameSeen, Refined, RigCorrection, State, Traverse
 from pancam_graph.elimination import Covariance, Posture
 from pancam_graph.factors import Fixed, Key, projective_factor
 from pancam_graph.graph._factors import FactorList
@@ -57,8 +57,8 @@ class ProjectiveTemplate(SoftTemplate):
         n = len(traverse.images)
         self.conditioning = _conditioning(traverse) if normalise else Conditioning.none(n)
 
-    def direction_factor(self, one: FrameDirection) -> gtsam.CustomFactor:
-        """Raise InputError: a matrix is no camera through which directions are seen."""
+    def seen_factor(self, one: FrameSeen) -> gtsam.CustomFactor:
+        """Raise InputError: a matrix has no lens."""
         raise InputError(
             f"constraints ({one.about}): expected the model mast, circle or free, found projective"
         )

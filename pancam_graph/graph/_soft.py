@@ -19,7 +19,7 @@ from pancam_graph.base.geometry import (
     pose_arrays,
     wrap_angle,
 )
-from pancam_graph.data import FrameDirection, Sharing, State, Traverse
+from pancam_graph.data import FrameSeen, Sharing, State, Traverse
 from pancam_graph.elimination import Linkage, Posture
 from pancam_graph.factors import (
     CircleOffset,
@@ -29,11 +29,11 @@ from pancam_graph.factors import (
     circle_factor,
     mast_factor,
 )
-from pancam_graph.graph._direction_factors import direction_by_camera
 from pancam_graph.graph._factors import FactorList
 from pancam_graph.graph._given import Seat
 from pancam_graph.graph._graph_options import RIGID, Flex, Model
 from pancam_graph.graph._keys import Kind, index_of, key_of
+from pancam_graph.graph._seen_factors import seen_by_camera
 from pancam_graph.graph._template import FactorTemplate, diagonal_noise
 from pancam_graph.landmarks import CameraViews
 
@@ -219,14 +219,12 @@ class SoftTemplate(FactorTemplate):
         tied = [np.flatnonzero(owner == i) for i in range(len(t.images) if apart else len(t.stops))]
         return [factor for images in tied if len(images) for factor in self.tie_factors(images)]
 
-    def direction_factor(self, one: FrameDirection) -> gtsam.CustomFactor:
+    def seen_factor(self, one: FrameSeen) -> gtsam.CustomFactor:
         """As in the base class, but by the camera's own pose, unless the tie makes that the mast's."""
         if self.flex == RIGID:
-            return super().direction_factor(one)
+            return super().seen_factor(one)
         image = self.image_of(one)
-        return direction_by_camera(
-            one, self.rig_variables, image, Key(self.camera_key(image)), self.plain_px(one)
-        )
+        return seen_by_camera(one, self.rig_variables, image, Key(self.camera_key(image)), self.plain_px(one))
 
     @property
     def has_cameras(self) -> bool:

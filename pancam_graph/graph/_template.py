@@ -12,10 +12,9 @@ import numpy as np
 
 from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.cameras import Fields, LensTable, fields_of
-from pancam_graph.data import FrameDirection, Refined, RigCorrection, Sharing, State, Traverse
+from pancam_graph.data import FrameSeen, Refined, RigCorrection, Sharing, State, Traverse
 from pancam_graph.elimination import Covariance, JointCovariance, Linkage, PosePlace, Posture, Root
 from pancam_graph.factors import Fixed, Key, Slot, encoder_factor, joint_prior_factor
-from pancam_graph.graph._direction_factors import direction_by_mast
 from pancam_graph.graph._factors import FactorList, Factors
 from pancam_graph.graph._given import GivenFactor, Seat, seated
 from pancam_graph.graph._graph_keys import GraphKeys
@@ -24,6 +23,7 @@ from pancam_graph.graph._head_flex import HeadFlex
 from pancam_graph.graph._keys import Kind, index_of, key_of, kind_of, read_variable
 from pancam_graph.graph._let_go import LetGo
 from pancam_graph.graph._rig_variables import RigVariables
+from pancam_graph.graph._seen_factors import seen_by_mast
 from pancam_graph.graph._sensors import Sensors
 from pancam_graph.landmarks import CameraViews
 
@@ -127,17 +127,17 @@ class FactorTemplate(ABC):
         return [one for one in given if one.constraint is None or not gone[one.constraint]]
 
     def own(self, given: GivenFactor) -> GivenFactor:
-        """A given factor as this template has it: a direction that a camera sees is of its own variables."""
+        """A given factor as this template has it: what a camera sees is on its own variables."""
         one = None if given.constraint is None else self.traverse.constraints[given.constraint]
-        if not isinstance(one, FrameDirection):
+        if not isinstance(one, FrameSeen):
             return given
-        return replace(given, factor=self.direction_factor(one))
+        return replace(given, factor=self.seen_factor(one))
 
-    def direction_factor(self, one: FrameDirection) -> gtsam.CustomFactor:
-        """What is seen in a known direction, on keys of which the template has seats; here by the mast."""
+    def seen_factor(self, one: FrameSeen) -> gtsam.CustomFactor:
+        """What a camera sees, on keys of which the template has seats; here by the mast."""
         image = self.image_of(one)
         stop, frame = int(self.traverse.image_stop[image]), int(self.traverse.image_frame[image])
-        return direction_by_mast(
+        return seen_by_mast(
             one,
             self.rig_variables,
             image,
@@ -147,14 +147,14 @@ class FactorTemplate(ABC):
             self.plain_px(one),
         )
 
-    def image_of(self, one: FrameDirection) -> int:
-        """Row of the image in which a direction is seen."""
+    def image_of(self, one: FrameSeen) -> int:
+        """Row of the image that something is seen in."""
         image = self.traverse.image_of(one)
         assert image is not None  # the traverse has looked
         return image
 
-    def plain_px(self, one: FrameDirection) -> FloatArray:
-        """(2,) the pixel of a direction as it would be without the smooth field of the rig's camera."""
+    def plain_px(self, one: FrameSeen) -> FloatArray:
+        """(2,) the pixel of what is seen as it would be without the smooth field of the rig's camera."""
         image = np.array([self.image_of(one)])
         (plain_px,) = self.without_field(image, np.array([[one.u_px, one.v_px]]))
         return np.asarray(plain_px)

@@ -168,6 +168,17 @@ class _StopHeading(_ConstraintEntry):
     sigma_rad: float
 
 
+class _FramePoint(_ConstraintEntry):
+    kind: Literal["frame-point"]
+    frame: Label
+    camera: Label
+    u_px: float
+    v_px: float
+    sigma_px: float
+    position_m: _Three
+    sigma_m: float
+
+
 class _FrameDirection(_ConstraintEntry):
     kind: Literal["frame-direction"]
     frame: Label
@@ -196,7 +207,8 @@ AnyConstraint = Annotated[
     | _StopPose
     | _StopDistance
     | _StopHeading
-    | _FrameDirection,
+    | _FrameDirection
+    | _FramePoint,
     Field(discriminator="kind"),
 ]
 """Any kind of constraint, as the type of an entry."""

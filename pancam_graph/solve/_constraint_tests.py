@@ -12,6 +12,7 @@ import numpy as np
 from pancam_graph.base.geometry import FloatArray
 from pancam_graph.data import (
     FrameDirection,
+    FramePoint,
     LandmarkAzimuth,
     LandmarkElevation,
     LandmarkInfinity,
@@ -182,7 +183,7 @@ def _test(
         freedom = int(shows.sum())
         square = float(np.sum((vectors[:, shows].T @ residual) ** 2 / values[shows]))
     size, unit = float(np.linalg.norm(raw)), "m"
-    if isinstance(one, StopPose | LandmarkInfinity):
+    if isinstance(one, StopPose | LandmarkInfinity | FramePoint):
         unit = ""
     elif isinstance(one, LandmarkAzimuth | LandmarkElevation | StopHeading | FrameDirection):
         size, unit = float(np.degrees(size)), "degrees"

@@ -48,7 +48,10 @@ def require_constraints(traverse: Traverse, options: SolveOptions, problem: Prob
             )
         for landmark in one.landmarks:
             if traverse.track_of(landmark, where) not in seen:
-                raise InputError(f"{where}: expected a point that two or more images see, found it in fewer")
+                raise InputError(
+                    f"{where}: expected a point that two or more images see, found it in fewer; a place or a "
+                    "direction that one image sees is a frame-point or a frame-direction"
+                )
     given = list(stop_constraints(traverse, template))
     check_given(given, template.seats(given), problem.values)
 

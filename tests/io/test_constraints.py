@@ -15,6 +15,7 @@ from pancam_graph.base.errors import InputError
 from pancam_graph.data import (
     CONSTRAINTS,
     FrameDirection,
+    FramePoint,
     LandmarkAzimuth,
     LandmarkDistance,
     LandmarkElevation,
@@ -65,6 +66,15 @@ EVERY = (
         azimuth_rad=-2.0,
         elevation_rad=0.6,
         sigma_rad=1e-4,
+    ),
+    FramePoint(
+        frame="frame00001",
+        camera="right",
+        u_px=10.0,
+        v_px=20.0,
+        sigma_px=0.5,
+        position_m=(3.0, 2.0, -1.0),
+        sigma_m=0.01,
     ),
 )
 
@@ -203,7 +213,7 @@ WRONG: dict[str, tuple[Change, str]] = {
     ),
     "contradictory exact heights": (
         lambda c: c["constraints"].extend(EXACT),
-        r"constraints\[16\] \(landmark-height\): expected what constraints\[15\] says, which is exact",
+        r"constraints\[17\] \(landmark-height\): expected what constraints\[16\] says, which is exact",
     ),
     "a surface that is not there": (entry(11, file="hills.tif"), "hills.tif: expected a GeoTIFF, found"),
     "a surface outside": (entry(11, file="../dem.tif"), "file: expected a path inside the traverse folder"),
@@ -217,7 +227,7 @@ WRONG: dict[str, tuple[Change, str]] = {
     "no distance": (entry(12, distance_m=0.0), "distance_m: expected a number above 0, found 0.0"),
     "contradictory exact distances": (
         lambda c: c["constraints"].extend(DISTANCES),
-        r"constraints\[16\] \(landmark-distance\): expected what constraints\[15\] says, which is exact",
+        r"constraints\[17\] \(landmark-distance\): expected what constraints\[16\] says, which is exact",
     ),
     "a place told in two ways": (
         entry(13, position_m=[0.0, 0.0, 0.0]),
@@ -246,6 +256,12 @@ WRONG: dict[str, tuple[Change, str]] = {
         lambda c: c["constraints"][14].pop("azimuth_rad"),
         "azimuth_rad: expected",
     ),
+    "point of a frame without a height": (
+        entry(15, position_m=[1.0, 2.0, None]),
+        r"constraints\[15\].*position_m",
+    ),
+    "point of a frame with a negative sigma": (entry(15, sigma_m=-1.0), "sigma_m: expected 0"),
+    "point beside its picture": (entry(15, v_px=-1.0), "expected pixels in a picture of 1024 x 1024"),
     "points that are not there": (
         lambda c: c.update(points="marks.csv"),
         "marks.csv: expected a file, found",

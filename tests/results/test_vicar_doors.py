@@ -18,6 +18,7 @@ from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray, rotation_from_wxyz
 from pancam_graph.cameras import CAHV, CAHVORE, cahv_of_vectors
 from pancam_graph.data import (
+    FramePoint,
     LandmarkAzimuth,
     LandmarkElevation,
     LandmarkHeight,
@@ -190,7 +191,7 @@ def test_each_type_of_tie_has_its_truth(tmp_path: Path, kind: int) -> None:
 
 
 def test_a_tie_of_each_image_is_one_fiducial(tmp_path: Path) -> None:
-    """Fiducials of the same coordinates join images without a pair; one that one image sees is left out."""
+    """Fiducials of the same coordinates join images without a pair; one image's own is of its frame."""
     t = solved().traverse
     lines = "".join(
         f'<tie type="1" left_key="{key}"><left line="{10 * y}" samp="{key}"/><xyz x="1" y="{y}" z="3"/></tie>'
@@ -201,9 +202,27 @@ def test_a_tie_of_each_image_is_one_fiducial(tmp_path: Path) -> None:
     back = with_ties(bare(solved()), read_ties(tmp_path / "f.tpt"), tmp_path / "f.tpt")
     assert back.observations is not None
     assert len(back.observations) == 4
-    (known,) = back.constraints
+    known, alone = back.constraints
     assert isinstance(known, LandmarkPosition)
     assert known.target_m.tolist() == [1, -2, -3]
+    assert isinstance(alone, FramePoint)
+    assert (alone.frame, alone.camera) == (t.images[0].frame, t.images[0].camera)
+    assert (alone.u_px, alone.v_px, alone.sigma_px, alone.sigma_m) == (7, 50, 0.5, 0.01)
+    assert list(alone.position_m) == [1, -5, -3]
+    assert alone.robust
+    assert back.warnings == bare(solved()).warnings
+
+
+def test_what_one_image_knows_of_a_point_but_its_place_is_left_out(tmp_path: Path) -> None:
+    t = solved().traverse
+    tie = '<tie type="4" left_key="7"><left line="10" samp="7"/><xy x="1" y="5"/></tie>'
+    pair = (
+        '<tie type="0" left_key="7" right_key="9"><left line="1" samp="1"/><right line="2" samp="2"/></tie>'
+    )
+    text = TIE.format(a=t.images[0].id, b=t.images[1].id, au=1, av=1, bu=2, bv=2, tie=tie + pair)
+    (tmp_path / "f.tpt").write_text(text)
+    back = with_ties(bare(solved()), read_ties(tmp_path / "f.tpt"), tmp_path / "f.tpt")
+    assert not back.constraints
     assert (
         "1 points are seen in one image alone: they are left out, and 1 constraints on them"
         in back.warnings[-1]

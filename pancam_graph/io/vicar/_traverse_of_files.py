@@ -11,6 +11,7 @@ from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray, wrap_angle
 from pancam_graph.data import (
     Constraint,
+    FramePoint,
     LandmarkAzimuth,
     LandmarkElevation,
     LandmarkHeight,
@@ -33,6 +34,8 @@ _IN_SITE = frozenset({1, 4, 5, 6, 7, 8})
 _NAMED = 3
 _SLIDES_PX = 1000.0
 """Standard deviation of a one-dimensional tie along its line."""
+_ROUND = 0.05
+"""Share of its variances by which the covariance of a place may differ from that of a sphere."""
 _SAME_POINTING_RAD = 1e-4
 """Pointings of one frame by several images that differ by less are one."""
 
@@ -121,26 +124,33 @@ def joined(
 ) -> Traverse:
     """A traverse with these points in place of its observations; `groups` are the marks of each point.
 
-    `said` has for each constraint its point, and what makes it of the point's track. Points that one image
-    sees are left out, with their constraints, and a second mark of a point in an image: warnings say how
-    many. Raises InputError where nothing joins two images.
+    `said` has for each constraint its point, and what makes it of the point's track. Of points that one image
+    sees, those of known place are `FramePoint`s; others are left out, with their constraints, and a second
+    mark of a point in an image: warnings say how many. Raises InputError where nothing joins two images.
     """
     rows: list[tuple[int, int, Mark]] = []
     track_of: dict[object, int] = {}
-    single, twice = 0, 0
+    alone: dict[object, Mark] = {}
+    twice = 0
     for group, marks in groups.items():
         first: dict[int, Mark] = {}
         for mark in marks:
             other = first.setdefault(mark.image, mark)
             twice += other.uv != mark.uv
         if len(first) < 2:
-            single += 1
+            alone.update((group, mark) for mark in first.values())
             continue
         track_of[group] = len(track_of)
         rows += [(mark.image, track_of[group], mark) for mark in first.values()]
     if not rows:
         raise InputError(f"{path}: expected points that two images or more see, found none")
-    lost = sum(group not in track_of for group, _ in said)
+    in_frames: list[tuple[object, FramePoint]] = []
+    for group, make in said:
+        one = _in_frame(traverse, alone[group], make(0)) if group in alone else None
+        if one is not None:
+            in_frames.append((group, one))
+    lost = sum(group not in track_of for group, _ in said) - len(in_frames)
+    single = len(alone) - len({group for group, _ in in_frames})
     notes = list(warnings)
     if single:
         and_ties = f", and {lost} constraints on them" if lost else ""
@@ -161,10 +171,38 @@ def joined(
         return replace(
             traverse,
             observations=observations if plain else observations.with_covariance(covariance),
-            constraints=(*(c for c in traverse.constraints if not c.landmarks), *constraints),
+            constraints=(
+                *(c for c in traverse.constraints if not c.landmarks),
+                *constraints,
+                *(one for _, one in in_frames),
+            ),
             points=None,
             warnings=(*traverse.warnings, *notes),
         )
+
+
+def _in_frame(traverse: Traverse, mark: Mark, constraint: Constraint) -> FramePoint | None:
+    """What a constraint says of a point that one image alone sees; None where that is nothing of the image.
+
+    A place whose covariance is not that of a sphere is none.
+    """
+    if not isinstance(constraint, LandmarkPosition) or len(constraint.axes) < len("xyz"):
+        return None
+    covariance, image = constraint.covariance, traverse.images[mark.image]
+    sigma = float(np.sqrt(np.trace(covariance) / 3))
+    if np.abs(covariance - sigma**2 * np.eye(3)).max() > _ROUND * sigma**2:
+        return None
+    uu, _, vv = mark.covariance_px2
+    return FramePoint(
+        frame=image.frame,
+        camera=image.camera,
+        u_px=mark.uv[0],
+        v_px=mark.uv[1],
+        sigma_px=float(np.sqrt((uu + vv) / 2)),
+        position_m=tuple(constraint.target_m.tolist()),
+        sigma_m=sigma,
+        robust=constraint.robust,
+    )
 
 
 def with_ties(traverse: Traverse, file: TieFile, path: Path, sigmas: TieSigmas = TIE_SIGMAS) -> Traverse:

@@ -1,4 +1,4 @@
-"""What is seen in known directions, as factors on the cameras of a template, through their real lenses."""
+"""What cameras see in known directions and at known places, as factors, through their real lenses."""
 
 import gtsam
 import numpy as np
@@ -6,26 +6,31 @@ import numpy as np
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray
 from pancam_graph.cameras import FIELD_COEFFICIENTS, FIELD_SHAPE, Fields, without_field
-from pancam_graph.data import FrameDirection, Traverse
+from pancam_graph.data import FrameDirection, FramePoint, FrameSeen, Traverse
 from pancam_graph.factors import (
     Fixed,
     Key,
     PoseSlot,
+    Seen,
+    SeenDirection,
     SeenPixel,
+    SeenPlace,
     Slot,
-    camera_direction_factor,
-    mast_direction_factor,
+    camera_seen_factor,
+    mast_seen_factor,
 )
 from pancam_graph.graph._rig_variables import RigVariables
 
-__all__ = ["direction_by_camera", "direction_by_mast", "require_in_sight"]
+__all__ = ["require_in_sight", "seen_by_camera", "seen_by_mast"]
 
 _IN_SIGHT = 3.0
 """Sigmas of telemetry by which a camera may be turned away from what it sees."""
+_LEAST_M = 1e-3
+"""Range from which on a place has a direction."""
 
 
-def direction_by_mast(
-    one: FrameDirection,
+def seen_by_mast(
+    one: FrameSeen,
     rig: RigVariables,
     image: int,
     mast: Slot,
@@ -41,9 +46,8 @@ def direction_by_mast(
         eye = int(t.image_eye[image])
         field, by_field = Key(rig.field_keys[eye]), _field_rows(t, eye, one)
     pixel, calibration = _pixel(rig, image, plain_px, by_field)
-    return mast_direction_factor(
-        _noise(one, pixel),
-        pixel,
+    return mast_seen_factor(
+        _seen(one, pixel),
         mast,
         pan_tilt,
         rig.mount_slot(image),
@@ -51,20 +55,19 @@ def direction_by_mast(
         calibration,
         field,
         head,
-        direction=one.direction,
     )
 
 
-def direction_by_camera(
-    one: FrameDirection, rig: RigVariables, image: int, camera: Slot, plain_px: FloatArray
+def seen_by_camera(
+    one: FrameSeen, rig: RigVariables, image: int, camera: Slot, plain_px: FloatArray
 ) -> gtsam.CustomFactor:
     """The factor on the pose of the camera, and on its calibration where that is free."""
     pixel, calibration = _pixel(rig, image, plain_px, None)
-    return camera_direction_factor(_noise(one, pixel), pixel, camera, calibration, direction=one.direction)
+    return camera_seen_factor(_seen(one, pixel), camera, calibration)
 
 
-def require_in_sight(traverse: Traverse, one: FrameDirection, image: int, where: str) -> None:
-    """Raise InputError for a pixel outside the domain of its lens, or a direction behind the camera.
+def require_in_sight(traverse: Traverse, one: FrameSeen, image: int, where: str) -> None:
+    """Raise InputError for a pixel outside the domain of its lens, or what lies behind the camera.
 
     It lies there if it is a right angle or more off the line of sight, and telemetry is not that uncertain.
     """
@@ -75,17 +78,25 @@ def require_in_sight(traverse: Traverse, one: FrameDirection, image: int, where:
             f"{where}: expected a pixel that the lens of {one.camera} has a line of sight for, found none at "
             f"({one.u_px:g}, {one.v_px:g})"
         )
-    rotations, _ = traverse.camera_poses()
-    cosine = float(rotations[image] @ rays.direction[0] @ one.direction)
-    off = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
-    sigmas = [
-        traverse.stops[int(traverse.image_stop[image])].sigma_rotation_rad,
-        *traverse.frames[int(traverse.image_frame[image])].sigmas_rad,
-    ]
+    rotations, centres = traverse.camera_poses()
+    stop = traverse.stops[int(traverse.image_stop[image])]
+    sigmas = [stop.sigma_rotation_rad, *traverse.frames[int(traverse.image_frame[image])].sigmas_rad]
+    if isinstance(one, FramePoint):
+        arm = one.place_m - centres[image]
+        distance = max(float(np.linalg.norm(arm)), _LEAST_M)
+        direction = arm / distance
+        sigmas.append(stop.sigma_translation_m / distance)
+    else:
+        assert isinstance(one, FrameDirection)  # there are no others
+        direction = one.direction
+    off = float(np.arccos(np.clip(rotations[image] @ rays.direction[0] @ direction, -1.0, 1.0)))
     if off > max(np.pi / 2, _IN_SIGHT * float(np.linalg.norm(sigmas))):
+        what, hint = "place", ""
+        if isinstance(one, FrameDirection):
+            what, hint = "direction", " (azimuths count anticlockwise from the world's x axis)"
         raise InputError(
-            f"{where}: expected a direction in front of the camera, found one {np.degrees(off):.0f} degrees "
-            "off its line of sight by telemetry (azimuths count anticlockwise from the world's x axis)"
+            f"{where}: expected a {what} in front of the camera, found one {np.degrees(off):.0f} degrees "
+            f"off its line of sight by telemetry{hint}"
         )
 
 
@@ -101,12 +112,14 @@ def _pixel(
     return SeenPixel(lens, t.calibration[image], plain_px, basis=basis, field=field), slot
 
 
-def _noise(one: FrameDirection, pixel: SeenPixel) -> gtsam.noiseModel.Base:
-    covariance = one.sigma_px**2 * pixel.covariance_per_px2 + one.sigma_rad**2 * np.eye(2)
-    return gtsam.noiseModel.Gaussian.Covariance(covariance)
+def _seen(one: FrameSeen, pixel: SeenPixel) -> Seen:
+    if isinstance(one, FramePoint):
+        return SeenPlace(pixel, one.place_m, sigma_px=one.sigma_px, sigma_m=one.sigma_m)
+    assert isinstance(one, FrameDirection)  # there are no others
+    return SeenDirection(pixel, one.direction, sigma_px=one.sigma_px, sigma_rad=one.sigma_rad)
 
 
-def _field_rows(traverse: Traverse, eye: int, one: FrameDirection) -> FloatArray:
+def _field_rows(traverse: Traverse, eye: int, one: FrameSeen) -> FloatArray:
     """(2, coefficients) the field of an eye at the pixel, by its coefficients."""
     camera, first = traverse.rig.eyes[eye].camera, np.zeros(1, dtype=np.int64)
     size_px = np.array([[camera.width_px, camera.height_px]], dtype=float)
