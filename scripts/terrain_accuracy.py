@@ -23,6 +23,12 @@ def main() -> int:
     add("--rig", default="mer-navcam", help="template of the cameras (%(default)s)")
     add("--seeds", type=int, nargs="+", default=[0], help="another seed, another world (0)")
     add("--pans", type=int, default=10, help="frames a stop (%(default)s)")
+    add(
+        "--rig-error",
+        choices=("none", "drawn"),
+        default="none",
+        help="drawn: the rig that is told is off as its uncertainty says (%(default)s)",
+    )
     add("--folder", type=Path, help="where drives and results stay (nowhere)")
     add("--json", type=Path, help="file for all figures")
     arguments = parser.parse_args()
@@ -31,7 +37,11 @@ def main() -> int:
         folder = arguments.folder or Path(nowhere)
         for seed in arguments.seeds:
             print(f"{arguments.rig}, seed {seed}", file=sys.stderr)
-            found.append(measure_terrain(arguments.rig, seed, folder, pans=arguments.pans))
+            found.append(
+                measure_terrain(
+                    arguments.rig, seed, folder, pans=arguments.pans, rig_error=arguments.rig_error
+                )
+            )
     if arguments.json is not None:
         arguments.json.write_text(dumps([asdict(one) for one in found], indent=1))
     print(table(found))

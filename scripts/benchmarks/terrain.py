@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -96,13 +96,22 @@ class Measures:
     terrain: Process
 
 
-def measure_terrain(rig: str, seed: int, folder: Path, *, pans: int = 10, pictures: int = 6) -> Measures:
+def measure_terrain(
+    rig: str,
+    seed: int,
+    folder: Path,
+    *,
+    pans: int = 10,
+    pictures: int = 6,
+    rig_error: Literal["none", "drawn"] = "none",
+) -> Measures:
     """Render a drive of two stops 5 m apart, refine it, make terrain, each as a process, and compare.
 
     `folder` gets drive and results; a drive that an earlier run left there is used again. Disparities are
-    compared in `pictures` of the stereo frames, evenly chosen. Raises InputError where the program fails.
+    compared in `pictures` of the stereo frames, evenly chosen. `rig_error` as in `RenderOptions`. Raises InputError where the program fails.
     """
-    rendering = render(rig_template(rig), RenderOptions(stops=2, spacing_m=5.0, pans=pans), seed=seed)
+    options = RenderOptions(stops=2, spacing_m=5.0, pans=pans, rig_error=rig_error)
+    rendering = render(rig_template(rig), options, seed=seed)
     drive, out = folder / f"{rig}-{seed}", folder / f"{rig}-{seed}-out"
     if not drive.exists():
         write_rendering(rendering, drive)
