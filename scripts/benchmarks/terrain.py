@@ -108,7 +108,8 @@ def measure_terrain(
     """Render a drive of two stops 5 m apart, refine it, make terrain, each as a process, and compare.
 
     `folder` gets drive and results; a drive that an earlier run left there is used again. Disparities are
-    compared in `pictures` of the stereo frames, evenly chosen. `rig_error` as in `RenderOptions`. Raises InputError where the program fails.
+    compared in `pictures` of the stereo frames, evenly chosen. `rig_error` is as in `RenderOptions`. Raises
+    InputError where the program fails.
     """
     options = RenderOptions(stops=2, spacing_m=5.0, pans=pans, rig_error=rig_error)
     rendering = render(rig_template(rig), options, seed=seed)
