@@ -13,7 +13,7 @@ from pancam_graph.base.threads import in_parallel
 from pancam_graph.terrain import kernel
 from pancam_graph.terrain._rectify import Rectified
 
-__all__ = ["Match", "disparity_limits", "match", "rectified_picture", "refined"]
+__all__ = ["Match", "disparity_limits", "match", "rectified_picture", "refined", "roughness"]
 
 _BLUR_PX = 0.3
 """Blur of what slanted windows compare: more of it hides the detail that says most, and with none the noise
@@ -24,10 +24,11 @@ _BLOCK_PX = 5
 _MARGIN_PX = 3
 _AGREE_PX = 1.5
 """By how much the disparities that each picture finds in the other may differ."""
-_PER_SPREAD, _LEAST_SIGMA_PX = 1.65, 0.02
-"""Standard deviation of a disparity over the spread of its windows, and what is added to it in squares.
-Windows look unlike for their relief, several of their pixels for the same reason: from rendered images with
-truth (docs/terrain.md)."""
+_PER_SPREAD, _PER_ROUGHNESS, _LEAST_SIGMA_PX = 0.64, 1.2, 0.02
+"""Standard deviation of a disparity over the spread of its windows, over the roughness around it, and what is
+added to both in squares: from rendered images with truth (docs/terrain.md)."""
+_ROUGH_PX = 4
+"""Pixels to each side over which roughness is taken: windows have 3, their neighbours' centres one more."""
 _GRAIN = 64
 
 
@@ -81,8 +82,36 @@ def match(
     inside = (at >= 0) & (at < left.shape[1])
     seen = there[0] & inside & np.take_along_axis(there[1], np.where(inside, at, 0), axis=1)
     disparity = np.where(seen, disparity, np.float32(np.nan))
-    sigma = np.sqrt((_PER_SPREAD * spread) ** 2 + _LEAST_SIGMA_PX**2)
+    rough = roughness(disparity)
+    sigma = np.sqrt((_PER_SPREAD * spread) ** 2 + (_PER_ROUGHNESS * rough) ** 2 + _LEAST_SIGMA_PX**2)
     return Match(disparity_px=disparity, sigma_px=sigma.astype(np.float32), grey=left)
+
+
+def roughness(disparity_px: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Root mean square (h, w) of disparities about a plane through those of the square around each pixel.
+
+    A window takes the surface for a plane: what it misses errs as the surface bends. Of pixels without a
+    disparity, and outside, nothing counts; slopes along rows and columns are fitted each for itself.
+    """
+    r = _ROUGH_PX
+    along, flat = np.arange(-r, r + 1.0), np.ones(2 * r + 1)
+    seen = np.isfinite(disparity_px)
+    weight = seen.astype(np.float64)
+    middle = float(np.median(disparity_px[seen])) if seen.any() else 0.0
+    # About a value in their midst, so that squares lose no digits.
+    value = np.where(seen, disparity_px - middle, 0.0)
+
+    def summed(values: FloatArray, across: FloatArray, down: FloatArray) -> FloatArray:
+        return np.asarray(cv2.sepFilter2D(values, cv2.CV_64F, across, down, borderType=cv2.BORDER_CONSTANT))
+
+    n = np.maximum(summed(weight, flat, flat), 1.0)
+    mean = summed(value, flat, flat) / n
+    variance = summed(value**2, flat, flat) / n - mean**2
+    for across, down in ((along, flat), (flat, along)):
+        place = summed(weight, across, down) / n
+        spread = np.maximum(summed(weight, across**2, down**2) / n - place**2, 1e-9)
+        variance -= (summed(value, across, down) / n - place * mean) ** 2 / spread
+    return np.sqrt(np.maximum(variance, 0.0)).astype(np.float32)
 
 
 def _started(

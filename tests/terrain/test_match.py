@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pancam_graph.base.geometry import FloatArray
-from pancam_graph.terrain._match import match, refined
+from pancam_graph.terrain._match import match, refined, roughness
 
 ROWS, COLUMNS = 48, 120
 SPANS_PX = (3.1, 4.3, 5.7, 7.9, 11.3)
@@ -82,3 +82,31 @@ def test_what_one_eye_does_not_see_has_no_disparity() -> None:
     assert np.isfinite(off[seen]).mean() > 0.98
     assert np.nanquantile(off[seen], 0.99) < 0.1
     assert np.isnan(found.disparity_px[hidden]).mean() > 0.8
+
+
+def test_a_plane_is_smooth_and_what_bends_is_as_rough_as_it_bends() -> None:
+    y, x = np.mgrid[:40, :60].astype(np.float32)
+    plane = 200 + 0.13 * y - 0.05 * x
+    np.testing.assert_allclose(roughness(plane)[4:-4, 4:-4], 0, atol=5e-4)
+    bumps = (plane + np.random.default_rng(0).normal(0, 0.3, plane.shape)).astype(np.float32)
+    assert np.sqrt(np.mean(roughness(bumps)[4:-4, 4:-4] ** 2)) == pytest.approx(
+        0.3 * np.sqrt(1 - 3 / 81), rel=0.03
+    )
+    # Of a parabola x^2 / 2 of the rate c: the root mean square of c (x^2 - <x^2>) / 2 over -4 to 4.
+    bend = 0.01
+    square = np.arange(-4, 5.0) ** 2
+    expected = bend / 2 * np.std(square)
+    bent = (plane + 0.5 * bend * (x - 30) ** 2).astype(np.float32)
+    np.testing.assert_allclose(roughness(bent)[4:-4, 4:-4], expected, rtol=1e-3)
+
+
+def test_holes_and_edges_do_not_make_it_rough() -> None:
+    y, x = np.mgrid[:40, :60].astype(np.float32)
+    plane = 20 + 0.13 * y - 0.05 * x
+    plane[10:15, 20:33] = np.nan
+    plane[np.random.default_rng(1).random(plane.shape) < 0.2] = np.nan
+    rough = roughness(plane)
+    assert np.isfinite(rough).all()
+    # With holes the two slopes are not independent: fitted each for itself, they leave some of each other.
+    assert np.quantile(rough, 0.9) < 0.08
+    assert (roughness(np.full((12, 12), np.nan, dtype=np.float32)) == 0).all()
