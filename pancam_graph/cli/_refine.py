@@ -286,7 +286,7 @@ def _work(call: Invocation) -> int:
             from pancam_graph.terrain import TerrainOptions
 
             results["terrain"] = TerrainOptions()
-        with workers(call) if arguments.terrain else nullcontext() as client:
+        with workers(call) if arguments.terrain or arguments.mosaic else nullcontext() as client:
             solution = write_results(
                 solution, arguments.out, **results, progress=progress.counted, client=client
             )

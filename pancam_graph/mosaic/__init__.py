@@ -2,7 +2,6 @@
 
 from pancam_graph.mosaic._files import MOSAIC_INDEX as MOSAIC_INDEX
 from pancam_graph.mosaic._files import MOSAIC_PAGE as MOSAIC_PAGE
-from pancam_graph.mosaic._files import Blink as Blink
 from pancam_graph.mosaic._files import WrittenMosaics as WrittenMosaics
 from pancam_graph.mosaic._files import write_mosaics as write_mosaics
 from pancam_graph.mosaic._make import Mosaic as Mosaic
@@ -13,3 +12,4 @@ from pancam_graph.mosaic._projections import Cylinder as Cylinder
 from pancam_graph.mosaic._projections import Ground as Ground
 from pancam_graph.mosaic._seam_error import Overlap as Overlap
 from pancam_graph.mosaic._seam_error import SeamError as SeamError
+from pancam_graph.mosaic._stop_files import Blink as Blink

@@ -1,10 +1,12 @@
 """What the folder of results must know of an output; each output's module fills in an `OutputWriter`."""
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
+from pancam_graph.base.errors import ClusterError
 from pancam_graph.data import Solution, Traverse
 from pancam_graph.results._older import ONE_FILE, Older
 
@@ -14,6 +16,9 @@ if TYPE_CHECKING:  # these import OpenCV, and names of outputs must be cheap
     from pancam_graph.terrain import TerrainOptions, WrittenTerrain
 
 __all__ = ["Output", "OutputWriter", "Written"]
+
+_LOG = logging.getLogger(__name__)
+_MadeT = TypeVar("_MadeT")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,6 +44,19 @@ class Written:
     """The mosaics, once they are written."""
     terrain: "WrittenTerrain | None" = None
     """The terrain, once it is written."""
+
+    def made_with_workers(self, make: Callable[[Any], _MadeT]) -> _MadeT:
+        """What `make` returns with the client; without it where workers or scheduler fail.
+
+        A solve that took long must not be lost for them, and the log has a warning.
+        """
+        if self.client is None:
+            return make(None)
+        try:
+            return make(self.client)
+        except ClusterError as error:
+            _LOG.warning("%s; this process goes on alone", error)
+            return make(None)
 
 
 def _anything(traverse: Traverse) -> None:

@@ -2,11 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from pancam_graph import report
-from pancam_graph.base.errors import ClusterError, InputError
+from pancam_graph.base.errors import InputError
 from pancam_graph.base.whole_files import whole_folder
 from pancam_graph.data import Traverse
 from pancam_graph.images import cache_folder
@@ -73,16 +74,12 @@ def _write(written: Written, folder: Path) -> Written:
     options, solution = written.terrain_options, written.solution
     assert options is not None  # without options nobody asked for terrain
     try:
-        terrain = make_terrain(
-            drive_of(solution),
-            options,
-            progress=written.progress,
-            cache=cache_folder(written.out),
-            client=written.client,
-        )
+        drive, cache = drive_of(solution), cache_folder(written.out)
+        made = partial(make_terrain, drive, options, progress=written.progress, cache=cache)
+        terrain = written.made_with_workers(lambda client: made(client=client))
         shown = _fill(terrain, solution.traverse, folder, options, written.progress)
         warnings = shown.warnings
-    except (InputError, ClusterError) as error:  # a solve that took long must not be lost for it
+    except InputError as error:  # a solve that took long must not be lost for it
         shown, warnings = None, (str(error),)
         folder.rmdir()
     warned = replace(solution, warnings=(*solution.warnings, *warnings))
