@@ -15,7 +15,7 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, axes_across, rz
+from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray, axes_across, rz, skew
 from pancam_graph.cameras import SURFACE_HEAD, Fields, LensTable, Sensor
 from pancam_graph.data import (
     EXACT,
@@ -42,6 +42,8 @@ _PER_M = 1e-6
 """Sigma of the inverse distance, 1/m, of a point that is at infinity."""
 _LOOSE_M = 1e4
 """Sigma of priors that hold a variable of a point where no observation does."""
+_UP = np.eye(3)[:, [2, 0, 1]]
+"""(3, 3) axes of a sensor that sees heights."""
 _MARGIN = 32
 """Nodes of a surface that compiled loops have beyond the first places of points on it."""
 
@@ -89,7 +91,7 @@ def sights_of(traverse: Traverse) -> list[Sight]:
 
 def _held(track: int) -> Iterator[Sight]:
     """The three coordinates of a point, as they are at the place of its variable."""
-    for axes, n in ((np.eye(3), 2), (np.eye(3)[:, [2, 0, 1]], 1)):
+    for axes, n in ((np.eye(3), 2), (_UP, 1)):
         yield Sight(-1, track, Sensor.COORDINATES, axes, np.zeros(3), -1, np.zeros(2), np.full(n, EXACT))
 
 
@@ -148,9 +150,11 @@ def _row(traverse: Traverse, stop: str) -> int:
 
 def _rotation(along: FloatArray) -> FloatArray:
     """A rotation (3, 3) whose first columns are these one or two (3, k) orthonormal ones."""
+    if along.shape[1] == 1 and along[2, 0] == 1:
+        return _UP
     first = along[:, 0]
     second = along[:, 1] if along.shape[1] > 1 else axes_across(first[None])[0, 0]
-    return np.column_stack([first, second, np.cross(first, second)])
+    return np.column_stack([first, second, skew(first) @ second])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

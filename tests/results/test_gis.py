@@ -125,3 +125,27 @@ def test_geojson_and_kml_have_the_same_places(solution: Solution, tmp_path: Path
     assert first == pytest.approx(np.array(at[0]), abs=1e-3)
     listed = json.loads((folder / "export.json").read_text())["files"]
     assert {"drive.gpkg", "drive.kml", "stops.geojson", "landmarks.geojson"} <= set(listed)
+
+
+def test_gdal_opens_all_layers_with_their_places(solution: Solution, tmp_path: Path) -> None:
+    """A reader that is not ours: GDAL, as the package pyogrio has it."""
+    gdal = pytest.importorskip("pyogrio", reason="GDAL (pyogrio) is not installed")
+    write_results(placed(solution), tmp_path / "out", report=False, exports=("gis",))
+    folder = tmp_path / "out" / "gis"
+    layers = dict(gdal.list_layers(folder / "drive.gpkg").tolist())
+    assert {name: kind.removesuffix(" Z") for name, kind in layers.items()} == {
+        "stops": "Point",
+        "drive": "LineString",
+        "ellipses": "Polygon",
+        "views": "Polygon",
+        "landmarks": "Point",
+    }
+    world = np.array([pose.translation() for pose in solution.final.world_T_mast])
+    expected = SITE.geographic(world)[:, [1, 0]]
+    for file, layer in ((folder / "drive.gpkg", "stops"), (folder / "stops.geojson", None)):
+        info = gdal.read_info(file, layer=layer)
+        assert info["features"] == len(solution.traverse.stops)
+        assert "Mars" in info["crs"]
+        _, _, geometry, _ = gdal.raw.read(file, layer=layer)
+        places = np.array([np.frombuffer(one[5:21], dtype="<f8") for one in geometry])
+        assert places == pytest.approx(expected, abs=1e-9)
