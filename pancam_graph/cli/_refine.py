@@ -13,8 +13,10 @@ from pancam_graph.cli._parser import Assignment, CommandParser, Flag, LateChoice
 from pancam_graph.cli._workers import add_cluster_option, workers
 
 if TYPE_CHECKING:
-    from pancam_graph.data import Traverse
+    from pancam_graph import SolveOptions
+    from pancam_graph.data import Solution, Traverse
     from pancam_graph.initialise import Start
+    from pancam_graph.smoother import TraverseSmoother
 
 __all__ = ["REFINE", "started"]
 
@@ -257,13 +259,9 @@ def _work(call: Invocation) -> int:
         read_s = time.perf_counter() - begin
         if must_compile():
             progress.say(COMPILING)
+        smoother = None
         if arguments.incremental:
-            from pancam_graph.smoother import solve_incrementally
-
-            n_stops = len(traverse.stops)
-            solution = solve_incrementally(
-                traverse, options, on_stop=lambda update: progress.stop(update, n_stops)
-            )
+            solution, smoother = _stop_by_stop(call, traverse, options)
         else:
             solution = solve(traverse, options, start=start, on_iteration=progress.iteration)
         solution = solution.with_seconds(read=read_s)
@@ -277,6 +275,7 @@ def _work(call: Invocation) -> int:
             "report": arguments.report,
             "csv": arguments.csv,
             "exports": arguments.export,
+            "smoother": smoother,
         }
         if arguments.mosaic:
             from pancam_graph.mosaic import MosaicOptions
@@ -297,6 +296,27 @@ def _work(call: Invocation) -> int:
             write_plots(solution, arguments.plots)
     print_summary(solution, str(arguments.out), quiet=arguments.quiet)
     return 0 if solution.passed else 1
+
+
+def _stop_by_stop(
+    call: Invocation, traverse: "Traverse", options: "SolveOptions"
+) -> "tuple[Solution, TraverseSmoother]":
+    """The solution with stops added one by one; with --add those that the smoother of OUT lacks alone."""
+    from pancam_graph.results import SMOOTHER_FILE
+    from pancam_graph.smoother import continued, smoother_for, solve_incrementally
+
+    smoother, n_stops = None, len(traverse.stops)
+    kept = call.arguments.out / SMOOTHER_FILE
+    if call.arguments.add and kept.exists():
+        smoother, why = continued(kept, traverse, options)
+        if smoother is None:
+            call.say(f"all stops are added anew: {why}")
+    if smoother is None:
+        smoother = smoother_for(traverse, options)
+    solution = solve_incrementally(
+        traverse, options, on_stop=lambda update: call.progress.stop(update, n_stops), smoother=smoother
+    )
+    return solution, smoother
 
 
 def started(traverse: "Traverse", path: Path, *, incremental: bool) -> "tuple[Traverse, Start]":

@@ -152,7 +152,10 @@ def rms_px(residuals_px: FloatArray) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Incremental:
-    """Effort of each update of a smoother, in the order of the stops."""
+    """Effort of each update of a smoother, in the order of the stops.
+
+    Stops that an earlier run had added count with no time, and with the cost that it ended with.
+    """
 
     seconds_per_stop: tuple[float, ...]
     cost_per_stop: tuple[float, ...]

@@ -17,6 +17,7 @@ from pancam_graph.results._results import recover_results as recover_results
 from pancam_graph.results._results import write_results as write_results
 from pancam_graph.results._rig import calibrated_rig as calibrated_rig
 from pancam_graph.results._rig import write_rig as write_rig
+from pancam_graph.results._smoother import SMOOTHER_FILE as SMOOTHER_FILE
 from pancam_graph.results._solution_json import SolutionFile as SolutionFile
 from pancam_graph.results._solution_json import read_solution_json as read_solution_json
 

@@ -13,6 +13,7 @@ from pancam_graph.results._older import ONE_FILE, Older
 if TYPE_CHECKING:  # these import OpenCV, and names of outputs must be cheap
     from pancam_graph.mosaic import MosaicOptions, WrittenMosaics
     from pancam_graph.results._brightness import Brightness
+    from pancam_graph.smoother import TraverseSmoother
     from pancam_graph.terrain import TerrainOptions, WrittenTerrain
 
 __all__ = ["Output", "OutputWriter", "Written"]
@@ -40,6 +41,8 @@ class Written:
     """How long writing has taken so far."""
     client: Any = None
     """A distributed.Client whose workers share the work on pictures, or None."""
+    smoother: "TraverseSmoother | None" = None
+    """What the drive can go on with, where it was solved stop by stop."""
     mosaics: "WrittenMosaics | None" = None
     """The mosaics, once they are written."""
     terrain: "WrittenTerrain | None" = None
@@ -80,7 +83,7 @@ class Output:
 
     name: str
     """Name of the file or folder; an export is asked for by this name."""
-    when: Literal["always", "report", "csv", "mosaics", "terrain", "export"]
+    when: Literal["always", "report", "csv", "mosaics", "terrain", "smoother", "export"]
     """The option with which it is written."""
     writer: Callable[[], OutputWriter]
     """Imports the module that writes it and returns its writer; names and choices are listed without."""

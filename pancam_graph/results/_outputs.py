@@ -68,6 +68,12 @@ def _residuals_csv() -> OutputWriter:
     return RESIDUALS_CSV
 
 
+def _smoother() -> OutputWriter:
+    from pancam_graph.results._smoother import SMOOTHER
+
+    return SMOOTHER
+
+
 def _mosaics() -> OutputWriter:
     from pancam_graph.results._mosaics import MOSAICS
 
@@ -125,6 +131,7 @@ OUTPUTS = (
     Output(name="residuals.npz", when="always", writer=_residuals),
     Output(name="stereo.npz", when="always", writer=_stereo),
     Output(name="residuals.csv", when="csv", writer=_residuals_csv),
+    Output(name="smoother.npz", when="smoother", writer=_smoother),
     Output(name="mosaics", when="mosaics", writer=_mosaics, older=MOSAIC_FOLDER),
     Output(name=TERRAIN, when="terrain", writer=_terrain, older=TERRAIN_FOLDER),
     Output(name="report.html", when="report", writer=_report),

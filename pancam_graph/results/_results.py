@@ -18,6 +18,7 @@ from pancam_graph.results._outputs import OUTPUTS, SOLUTION, check_exports
 
 if TYPE_CHECKING:
     from pancam_graph.mosaic import MosaicOptions
+    from pancam_graph.smoother import TraverseSmoother
     from pancam_graph.terrain import TerrainOptions
 
 __all__ = ["check_out", "recover_results", "write_results"]
@@ -80,6 +81,7 @@ def write_results(
     terrain: "TerrainOptions | None" = None,
     progress: Callable[[str, int, int], None] | None = None,
     client: Any = None,
+    smoother: "TraverseSmoother | None" = None,
 ) -> Solution:
     """Write the results of a solution into the folder `out`: all `OUTPUTS` that are asked for.
 
@@ -87,9 +89,10 @@ def write_results(
     whole until then, and is there as before if anything fails. `csv`: whether residuals are written as CSV
     too. `exports` are names of `EXPORTS`. With options of `mosaics` and of `terrain`, folders of them are
     among the results; `progress` is told of each. Workers of `client`, a distributed.Client, match frames for
-    terrain, and must see `out` at the same path. Returns the solution with the time that writing took as its
-    `seconds.report`, and with warnings of images that mosaics and terrain lack, or why there is no terrain.
-    Raises InputError as `check_out` and `check_exports` do, and where writing fails.
+    terrain, and must see `out` at the same path. `smoother` is kept as `smoother.npz`. Returns the solution
+    with the time that writing took as its `seconds.report`, and with warnings of images that mosaics and
+    terrain lack, or why there is no terrain. Raises InputError as `check_out` and `check_exports` do, and
+    where writing fails.
     """
     out = Path(out)
     check_out(out)
@@ -100,6 +103,7 @@ def write_results(
         "csv": csv,
         "mosaics": mosaics is not None,
         "terrain": terrain is not None,
+        "smoother": smoother is not None,
     }
     chosen = [o for o in OUTPUTS if asked.get(o.when, o.name in exports)]
     started = time.perf_counter()
@@ -113,6 +117,7 @@ def write_results(
                 out=out,
                 progress=progress,
                 client=client,
+                smoother=smoother,
                 seconds=lambda: time.perf_counter() - started,
             )
             for output in chosen:

@@ -2,13 +2,13 @@
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from pancam_graph.base.errors import InputError
-from pancam_graph.base.geometry import IntArray
 from pancam_graph.base.options import options_of
 from pancam_graph.base.threads import blas_on_one_thread
 from pancam_graph.data import (
@@ -23,6 +23,7 @@ from pancam_graph.data import (
     Traverse,
 )
 from pancam_graph.graph import HardTemplate, UserFactors
+from pancam_graph.smoother._continued import brought_up_to_date, rows_in, what_differs
 from pancam_graph.smoother._ledger import Fate
 from pancam_graph.smoother._order import order_of_stops
 from pancam_graph.smoother._smoother import TraverseSmoother
@@ -39,7 +40,7 @@ from pancam_graph.solve import (
     solution_of,
 )
 
-__all__ = ["solve_incrementally", "stops_of"]
+__all__ = ["continued", "smoother_for", "solve_incrementally", "stops_of"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -67,17 +68,67 @@ def solve_incrementally(
     *,
     on_stop: Callable[[Update], None] | None = None,
     factors: UserFactors | None = None,
+    smoother: TraverseSmoother | None = None,
 ) -> Solution:
     """Solve a traverse by adding its stops one by one to a smoother; `on_stop` is called after each.
 
     Their order is that of the file as long as each shares tracks with the one before (`order_of_stops`).
 
-    `factors` as for `solve`; they are added after the last stop.
+    `factors` as for `solve`; they are added after the last stop. `smoother` is one of `smoother_for`, empty
+    or as an earlier call with a part of the drive left it: the stops that it has are not added again, what
+    has changed of their observations is, and it is left with the whole drive.
 
     Raises InputError for options that the smoother lacks: another model than the rigid mast, explicit
-    landmarks, and alternation. Of the robust loss only "none" counts, which turns the test for outliers off.
+    landmarks, and alternation; of the robust loss only "none" counts, which turns the test for outliers off.
+    Raises InputError too for a smoother of another drive, saying what differs.
     """
     options = options_of(SolveOptions, options, "solve_incrementally")
+    begin = time.perf_counter()
+    wanted = _smoother_options(traverse, options)
+    if smoother is None:
+        smoother = TraverseSmoother(traverse.rig, wanted)
+    elif smoother.stops and (why := what_differs(smoother, traverse, wanted)) is not None:
+        raise InputError(f"smoother: expected one with the first stops of {traverse.name}, found {why}")
+    updates: dict[str, Update] = {}
+    order, parts = order_of_stops(traverse), list(stops_of(traverse))
+    known, cost_known = frozenset(smoother.stops), smoother.cost
+    for number, previous in order:
+        stop, after = parts[number][0], None if previous is None else traverse.stops[previous].id
+        if stop.id in known:
+            continue
+        update = updates[stop.id] = smoother.add_stop(*parts[number], after=after)
+        _LOG.info("%s: cost %.6g, %.3f s", stop.id, update.cost, update.seconds)
+        if on_stop is not None:
+            on_stop(update)
+    if known:
+        brought_up_to_date(smoother, traverse)
+    if factors is not None:
+        sharing = replace(free_numbers(traverse, options), field=FIXED)
+        smoother.add_factors_of(HardTemplate(traverse, sharing), factors)
+    solved = time.perf_counter()
+    solution = _as_solution(traverse, options, smoother, updates, cost_known, factors)
+    done = time.perf_counter()
+    return replace(solution, seconds=Seconds(initialise=0.0, solve=solved - begin, report=done - solved))
+
+
+def smoother_for(traverse: Traverse, options: SolveOptions | None = None) -> TraverseSmoother:
+    """An empty smoother as `solve_incrementally` makes one for a traverse; raises InputError as it does."""
+    options = options_of(SolveOptions, options, "smoother_for")
+    return TraverseSmoother(traverse.rig, _smoother_options(traverse, options))
+
+
+def continued(path: Path, traverse: Traverse, options: SolveOptions) -> tuple[TraverseSmoother | None, str]:
+    """The smoother that a file keeps, if it has the first stops of a traverse; else None, and why not."""
+    try:
+        smoother = TraverseSmoother.load(path)
+        why = what_differs(smoother, traverse, _smoother_options(traverse, options))
+    except InputError as error:
+        return None, str(error)
+    return (smoother, "") if why is None else (None, f"{path} has {why}")
+
+
+def _smoother_options(traverse: Traverse, options: SolveOptions) -> SmootherOptions:
+    """The smoother's options that go with a solve's. Raises InputError for those that it lacks."""
     for name, chosen, expected in (
         ("model", options.model, "mast"),
         ("tie", options.firm_tie, "hard"),
@@ -88,53 +139,37 @@ def solve_incrementally(
             raise InputError(f"incremental: {name}: expected {expected}, found {chosen}")
     if traverse.observations is not None:
         traverse.observations.noise.require_even()
-    begin, sharing = time.perf_counter(), free_numbers(traverse, options)
-    smoother = TraverseSmoother(
-        traverse.rig,
-        SmootherOptions(
-            # What is considered enters sigmas alone, and these are `solve`'s.
-            rig="estimated" if options.rig == "estimated" else "held",
-            sharing=sharing,
-            outlier_sigma=None if options.loss == "none" else options.outlier_sigma,
-        ),
+    return SmootherOptions(
+        # What is considered enters sigmas alone, and these are `solve`'s.
+        rig="estimated" if options.rig == "estimated" else "held",
+        sharing=free_numbers(traverse, options),
+        outlier_sigma=None if options.loss == "none" else options.outlier_sigma,
     )
-    updates = []
-    order, parts = order_of_stops(traverse), list(stops_of(traverse))
-    for number, previous in order:
-        stop, after = parts[number][0], None if previous is None else traverse.stops[previous].id
-        updates.append(smoother.add_stop(*parts[number], after=after))
-        _LOG.info("%s: cost %.6g, %.3f s", stop.id, updates[-1].cost, updates[-1].seconds)
-        if on_stop is not None:
-            on_stop(updates[-1])
-    if factors is not None:
-        smoother.add_factors_of(HardTemplate(traverse, replace(sharing, field=FIXED)), factors)
-    solved = time.perf_counter()
-    solution = _as_solution(traverse, options, smoother, [i for i, _ in order], updates, factors)
-    done = time.perf_counter()
-    return replace(solution, seconds=Seconds(initialise=0.0, solve=solved - begin, report=done - solved))
 
 
 def _as_solution(
     traverse: Traverse,
     options: SolveOptions,
     smoother: TraverseSmoother,
-    order: Sequence[int],
-    updates: list[Update],
+    updates: Mapping[str, Update],
+    cost_known: float,
     factors: UserFactors | None,
 ) -> Solution:
     """The smoother's estimate as a solution of the traverse.
 
-    `order` has the rows of its stops as they were added. The outliers are judged once more, as `solve` does,
+    `updates` are those of stops that were added now, by id; `cost_known` is the cost of those
+    that were there already. The outliers are judged once more, as `solve` does,
     now that all stops are known: what is kept should not depend on the order in which they came. Rejected
     loop closures stay out.
     """
     assert traverse.observations is not None
     used = np.zeros(len(traverse.observations), dtype=bool)
     unbelieved = used.copy()
-    as_added = _rows_as_added(traverse, order)
-    used[as_added] = smoother.used
-    unbelieved[as_added] = smoother.state().fate == int(Fate.CLOSURE)
-    costs = tuple(u.cost for u in updates)
+    row = rows_in(smoother, traverse)
+    there = row >= 0
+    used[row[there]] = smoother.used[there]
+    unbelieved[row[there]] = (smoother.fate == int(Fate.CLOSURE))[there]
+    costs = (*([cost_known] if cost_known else []), *(u.cost for u in updates.values()))
     with blas_on_one_thread():
         prepared = prepare(traverse, options, factors=factors)
         template = prepared.problem.template
@@ -148,21 +183,14 @@ def _as_solution(
             is_optimum=screened is before,
         )
         solution = solution_of(reconsidered(judge(fitted)))
-    by_stop = [updates[int(i)] for i in np.argsort(order)]
-    warnings = (w for u in updates for w in u.warnings)
+    by_stop = [updates.get(stop.id) for stop in traverse.stops]
+    warnings = (w for u in updates.values() for w in u.warnings)
     return replace(
         solution,
         warnings=tuple(dict.fromkeys((*solution.warnings, *warnings))),
         incremental=Incremental(
-            seconds_per_stop=tuple(u.seconds for u in by_stop),
-            cost_per_stop=tuple(u.cost for u in by_stop),
-            relinearised_per_stop=tuple(u.relinearised for u in by_stop),
+            seconds_per_stop=tuple(0.0 if u is None else u.seconds for u in by_stop),
+            cost_per_stop=tuple(cost_known if u is None else u.cost for u in by_stop),
+            relinearised_per_stop=tuple(0 if u is None else u.relinearised for u in by_stop),
         ),
     )
-
-
-def _rows_as_added(traverse: Traverse, order: Sequence[int]) -> IntArray:
-    """Rows of the traverse's observations as its stops, in their `order`, bring them."""
-    assert traverse.observations is not None
-    place = np.argsort(order)
-    return np.argsort(place[traverse.image_stop[traverse.observations.image]], kind="stable")

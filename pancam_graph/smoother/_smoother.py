@@ -85,6 +85,16 @@ class TraverseSmoother:
         return np.asarray(self._drive.ledger.fate == int(Fate.USED))
 
     @property
+    def fate(self) -> IntArray:
+        """(observations,) what became of each observation of `traverse`, as values of `Fate`."""
+        return self._drive.ledger.fate.astype(np.int64)
+
+    @property
+    def n_factors(self) -> int:
+        """Number of the caller's factors (`add_factors`), ties on stops and frames among them."""
+        return len(self._drive.given)
+
+    @property
     def cost(self) -> float:
         """Half the sum of squares of everything that is used, priors included, as the last update left it."""
         return self._engine.cost if self._stop else 0.0
