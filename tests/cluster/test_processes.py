@@ -12,6 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import gtsam
+import numpy as np
 import pytest
 
 from pancam_graph.base.errors import ClusterError
@@ -77,9 +79,14 @@ def process(folder: Path, run: str, *words: str) -> Iterator[subprocess.Popen[by
 
 
 def test_a_run_ends_with_the_same_bytes_whoever_is_killed(tmp_path: Path) -> None:
+    """Two stops, so that their terrain and their ties are among what is killed."""
     (tmp_path / "images").mkdir()
-    scene, _ = make_traverse(tmp_path / "images", pans_deg=(-40.0, -20.0, 0.0, 20.0))
-    alone = as_bytes(found_in(find_observations(scene, QUICK)))
+    stops = (gtsam.Pose3(), gtsam.Pose3(gtsam.Rot3(), np.array([0.3, 0.2, 0.0])))
+    scene, _ = make_traverse(tmp_path / "images", pans_deg=(-20.0, 0.0), stops=stops)
+    found_alone = find_observations(scene, QUICK)
+    assert found_alone.matching is not None
+    assert all(pair.kept for pair in found_alone.matching.stops)
+    alone = as_bytes(found_in(found_alone))
     draw, killed = random.Random(20), list[int]()
     with connected("local:2") as client:
 
@@ -95,6 +102,7 @@ def test_a_run_ends_with_the_same_bytes_whoever_is_killed(tmp_path: Path) -> Non
         found = find_observations(scene, QUICK, cache=tmp_path / "cache", client=client, progress=kill)
     assert len(killed) == N_KILLS
     assert as_bytes(found_in(found)) == alone
+    assert found.matching == found_alone.matching
     assert not list((tmp_path / "cache").glob("parcel-*"))
 
 
