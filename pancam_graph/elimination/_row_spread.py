@@ -43,4 +43,6 @@ class RowSpread:
             self._joint[block.groups] = block.joint(self._covariance)
         B = np.linalg.solve(L, by_landmark.T).T
         reach = F - B @ W
-        return np.asarray(B @ (np.eye(3) + of_fields) @ B.T + reach @ self._joint[block.groups] @ reach.T)
+        moved = np.flatnonzero(reach.any(axis=0))  # few: those of the stops that see the landmark
+        reach, joint = reach[:, moved], self._joint[block.groups][np.ix_(moved, moved)]
+        return np.asarray(B @ (np.eye(3) + of_fields) @ B.T + reach @ joint @ reach.T)
