@@ -6,7 +6,7 @@ import numpy as np
 import scipy
 
 from pancam_graph.base.geometry import IntArray
-from pancam_graph.data import Traverse
+from pancam_graph.data import FrameSeen, Traverse
 from pancam_graph.landmarks import kernel
 
 __all__ = ["components", "connection_warnings", "listed", "shared_landmarks"]
@@ -46,7 +46,8 @@ def connection_warnings(traverse: Traverse, image: IntArray, landmark: IntArray)
     """
     warnings: list[str] = []
     count = np.bincount(image, minlength=len(traverse.images))
-    empty = [traverse.images[i].id for i in np.flatnonzero(count == 0)]
+    told = {traverse.image_of(one) for one in traverse.constraints if isinstance(one, FrameSeen)}
+    empty = [traverse.images[i].id for i in np.flatnonzero(count == 0).tolist() if i not in told]
     if empty:
         warnings.append(
             f"{_number(empty, 'image')} without a used observation: {_names(empty)}; "

@@ -189,6 +189,36 @@ def test_stop_by_stop_ends_where_batch_does_and_the_graph_has_the_factors() -> N
         assert np.isfinite(graph.error(values))
 
 
+def test_a_picture_of_the_sun_alone_heads_the_drive() -> None:
+    """A frame whose picture shares no point with others."""
+    simulation = simulated(2, 2)
+    plain = near_part(simulation)
+    rng = np.random.default_rng(0)
+    last = plain.images[-1]
+    observations = plain.observations
+    assert observations is not None
+    alone = plain.image_frame == plain.image_frame[-1]
+    plain = plain.with_observations(observations.select(~alone[observations.image]))
+    level = np.array([1e-4, 1e-4, 1.0])  # telemetry knows roll and pitch
+    stops = [
+        replace(
+            stop,
+            world_T_mast=pose.retract(np.append(0.05 * level * rng.normal(size=3), np.zeros(3))),
+            sigma_rotation_rad=0.05,
+        )
+        for stop, pose in zip(plain.stops, simulation.truth.world_T_mast, strict=True)
+    ]
+    before = replace(plain, stops=tuple(stops))
+    tied = replace(before, constraints=(sun(simulation, len(plain.images) - 1),))
+    loose, firm = solve(before, HARD), solve(tied, HARD)
+    assert any(last.id in warning for warning in loose.warnings)
+    assert not any(last.id in warning for warning in firm.warnings)
+    for stop in (0, 1):
+        assert firm.stop_covariance[stop][2, 2] < 0.5 * loose.stop_covariance[stop][2, 2]
+        error = rotation_errors(firm, simulation)[stop, 2]
+        assert abs(error) < 3 * np.sqrt(firm.stop_covariance[stop][2, 2])
+
+
 def test_what_no_camera_can_see_is_refused_in_one_sentence() -> None:
     simulation = simulated(2, 2)
     traverse = near_part(simulation)
