@@ -213,6 +213,30 @@ def test_a_tie_of_each_image_is_one_fiducial(tmp_path: Path) -> None:
     assert back.warnings == bare(solved()).warnings
 
 
+def test_a_known_place_that_one_image_sees_is_written_and_read(tmp_path: Path) -> None:
+    solution = solved()
+    t = solution.traverse
+    known = FramePoint(
+        frame=t.images[0].frame,
+        camera=t.images[0].camera,
+        u_px=12.5,
+        v_px=20.25,
+        sigma_px=0.5,
+        position_m=(3.0, -2.0, 0.5),
+        sigma_m=0.01,
+        robust=True,
+    )
+    told = replace(solution, traverse=replace(t, constraints=(known,)))
+    assert written(told, tmp_path / "f.tpt", "tpt") == []
+    other = replace(known, u_px=99.0)  # as other points, it gives way to those of the file
+    before = replace(bare(told), constraints=(other,))
+    back = with_ties(before, read_ties(tmp_path / "f.tpt"), tmp_path / "f.tpt")
+    (found,) = back.constraints
+    assert isinstance(found, FramePoint)
+    for name, value in vars(known).items():
+        assert getattr(found, name) == value, name
+
+
 def test_what_one_image_knows_of_a_point_but_its_place_is_left_out(tmp_path: Path) -> None:
     t = solved().traverse
     tie = '<tie type="4" left_key="7"><left line="10" samp="7"/><xy x="1" y="5"/></tie>'

@@ -172,7 +172,7 @@ def joined(
             traverse,
             observations=observations if plain else observations.with_covariance(covariance),
             constraints=(
-                *(c for c in traverse.constraints if not c.landmarks),
+                *(c for c in traverse.constraints if not (c.landmarks or isinstance(c, FramePoint))),
                 *constraints,
                 *(one for _, one in in_frames),
             ),

@@ -9,12 +9,14 @@ from pancam_graph.base.errors import InputError
 from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.data import (
     Constraint,
+    FramePoint,
     LandmarkAzimuth,
     LandmarkElevation,
     LandmarkHeight,
     LandmarkInfinity,
     LandmarkPosition,
     State,
+    Traverse,
 )
 from pancam_graph.io.vicar import AdjustedTie, ReferenceFrame, Tie, TieFile, tie_text, tie_xml
 from pancam_graph.results.formats._source import Source
@@ -50,7 +52,11 @@ def tie_file(source: Source) -> TieFile:
     frame = site_frame(source, _FRAME)
     known: dict[int, list[Constraint]] = {}
     lost: Counter[str] = Counter()
+    seen_once: list[Tie] = []
     for constraint in traverse.constraints:
+        if isinstance(constraint, FramePoint):
+            seen_once.append(_fiducial(traverse, constraint, frame))
+            continue
         tracks = [traverse.track_of(landmark) for landmark in constraint.landmarks]
         if len(tracks) == 1 and tracks[0] is not None and _says(constraint):
             known.setdefault(tracks[0], []).append(constraint)
@@ -65,13 +71,13 @@ def tie_file(source: Source) -> TieFile:
             ties += singles
             # Angles are from a stop: without an image of it that sees the point there is no tie.
             lost[constraint.kind] += bool(constraint.stops) and not singles
-    if not ties:
+    if not ties:  # what one image sees joins nothing
         raise InputError("tpt: expected observations that join two images, found none")
     each = ", ".join(f"{count} {kind}" for kind, count in lost.items() if count)
     if each:
         source.warnings.append(f"tpt: ties of marsnav have no equal of some constraints, left out: {each}")
     images: dict[int, str | None] = {row: who.unique_id for row, who in enumerate(source.identities)}
-    return TieFile(images=images, ties=tuple(ties), frames=(frame,))
+    return TieFile(images=images, ties=(*ties, *seen_once), frames=(frame,))
 
 
 def _says(constraint: Constraint) -> bool:
@@ -146,6 +152,19 @@ def _singles(
         )
         for row in rows.tolist()
     ]
+
+
+def _fiducial(traverse: Traverse, point: FramePoint, frame: ReferenceFrame) -> Tie:
+    """The tie of a known place that one image sees."""
+    image = traverse.image_of(point)
+    assert image is not None  # the traverse has looked
+    return Tie(
+        type=1,
+        left=image,
+        left_uv=(point.u_px, point.v_px),
+        xyz=_xyz(site_xyz(point.place_m)),
+        frame=frame,
+    )
 
 
 def _adjusted(source: Source, left: int, right: int) -> AdjustedTie | None:
