@@ -25,7 +25,7 @@ __all__ = ["Helpers", "crew_at_work", "helped"]
 class _Item(NamedTuple):
     """One step of one image, pair, group, or two stops, or of a group's tracks that begin in one image."""
 
-    kind: Literal["mask", "features", "matches", "tracks", "refined", "observed", "terrain", "ties"]
+    kind: Literal["mask", "features", "matches", "tracks", "refined", "observed", "rig", "terrain", "ties"]
     number: int
     """Row of the image or stop, or number of the pair or group."""
     second: int = -1
@@ -100,6 +100,7 @@ def _plan(placed: PlacedStops) -> tuple[list[_Item], list[list[int]]]:
     work = placed.work
     items, after = list[_Item](), list[list[int]]()
     mask, features, terrain = dict[int, int](), dict[int, int](), dict[int, int]()
+    tell_rig, rig, without_rig = list[int](), list[int](), list[int]()
     waiting = [(max(placed.group_of[a], placed.group_of[b]), a, b) for a, b in placed.directed]
     ties = {last: [pair[1:] for pair in waiting if pair[0] == last] for last, *_ in waiting}
 
@@ -124,9 +125,18 @@ def _plan(placed: PlacedStops) -> tuple[list[_Item], list[list[int]]]:
         if group in placed.groups:
             images = placed.images_of(group)
             add_images(images)
-            terrain[group] = add(_Item("terrain", group), [observed, *(mask[row] for row in images)])
+            if group in placed.rig_groups:
+                tell_rig.append(observed)
+            if group == placed.rig_groups[-1]:
+                rig = [add(_Item("rig", group), tell_rig)]
+            before = [observed, *rig, *(mask[row] for row in images)]
+            terrain[group] = add(_Item("terrain", group), before)
+            if not rig:
+                without_rig.append(terrain[group])
         for one, other in ties.get(group, ()):
             add(_Item("ties", one, other), [terrain[placed.group_of[stop]] for stop in (one, other)])
+    for number in without_rig:  # those that tell the rig wait for it, too
+        after[number] += rig
     add_images(work.rows)
     return items, after
 
@@ -148,6 +158,8 @@ def _do(placed: PlacedStops, item: _Item) -> None:
         work.tracks(number)
     elif item.kind == "observed":
         work.observed(number)
+    elif item.kind == "rig":
+        placed.rig()
     elif item.kind == "terrain":
         placed.placed(number)
     elif item.kind == "ties":
@@ -168,6 +180,8 @@ def _name(work: Steps, item: _Item) -> str:
         return f"the matches of images {traverse.images[pair.a].id} and {traverse.images[pair.b].id}"
     if item.kind == "ties":
         return f"the ties of stops {traverse.stops[number].id} and {traverse.stops[item.second].id}"
+    if item.kind == "rig":
+        return "the rig that stops are placed with"
     if item.kind in {"tracks", "observed", "terrain"}:
         what = "terrain" if item.kind == "terrain" else "tracks"
         return f"the {what} of stop {traverse.stops[traverse.image_stop[work.rows_of(number)[0]]].id}"

@@ -1,11 +1,11 @@
 """Steps that follow those within stops: terrain of stops, each by itself, and ties between two of them.
 
-No stop waits for all others: those of a group (see `Steps.groups`) are solved alone, and two of them are tied
-once both are placed. Memory holds what a few stops need.
+No stop waits for all others: a few tell the rig, those of a group (see `Steps.groups`) are solved alone with
+it, and two of them are tied once both are placed. Memory holds what a few stops need.
 """
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -21,15 +21,29 @@ from pancam_graph.images._cache import Arrays, key_of
 from pancam_graph.images._held import Held
 from pancam_graph.images._splines import Splines
 from pancam_graph.images._steps import Steps
-from pancam_graph.images._terrain import StopTerrain, of_stops, terrain_arrays, terrain_from, unplaced_arrays
+from pancam_graph.images._terrain import (
+    StopTerrain,
+    of_stops,
+    rig_arrays,
+    rig_from,
+    terrain_arrays,
+    terrain_from,
+    unplaced_arrays,
+)
 from pancam_graph.images._usable import on_terrain
+from pancam_graph.rigs import RigUncertainty
 from pancam_graph.solve import SolveOptions, solve
 
 __all__ = ["PlacedStops", "TiedTracks", "placed_key"]
 
 _LOG = logging.getLogger(__name__)
 _HELD_BYTES = 32 << 20
+_RIG_GROUPS = 4
+"""Groups whose observations together tell the rig that all stops are placed with: more hardly tell it better,
+and memory holds the observations of all of them."""
+_COLUMNS = ("image", "uv_px", "sigma_px", "covariance_px2")
 _CALLS: dict[str, tuple[Callable[..., Any], ...]] = {
+    "rig": (solve, of_stops),
     "terrain": (solve, of_stops, on_terrain),
     "ties": (Splines, terrain_from, on_terrain, StopMatcher),
 }
@@ -71,7 +85,7 @@ class PlacedStops:
     def plan(self) -> None:
         """Find out what all steps need to know of the drive as a whole, so that threads may ask for items."""
         self.work.plan()
-        self.group_of, self._terrains, self._terrain_keys  # noqa: B018  made when asked for
+        self.group_of, self._terrains, self._keys  # noqa: B018  made when asked for
 
     @cached_property
     def group_of(self) -> dict[int, int]:
@@ -107,18 +121,54 @@ class PlacedStops:
         """The stops of a group as a drive of their own, and the rows of its images."""
         return of_stops(self.work.traverse, self._stops_of(group), self.work.has_picture)
 
+    @property
+    def rig_groups(self) -> list[int]:
+        """The groups that tell the rig: the first ones, so that later stops change nothing of them."""
+        return self.groups[:_RIG_GROUPS]
+
+    def _rig_key(self) -> str:
+        if "rig" not in self._keys:
+            work, groups = self.work, self.rig_groups
+            pictures = [work.picture_keys[row] for group in groups for row in self.images_of(group)]
+            observed = [work.observed_key(group) for group in groups]
+            self._keys["rig"] = placed_key("rig", observed, pictures, work.traverse.sharing)
+        return self._keys["rig"]
+
+    def rig(self) -> Arrays:
+        """The rig as the observations of a few groups have it, or as it is told; see `rig_arrays`."""
+
+        def make() -> Arrays:
+            stops = np.concatenate([self._stops_of(group) for group in self.rig_groups])
+            few, rows = of_stops(self.work.traverse, np.sort(stops), self.work.has_picture)
+            observed = [self.work.observed(group) for group in self.rig_groups]
+            if not any(len(each["track"]) for each in observed):
+                return rig_arrays(few.rig)
+            try:
+                # A rig that is off as its uncertainty says puts terrain where other stops do not see it;
+                # fields are too small for that.
+                solution = solve(
+                    few.with_observations(_observations(observed, rows)), SolveOptions(field=False)
+                )
+            except SolveError as error:
+                _LOG.info("the rig as it is told places terrain: %s", error)
+                return rig_arrays(few.rig)
+            return rig_arrays(solution.rig)
+
+        return self.work.cache.recall("rig", self._rig_key(), make)
+
     def terrain_key(self, group: int) -> str:
         """Key of the terrain of a group."""
-        if group not in self._terrain_keys:
+        name = f"terrain {group}"
+        if name not in self._keys:
             work, images = self.work, self.images_of(group)
             pictures = [work.picture_keys[row] for row in images]
             masks = [work.reasons(row) for row in images]
-            inputs = work.observed_key(group), pictures, masks, work.traverse.sharing
-            self._terrain_keys[group] = placed_key("terrain", *inputs)
-        return self._terrain_keys[group]
+            inputs = self._rig_key(), work.observed_key(group), pictures, masks
+            self._keys[name] = placed_key("terrain", *inputs)
+        return self._keys[name]
 
     @cached_property
-    def _terrain_keys(self) -> dict[int, str]:
+    def _keys(self) -> dict[str, str]:
         return {}
 
     def placed(self, group: int) -> Arrays:
@@ -145,16 +195,11 @@ class PlacedStops:
         unplaced = {**unplaced_arrays(alone), "unit": np.array(1.0), "weight": np.array(0)}
         if not len(observed["track"]):
             return unplaced
-        observations = Observations(
-            image=np.searchsorted(rows, observed["image"]),
-            track=observed["track"],
-            uv_px=observed["uv_px"],
-            sigma_px=observed["sigma_px"],
-            origin="images",
-        ).with_covariance(observed["covariance_px2"])
+        observations, told = _observations([observed], rows), rig_from(alone.rig, **self.rig())
+        # Stops without ties have nothing but the rig in common: with it each is where a solve of all has it.
+        held = replace(told, uncertainty=_of_flex(told.uncertainty))
+        alone = replace(alone, rig=held, sharing=None)
         try:
-            # A rig that is off as its uncertainty says puts terrain where other stops do not see it;
-            # fields are too small for that.
             solution = solve(alone.with_observations(observations), SolveOptions(field=False))
         except SolveError as error:
             _LOG.info("stops %s: no terrain: %s", names, error)
@@ -244,3 +289,32 @@ class PlacedStops:
         return self.group_of[stop], TiedTracks(
             image=ties.image, track=track, uv_px=ties.uv_px, covariance_px2=ties.covariance_px2
         )
+
+
+def _observations(observed: Sequence[Arrays], rows: IntArray) -> Observations:
+    """Observations within some groups, of images by their places in `rows`, sorted by track, then image."""
+    first = np.cumsum([0, *(1 + int(each["track"].max(initial=-1)) for each in observed)])
+    columns = {n: np.concatenate([each[n] for each in observed]) for n in _COLUMNS}
+    return Observations(
+        image=np.searchsorted(rows, columns["image"]),
+        track=np.concatenate([each["track"] + n for each, n in zip(observed, first, strict=False)]),
+        uv_px=columns["uv_px"],
+        sigma_px=columns["sigma_px"],
+        origin="images",
+    ).with_covariance(columns["covariance_px2"])
+
+
+def _of_flex(uncertainty: RigUncertainty) -> RigUncertainty:
+    """What is uncertain of a rig that pictures have told: the flex of frames, and encoders."""
+    return replace(
+        uncertainty,
+        focal=0.0,
+        aspect=0.0,
+        principal_point_px=0.0,
+        skew_px=0.0,
+        mount_rad=0.0,
+        mount_m=0.0,
+        tilt_axis_rad=0.0,
+        tilt_axis_m=0.0,
+        covariance=None,
+    )

@@ -20,6 +20,8 @@ __all__ = [
     "Sighting",
     "StopTerrain",
     "of_stops",
+    "rig_arrays",
+    "rig_from",
     "terrain_arrays",
     "terrain_from",
     "unplaced_arrays",
@@ -323,14 +325,30 @@ def unplaced_arrays(traverse: Traverse) -> dict[str, FloatArray | IntArray]:
     }
 
 
+def rig_arrays(rig: Rig) -> dict[str, FloatArray]:
+    """What a solve estimates of a rig, fields aside; see `rig_from`."""
+    return {
+        "calibration": np.array([eye.camera.pinhole.calibration_matrix for eye in rig.eyes]),
+        "head_T_camera": np.array([eye.head_T_camera.matrix() for eye in rig.eyes]),
+        "pan_T_tilt": rig.pan_T_tilt.matrix(),
+    }
+
+
+def rig_from(rig: Rig, calibration: FloatArray, head_T_camera: FloatArray, pan_T_tilt: FloatArray) -> Rig:
+    """A rig with what was estimated of it in place of what it claims."""
+    eyes = tuple(
+        replace(eye, camera=eye.camera.with_calibration(K), head_T_camera=gtsam.Pose3(mount))
+        for eye, K, mount in zip(rig.eyes, calibration, head_T_camera, strict=True)
+    )
+    return replace(rig, eyes=eyes, pan_T_tilt=gtsam.Pose3(pan_T_tilt))
+
+
 def _geometry(
     rig: Rig, pan_tilt_rad: FloatArray, world_T_mast: Sequence[gtsam.Pose3]
 ) -> dict[str, FloatArray]:
     world_R_mast, world_t_mast = pose_arrays(world_T_mast)
     return {
-        "calibration": np.array([eye.camera.pinhole.calibration_matrix for eye in rig.eyes]),
-        "head_T_camera": np.array([eye.head_T_camera.matrix() for eye in rig.eyes]),
-        "pan_T_tilt": rig.pan_T_tilt.matrix(),
+        **rig_arrays(rig),
         "pan_tilt_rad": pan_tilt_rad,
         "world_R_mast": world_R_mast,
         "world_t_mast": world_t_mast,
@@ -362,11 +380,7 @@ def terrain_from(
         replace(s, world_T_mast=gtsam.Pose3(gtsam.Rot3(R), t))
         for s, R, t in zip(traverse.stops, world_R_mast, world_t_mast, strict=True)
     )
-    eyes = tuple(
-        replace(eye, camera=eye.camera.with_calibration(K), head_T_camera=gtsam.Pose3(mount))
-        for eye, K, mount in zip(traverse.rig.eyes, calibration, head_T_camera, strict=True)
-    )
-    rig = replace(traverse.rig, eyes=eyes, pan_T_tilt=gtsam.Pose3(pan_T_tilt))
+    rig = rig_from(traverse.rig, calibration, head_T_camera, pan_T_tilt)
     terrain = StopTerrain(
         traverse=replace(traverse, frames=frames, stops=stops, observations=None),
         rigs=(rig,) * len(stops),

@@ -133,7 +133,7 @@ def test_another_version_of_a_library_is_seen(monkeypatch: pytest.MonkeyPatch) -
 
 
 WITHIN = ("mask", "features", "matches", "tracks", "refined", "observed")
-KINDS = (*WITHIN, "terrain", "ties")
+KINDS = (*WITHIN, "rig", "terrain", "ties")
 
 
 def key_of(kind: str) -> str:
@@ -143,13 +143,13 @@ def key_of(kind: str) -> str:
 @pytest.mark.parametrize(
     ("edited", "stale"),
     [
-        ("factors.mast", {"terrain"}),
-        ("landmarks.kernel._eliminate", {"terrain"}),
+        ("factors.mast", {"rig", "terrain"}),
+        ("landmarks.kernel._eliminate", {"rig", "terrain"}),
         ("images._features", {"features", "matches", "ties"}),
         ("images._sky", {"mask"}),
         ("images._tracks", {"tracks", "observed"}),
         ("images._patches", {"refined", "ties"}),
-        ("rigs._rig", {"mask", "matches", "refined", "terrain", "ties"}),
+        ("rigs._rig", {"mask", "matches", "refined", "rig", "terrain", "ties"}),
         ("report._style", set()),
         ("results._residuals", set()),
         ("images._steps", set(KINDS)),
