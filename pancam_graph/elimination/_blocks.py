@@ -28,8 +28,10 @@ class Block:
     """Groups in the order of elimination."""
     begin: IntArray
     """(groups + 1,) first column of each in the block"""
+    segment: IntArray
+    """(n,) segments of the units that see its landmarks"""
     segment_column: IntArray
-    """(segments,) first column of each segment in the block; negative where it is of another"""
+    """(n,) first column in the block of each of these"""
     row: IntArray
     """(columns,) place of each column of the block among those of its group; -1: it belongs to no variable"""
     group: IntArray
@@ -41,8 +43,13 @@ class Block:
     n_units: int
 
     @staticmethod
-    def of(link: Linkage, layout: "Layout", panels: Panels, groups: tuple[int, ...]) -> "Block":
-        """The columns of a block that touches these groups; its units are not counted yet."""
+    def of(
+        link: Linkage, layout: "Layout", panels: Panels, groups: tuple[int, ...], units: IntArray
+    ) -> "Block":
+        """The columns of a block that touches these groups, and is seen by some of these units.
+
+        How many see it is not counted yet.
+        """
         group = np.array(groups, dtype=np.int64)
         width = layout.group_width[group]
         begin = np.zeros(len(groups) + 1, dtype=np.int64)
@@ -50,6 +57,9 @@ class Block:
         shift = np.full(link.n_groups, _NOWHERE)
         shift[group] = begin[:-1]
         row = np.concatenate([np.zeros(0, dtype=np.int64), *(layout.row[g] for g in groups)])
+        begins, counts = link.segment_begin[units], np.diff(link.segment_begin)[units]
+        before = np.cumsum(counts) - counts
+        segment = np.repeat(begins - before, counts) + np.arange(int(counts.sum()))
         of, is_nobodys = group.repeat(width), row < 0
         # Where each group begins in the panel of each; -1 where it is not there.
         starts = np.array([panels.first_columns(g) for g in groups], dtype=np.int64)
@@ -58,7 +68,8 @@ class Block:
             groups=groups,
             group=group,
             begin=begin,
-            segment_column=shift[layout.segment_group] + layout.segment_column,
+            segment=segment,
+            segment_column=shift[layout.segment_group[segment]] + layout.segment_column[segment],
             row=row,
             panel_column=np.where(is_nobodys | (first < 0), -1, first + row),
             source=np.where(is_nobodys, -1, link.group_column[of] + row),
@@ -121,8 +132,10 @@ class Layout:
         )
 
 
-def blocks_of(linkage: Linkage, m: Measurements) -> tuple[IntArray, dict[int, tuple[int, ...]]]:
-    """Block of each landmark, named by the first group that sees it, and the groups each block touches."""
+def blocks_of(
+    linkage: Linkage, m: Measurements
+) -> tuple[IntArray, dict[int, tuple[int, ...]], dict[int, IntArray]]:
+    """Block of each landmark, named by the first group that sees it; by block its groups, and its units."""
     groups = linkage.unit_groups
     # Landmarks of constant cameras form a block that depends on no group.
     nobody = linkage.n_groups
@@ -131,7 +144,6 @@ def blocks_of(linkage: Linkage, m: Measurements) -> tuple[IntArray, dict[int, tu
     first = np.minimum.reduceat(unit_first[unit], m.starts)
     seen = np.zeros((nobody + 1, len(groups)), dtype=bool)
     seen[first[m.landmark], unit] = True
-    return first, {
-        int(b): tuple(sorted(set().union(*{groups[u] for u in np.flatnonzero(seen[b])})))
-        for b in np.flatnonzero(seen.any(axis=1))
-    }
+    units = {int(b): np.flatnonzero(seen[b]) for b in np.flatnonzero(seen.any(axis=1))}
+    reach = {b: tuple(sorted(set().union(*{groups[u] for u in some}))) for b, some in units.items()}
+    return first, reach, units

@@ -68,6 +68,7 @@ class Room(local):
 
     def __init__(self) -> None:
         self._numbers = np.empty(0)
+        self._columns = np.empty(0, dtype=np.int64)
 
     def numbers(self, n: int) -> FloatArray:
         """(n,) numbers with arbitrary values."""
@@ -75,6 +76,13 @@ class Room(local):
             # At least twice as much as before, so that growth in small steps rarely needs new memory.
             self._numbers = np.empty(max(n, 2 * len(self._numbers)))
         return self._numbers[:n]
+
+    def columns_of(self, block: Block, n: int) -> IntArray:
+        """(n,) first column in a block of each of n segments; arbitrary for units that do not see it."""
+        if len(self._columns) < n:
+            self._columns = np.empty(n, dtype=np.int64)
+        self._columns[block.segment] = block.segment_column
+        return self._columns[:n]
 
 
 _OfChunk = tuple[FloatArray, FloatArray, int, float, int, int, IntArray, int, kernel.Reduced]
@@ -113,7 +121,7 @@ class LandmarkSystem:
         self.linkage, self.loss, self._refined = linkage, loss, refined
         self._measurements = measurements
         n = len(landmarks.vector)
-        first, reach = blocks_of(linkage, measurements)
+        first, reach, units = blocks_of(linkage, measurements)
         self.landmark_row = np.argsort(first, kind="stable")
         """(landmarks,) row in `landmarks` of each in the order of elimination"""
         self.vector = landmarks.vector[self.landmark_row]
@@ -122,8 +130,9 @@ class LandmarkSystem:
         self.structure = structure or pattern(linkage.group_dim, [*reach.values(), *cliques], last=last)
         self._panels = Panels(self.structure)  # stays 0, and without memory where it is large
         self._layout = Layout.of(linkage)
+        self._memory = room or Room()
         edges = np.flatnonzero(np.diff(first[self.landmark_row], prepend=-1, append=-1))
-        self._arrange(measurements, first, reach, edges)
+        self._arrange(measurements, first, reach, units, edges)
         self.reduced = kernel.Reduced(
             factor=np.empty((n, 6)),
             gamma=np.empty((n, 3)),
@@ -139,14 +148,18 @@ class LandmarkSystem:
         self._plain: tuple[Fields, kernel.Sights] | None = None
         self._on_disk: Scratch | None = None
         self._arms_on_disk: Scratch | None = None
-        self._memory = room or Room()
         self._moved, self._moved_cost = np.empty_like(self.vector), np.zeros(n)
         self._has_moved = False
         self._posture: Posture
         self._rests = False
 
     def _arrange(
-        self, m: Measurements, first: IntArray, reach: dict[int, tuple[int, ...]], edges: IntArray
+        self,
+        m: Measurements,
+        first: IntArray,
+        reach: dict[int, tuple[int, ...]],
+        units: dict[int, IntArray],
+        edges: IntArray,
     ) -> None:
         """Fill `sights`, `blocks` and `chunks`."""
         link = self.linkage
@@ -174,8 +187,9 @@ class LandmarkSystem:
         self.blocks: list[Block] = []
         self.chunks: list[_Chunk] = []
         for a, b in pairwise(edges.tolist()):
-            groups = tuple(self._panels.sorted(reach[int(first[self.landmark_row[a]])]))
-            block = Block.of(link, self._layout, self._panels, groups)
+            name = int(first[self.landmark_row[a]])
+            groups = tuple(self._panels.sorted(reach[name]))
+            block = Block.of(link, self._layout, self._panels, groups, units[name])
             n_units = kernel.arrange(
                 self.landmark_row[a:b],
                 begin,
@@ -183,7 +197,7 @@ class LandmarkSystem:
                 link.image_unit,
                 link.segment_begin,
                 n_pairs,
-                block.segment_column >> 1,
+                self._memory.columns_of(block, len(link.segment_width)) >> 1,
                 len(block.row) // 2,
                 a,
                 rows,
@@ -288,7 +302,8 @@ class LandmarkSystem:
         """What the loops that eliminate take of the landmarks of a chunk, in their order."""
         block, loss = self.blocks[chunk.block], self.loss
         landmarks = self.vector, self.origin_m, loss.kind, loss.width, chunk.begin, chunk.end
-        return *landmarks, block.segment_column, block.n_units, self.reduced
+        columns = self._memory.columns_of(block, len(self.linkage.segment_width))
+        return *landmarks, columns, block.n_units, self.reduced
 
     def _field_parts(self, wave: _Wave, views: CameraViews) -> Sequence[tuple[kernel.FieldSights, FieldPart]]:
         """Room for what each chunk of a wave tells about fields; empty where there are none."""
@@ -417,7 +432,8 @@ class LandmarkSystem:
     def follow(self, posture: Posture, step: FloatArray) -> None:
         """The first half of `try_step`: back substitution."""
         bearings, sights, reduced = self.bearings(posture), self._sights_at(posture.views), self.reduced
-        steps = [np.append(step, 0.0)[block.source] for block in self.blocks]
+        with_none = np.append(step, 0.0)  # for columns that belong to no variable
+        steps = [with_none[block.source] for block in self.blocks]
         if self._fields is not None:
             reduced = reduced._replace(gamma=self._fields.following(reduced.gamma, posture.views))
 
