@@ -71,6 +71,24 @@ class Random:
         return matrix[self.columns(g), self.columns(h)]
 
 
+@pytest.mark.parametrize("name", ["chain of threes", "chain with what all share"])
+def test_a_system_on_disk_has_the_same_bits(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pancam_graph.elimination._panels._AT_ONCE", 50)  # it leaves memory on the way
+    memory = Random(name).panels
+    disk = Panels(memory.structure, on_disk=True)
+    disk.numbers[:] = memory.numbers
+    roots = [panels.copy().root() for panels in (memory, disk)]
+    assert roots[1].scratch is not None
+    assert np.array_equal(disk.numbers, memory.numbers)  # a copy was used up
+    assert np.array_equal(roots[0].step(), roots[1].step())
+    one, other = (root.inverse_columns(2, slice(0, 2)) for root in roots)
+    assert np.array_equal(one, other)
+    a, b = (root.covariance() for root in roots)
+    for g, after in enumerate(memory.structure.after):
+        for h in after:
+            assert np.array_equal(a.block(g, h), b.block(g, h))
+
+
 def stacked(root: Root) -> tuple[FloatArray, FloatArray]:
     """All rows R over all columns, by group, and e."""
     st = root.structure

@@ -9,8 +9,11 @@ import pytest
 from pancam_graph import SimulationOptions, Solution, SolveOptions, Traverse, simulate, solve
 from pancam_graph.base.errors import InputError
 from pancam_graph.data import Constraint, StopHeading, StopPose
+from pancam_graph.elimination import LandmarkSystem
 from pancam_graph.rigs import mer_navcam
 from pancam_graph.simulate import Simulation
+from pancam_graph.solve import prepare
+from pancam_graph.solve._problem import system_of
 from support.tied_drives import landmark_ties
 
 LONG = SimulationOptions(
@@ -108,6 +111,20 @@ def test_a_stop_that_no_other_sees_is_as_at_once() -> None:
     # The fourth stop keeps odometry alone.
     seen = t.image_stop[observations.image] != 3
     required_alike(t.with_observations(observations.select(seen)), SolveOptions(loss="none", rig="held"), 4)
+
+
+def test_a_block_knows_the_segments_of_its_own_units_alone() -> None:
+    """Else memory would grow with the square of the drive."""
+    problem = prepare(drive().traverse, SolveOptions(rig="held")).problem
+    system, _ = system_of(problem)
+    assert isinstance(system, LandmarkSystem)
+    t, link = problem.template.traverse, problem.template.linkage
+    unit_stop = np.zeros(len(link.segment_begin) - 1, dtype=np.int64)
+    unit_stop[link.image_unit] = t.image_stop
+    of_segment = np.repeat(unit_stop, np.diff(link.segment_begin))
+    for block in system.blocks:
+        assert set(of_segment[block.segment].tolist()) == set(block.groups)
+    assert sum(len(block.segment) for block in system.blocks) < 0.8 * len(system.blocks) * len(of_segment)
 
 
 def test_numbers_and_methods_that_have_no_stretches_are_refused() -> None:
