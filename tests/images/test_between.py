@@ -36,6 +36,7 @@ from pancam_graph.images._pairs import PairGeometry
 from pancam_graph.images._splines import Splines
 from pancam_graph.images._terrain import StopTerrain, terrain_arrays, terrain_from, unplaced_arrays
 from pancam_graph.rigs import Eye, Rig, rig_template
+from support.truth import place_error, relative_rms_rad
 
 QUICK = FrontEndOptions(max_features=1500, max_ties=700)
 
@@ -558,22 +559,6 @@ def test_a_rig_that_is_off_costs_few_ties_between_stops(
     solution = solve(found, SolveOptions(field=False))
     assert solution.converged
     assert relative_rms_rad(small[0], solution).max() < 0.5e-3
-
-
-def place_error(rendering: Rendering, solution: Solution) -> float:
-    """Of the second stop in the mast frame of the first, as a share of the distance."""
-    true, found = (
-        m[0].between(m[1]).translation() for m in (rendering.truth.world_T_mast, solution.final.world_T_mast)
-    )
-    return float(np.linalg.norm(found - true) / np.linalg.norm(true))
-
-
-def relative_rms_rad(rendering: Rendering, solution: Solution) -> FloatArray:
-    """RMS error (stops, 2) of pan and tilt relative to the mean of the stop."""
-    error = solution.final.pan_tilt_rad - rendering.truth.pan_tilt_rad
-    error = np.arctan2(np.sin(error), np.cos(error))
-    stop = solution.traverse.frame_stop
-    return np.array([np.std(error[stop == s], axis=0) for s in range(len(solution.traverse.stops))])
 
 
 def wac_pair() -> Rig:
