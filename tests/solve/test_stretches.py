@@ -1,5 +1,6 @@
 """A drive eliminated in stretches is the drive eliminated at once: cost, values, sigmas and verdict."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
@@ -14,6 +15,7 @@ from pancam_graph.rigs import mer_navcam
 from pancam_graph.simulate import Simulation
 from pancam_graph.solve import prepare
 from pancam_graph.solve._problem import system_of
+from support.solving import fitted, solution_from
 from support.tied_drives import landmark_ties
 
 LONG = SimulationOptions(
@@ -28,9 +30,14 @@ def drive(**options: object) -> Simulation:
     return simulate(mer_navcam(), replace(LONG, **options), seed=5)  # type: ignore[arg-type]  # by name
 
 
-def required_alike(traverse: Traverse, options: SolveOptions, stretches: int) -> tuple[Solution, Solution]:
+def required_alike(
+    traverse: Traverse,
+    options: SolveOptions,
+    stretches: int,
+    solved: Callable[[Traverse, SolveOptions], Solution] = solve,
+) -> tuple[Solution, Solution]:
     """Solve a drive at once and in stretches; both solutions, which must be the same but for rounding."""
-    whole, cut = (solve(traverse, replace(options, stretches=n)) for n in (1, stretches))
+    whole, cut = (solved(traverse, replace(options, stretches=n)) for n in (1, stretches))
     assert whole.converged
     assert cut.converged
     np.testing.assert_array_equal(cut.used, whole.used)
@@ -69,6 +76,13 @@ def test_stretches_end_where_the_whole_drive_does(rig: str, stretches: int) -> N
     for a, b in zip(whole.refined, cut.refined, strict=True):
         assert abs(a.change - b.change) < 1e-3 * a.sigma
         assert b.sigma == pytest.approx(a.sigma, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_twelve_hundred_stops_in_four_stretches_end_where_they_do_at_once() -> None:
+    traverse = drive(stops=1200, pans=1, outliers=0.0).traverse
+    options = SolveOptions(rig="held", loss="none")
+    required_alike(traverse, options, 4, lambda t, o: solution_from(fitted(t, o)))
 
 
 def with_constraints(simulation: Simulation, constraints: tuple[Constraint, ...]) -> Traverse:
