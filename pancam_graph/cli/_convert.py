@@ -55,7 +55,8 @@ def _add_options(parser: CommandParser) -> None:
         type=Path,
         metavar="FOLDER",
         help="the folder of the pictures of a .tpt, a .nav, an .rvf or a control network; of results, the "
-        "folder that was refined, where it is not any more where it was then",
+        "folder that was refined, or that has all that were refined together, where it is not any more where "
+        "it was then",
     )
     add("--overwrite", action=Flag, help="replace a file, or a folder of an older conversion, that is there")
 

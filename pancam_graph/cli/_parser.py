@@ -196,5 +196,6 @@ def add_images_option(parser: CommandParser) -> None:
         "--images",
         type=Path,
         metavar="FOLDER",
-        help="the folder that was refined, where it is not any more where it was then",
+        help="the folder that was refined, or that has all that were refined together, where it is not any "
+        "more where it was then",
     )

@@ -59,8 +59,8 @@ def _add_options(parser: CommandParser) -> None:
         type=Path,
         default=(),
         metavar="FOLDER",
-        help="one or more folders with more of the same drive, such as the pictures of later sols: with OUT "
-        "of the drive so far, pictures and stops that they do not see are not matched again",
+        help="a folder with more of the same drive, such as the pictures of a later sol; may be repeated: "
+        "with OUT of the drive so far, pictures and stops that it does not see are not matched again",
     )
     add(
         "--model",
@@ -186,7 +186,7 @@ def _add_outputs(parser: CommandParser) -> None:
         default=1,
         metavar="N",
         help="eliminate a long drive in N stretches of its stops, one of which is in memory at a time, the "
-        "others on disk (in TMPDIR); the result is the same (%(default)s)",
+        "others on disk (in TMPDIR); the optimum and its sigmas are the same (%(default)s)",
     )
     add("--csv", action=Flag, help="write residuals.csv too, a line for each observation")
     add(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from pancam_graph.base.errors import InputError
-from pancam_graph.data import Image, NamedPoints, Observations, Traverse
+from pancam_graph.data import Constraint, Image, NamedPoints, Observations, Traverse
 from pancam_graph.io._json import prefixed, short
 from pancam_graph.io._mask_files import mask_file
 from pancam_graph.io._schema import TraverseFile
@@ -104,7 +104,7 @@ def joined_drive(root: Path, parts: Sequence[Part], file_name: str) -> Traverse:
     if observations is not None:
         drive = replace(drive, observations=observations.with_points(points))
     # Ties name tracks and points of the whole drive.
-    return replace(drive, constraints=tuple(tie for part in parts for tie in part.traverse.constraints))
+    return replace(drive, constraints=_ties(parts))
 
 
 def _plain(entry: Any) -> Any:
@@ -144,6 +144,21 @@ def _once(
             folders.setdefault(value.id, []).append(part.folder)
     shared = [(name, [str(folder) for folder in of]) for name, of in folders.items() if len(of) > 1]
     return tuple(found.values()), shared
+
+
+def _ties(parts: Sequence[Part]) -> tuple[Constraint, ...]:
+    """The ties of all parts; one that an earlier part has too, word for word, counts once.
+
+    Files of surfaces are each part's own: ties on them are not compared.
+    """
+    ties, known = list[Constraint](), list[dict[str, Any]]()
+    for part in parts:
+        own = [entry.model_dump() for entry in part.entries.constraints]
+        for tie, entry in zip(part.traverse.constraints, own, strict=True):
+            if "file" in entry or entry not in known:
+                ties.append(tie)
+        known += own
+    return tuple(ties)
 
 
 def _points(parts: Sequence[Part], begin: Sequence[int]) -> NamedPoints | None:

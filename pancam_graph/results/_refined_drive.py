@@ -27,6 +27,6 @@ def read_drive(out: Path | str, folder: Path | str | None = None) -> Drive:
         cameras=tuple(eyes[eye].camera for eye in traverse.image_eye.tolist()),
         world_R_camera=rotations,
         world_t_camera=centres,
-        stereo=read_stereo(out / STEREO_FILE, len(traverse.images)),
+        stereo=read_stereo(out / STEREO_FILE, traverse),
         angle_sigma_rad=np.array([[np.nan if s is None else s for s in pair] for pair in sigmas]),
     )

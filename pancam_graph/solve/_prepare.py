@@ -11,6 +11,7 @@ from pancam_graph.base.errors import InputError, SolveError
 from pancam_graph.base.geometry import FloatArray, IntArray
 from pancam_graph.data import (
     FIXED,
+    FrameDirection,
     Freedom,
     Observations,
     PixelNoise,
@@ -165,7 +166,7 @@ def prepare(
         noise=traverse.observations.noise,
         reason=reason,
         is_near=cameras is not None,
-        warnings=(*traverse.warnings, *start.warnings, *left_out),
+        warnings=(*traverse.warnings, *start.warnings, *left_out, *_turned_by_pans(traverse)),
         on_iteration=on_iteration,
     )
 
@@ -364,6 +365,19 @@ def _extent_m(centre_m: FloatArray, track: IntArray, n_tracks: int) -> FloatArra
     np.minimum.at(low, track, centre_m)
     np.maximum.at(high, track, centre_m)
     return np.asarray(np.linalg.norm(high - low, axis=1))
+
+
+def _turned_by_pans(traverse: Traverse) -> list[str]:
+    """A warning of directions that cannot turn the drive, since the stop of their frame is held."""
+    stop_of = {frame.id: frame.stop for frame in traverse.frames}
+    seen = [stop_of[one.frame] for one in traverse.constraints if isinstance(one, FrameDirection)]
+    held = [stop.id for stop in traverse.stops if stop.id in seen and not stop.sigma_rotation_rad]
+    if not held:
+        return []
+    return [
+        f"stop {', '.join(held)}: a frame-direction there turns pans, tilts and the rig, not the drive, "
+        "which the stop holds (sigma_rotation_rad 0): a sigma above 0 lets the direction tell the heading"
+    ]
 
 
 def _left_out_warnings(single: IntArray, n_outside: int) -> list[str]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pancam_graph.base.choices import some_of
 from pancam_graph.base.errors import InputError
 from pancam_graph.base.options import options_of
 from pancam_graph.base.threads import in_order
@@ -99,6 +100,13 @@ def make_terrain(
     pairs, warnings = stereo_pairs(drive)
     if not pairs:
         raise InputError(_no_stereo(drive))
+    if drive.stereo is not None:
+        unknown = [traverse.frames[p.frame].id for p in pairs if drive.stereo.of(p.left, p.right) is None]
+        if unknown:
+            warnings.append(
+                f"terrain: sigmas of {some_of(unknown)} lack the errors of pose, angles and rig: the results "
+                "have none of these pairs (stereo.npz)"
+            )
     rows = np.array([p.left for p in pairs])
     centres = drive.world_t_camera[rows]
     focal_px = float(np.median([drive.cameras[r].pinhole.fx_px for r in rows]))

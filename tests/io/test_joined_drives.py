@@ -151,6 +151,20 @@ def test_named_points_and_ties_are_common(drive: Traverse, tmp_path: Path) -> No
     assert len(joined.constraints) == 2
 
 
+def test_a_tie_that_both_folders_have_counts_once(drive: Traverse, tmp_path: Path) -> None:
+    folders = written(drive, tmp_path)
+    second = json.loads((folders[0] / "traverse.json").read_text())["stops"][1]
+    tie = {"kind": "stop-heading", "stop": second["id"], "heading_rad": 0.1, "sigma_rad": 0.02}
+    change(folders[1], lambda content: content["stops"].append(second))
+    for folder in folders:
+        change(folder, lambda c: c.update(constraints=[tie, tie | {"heading_rad": 0.2}]))
+    change(folders[1], lambda c: c["constraints"].append(tie | {"sigma_rad": 0.01}))
+    said = [
+        (t.heading_rad, t.sigma_rad) for t in read_input(*folders).constraints if isinstance(t, StopHeading)
+    ]
+    assert said == [(0.1, 0.02), (0.2, 0.02), (0.1, 0.01)]
+
+
 def test_a_stop_in_two_folders_is_one_and_said(drive: Traverse, tmp_path: Path) -> None:
     folders = written(drive, tmp_path)
     first = json.loads((folders[0] / "traverse.json").read_text())["stops"][0]

@@ -56,14 +56,17 @@ def test_terrain_made_later_has_the_same_errors_in_common(solution: Solution, ou
     assert read.of(int(made.right[1]), int(made.left[1])) is None
 
 
-def test_results_of_older_versions_have_none(out: Path, tmp_path: Path) -> None:
-    assert read_stereo(tmp_path / STEREO_FILE, 6) is None
+def test_results_of_older_versions_have_none(solution: Solution, tmp_path: Path) -> None:
+    assert read_stereo(tmp_path / STEREO_FILE, solution.traverse) is None
 
 
 @pytest.mark.parametrize(
     ("name", "change", "says"),
     [
         ("left", lambda a: a + 7, r"stereo\.npz: left: expected 3 rows of 6 images, found other numbers"),
+        ("image_names", lambda a: a[::-1], r"image_names: expected those of .*, found others"),
+        ("right", lambda a: a[::-1], r"left, right: expected pairs of images of one frame"),
+        ("covariance", lambda a: -a, r"covariance: expected covariances, found numbers that are none"),
         ("right", lambda a: a[:2], r"right: expected 3 rows"),
         ("right", lambda a: a.astype(float), r"right: expected 3 rows"),
         ("covariance", lambda a: a[..., :5], r"covariance: expected 3 pairs of nodes .* found the shape"),
@@ -73,19 +76,21 @@ def test_results_of_older_versions_have_none(out: Path, tmp_path: Path) -> None:
         ("extent", lambda a: a[:, :3], r"extent: expected the shape \(3, 4\), found \(3, 3\)"),
     ],
 )
-def test_a_damaged_file_is_refused(out: Path, tmp_path: Path, name: str, change, says: str) -> None:  # type: ignore[no-untyped-def]  # of any array
+def test_a_damaged_file_is_refused(  # type: ignore[no-untyped-def]  # change: of any array
+    solution: Solution, out: Path, tmp_path: Path, name: str, change, says: str
+) -> None:
     with np.load(out / STEREO_FILE) as file:
         arrays = dict(file)
     arrays[name] = change(arrays[name])
     np.savez(tmp_path / STEREO_FILE, **arrays)
     with pytest.raises(InputError, match=says):
-        read_stereo(tmp_path / STEREO_FILE, 6)
+        read_stereo(tmp_path / STEREO_FILE, solution.traverse)
 
 
 @settings(max_examples=25, deadline=None)
 @given(data=st.data())
 def test_any_bytes_are_read_or_refused_with_a_sentence(
-    out: Path, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+    solution: Solution, out: Path, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
     content = bytearray((out / STEREO_FILE).read_bytes())
     for _ in range(data.draw(st.integers(1, 6))):
@@ -93,7 +98,7 @@ def test_any_bytes_are_read_or_refused_with_a_sentence(
     file = tmp_path_factory.mktemp("fuzz") / STEREO_FILE
     file.write_bytes(content[: data.draw(st.sampled_from([len(content), 700, 0]))])
     try:
-        read = read_stereo(file, 6)
+        read = read_stereo(file, solution.traverse)
     except InputError as error:
         assert str(file) in str(error)
     else:

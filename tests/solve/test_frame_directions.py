@@ -238,3 +238,15 @@ def test_what_no_camera_can_see_is_refused_in_one_sentence() -> None:
     )
     with pytest.raises(InputError, match="expected a variable that is free, found only such as telemetry"):
         solve(held, HARD)
+
+
+def test_a_direction_at_a_held_stop_is_said_to_turn_no_drive() -> None:
+    simulation = simulated(2, 2)
+    t = simulation.traverse
+    assert not t.stops[0].sigma_rotation_rad
+    seen = replace(t, constraints=suns(simulation))
+    said = [w for w in solve(seen, HARD).warnings if "turns pans, tilts and the rig, not the drive" in w]
+    assert len(said) == 1
+    assert said[0].startswith(f"stop {t.stops[0].id}: a frame-direction there")
+    free = replace(seen, stops=tuple(replace(s, sigma_rotation_rad=0.02) for s in t.stops))
+    assert not [w for w in solve(free, HARD).warnings if "not the drive" in w]
