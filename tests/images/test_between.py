@@ -133,7 +133,7 @@ def test_a_search_begins_where_most_matches_agree(
     ties, rng, sigma_m = seen_rows(terrain, true), np.random.default_rng(0), 0.15
 
     def matched(*given: Any) -> tuple[Ties, FloatArray]:
-        at = given[4]
+        at = given[3]
         seen = terrain.sighting(ties.row, ties.image, at.world_T_mast)
         spread = seen.covariance_px2(at.covariance, terrain.sigma_inverse_m[ties.row])
         half = QUICK.search_sigmas * np.sqrt(np.linalg.eigvalsh(spread)[:, 1]) + QUICK.search_slack_px

@@ -86,6 +86,7 @@ def gone_on(run: Run, calls: list[int], tmp_path: Path, monkeypatch: pytest.Monk
         "points.ply",
         "residuals.npz",
         "solution.json",
+        "stereo.npz",
     ]
     return tmp_path / "out"
 

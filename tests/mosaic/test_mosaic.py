@@ -534,7 +534,7 @@ def test_a_failure_leaves_the_older_results_whole(
     def interrupted(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pancam_graph.mosaic._files.comparison", interrupted)
+    monkeypatch.setattr("pancam_graph.mosaic._stop_files.comparison", interrupted)
     with pytest.raises(KeyboardInterrupt):
         write_results(truth, out, report=False, mosaics=NEAR)
     assert sorted(p.relative_to(out) for p in out.rglob("*")) == before
