@@ -11,7 +11,7 @@ if [ $# -eq 0 ]; then set -- -m "not slow"; fi
 
 # usage: install_newest FOLDER
 install_newest() {
-    install_into "$1" "[test]" --upgrade --upgrade-strategy eager
+    install_into "$1" "[test,terrain,cluster]" --upgrade --upgrade-strategy eager
 }
 
 # usage: install_lowest FOLDER
@@ -19,9 +19,10 @@ install_lowest() {
     "$1/bin/python" -c '
 import tomllib
 project = tomllib.load(open("pyproject.toml", "rb"))["project"]
-for requirement in project["dependencies"] + project["optional-dependencies"]["test"]:
+extras = project["optional-dependencies"]
+for requirement in project["dependencies"] + extras["test"] + extras["terrain"] + extras["cluster"]:
     print(requirement.replace(">=", "=="))
-' > "$1/lowest.txt" && install_into "$1" "[test]" --constraint "$1/lowest.txt"
+' > "$1/lowest.txt" && install_into "$1" "[test,terrain,cluster]" --constraint "$1/lowest.txt"
 }
 
 table=""

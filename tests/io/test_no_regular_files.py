@@ -45,7 +45,8 @@ def test_a_regular_file_is_one_and_an_impossible_name_is_told_in_the_systems_wor
     assert instead_of_file(tmp_path / "a") is None
     assert instead_of_file(tmp_path / "b") is None
     assert instead_of_file(tmp_path / ("n" * 300)) == "File name too long"
-    assert instead_of_file(tmp_path / "a\0b") == "embedded null byte"
+    # The words are those of the version of Python.
+    assert "embedded null" in str(instead_of_file(tmp_path / "a\0b"))
 
 
 def pictured(folder: Path) -> Traverse:
