@@ -17,11 +17,11 @@ install_newest() {
 # usage: install_lowest FOLDER
 install_lowest() {
     "$1/bin/python" -c '
-import tomllib
+import re, tomllib
 project = tomllib.load(open("pyproject.toml", "rb"))["project"]
 extras = project["optional-dependencies"]
 for requirement in project["dependencies"] + extras["test"] + extras["terrain"] + extras["cluster"]:
-    print(requirement.replace(">=", "=="))
+    print(re.sub(r"\[.*?\]", "", requirement).replace(">=", "=="))
 ' > "$1/lowest.txt" && install_into "$1" "[test,terrain,cluster]" --constraint "$1/lowest.txt"
 }
 

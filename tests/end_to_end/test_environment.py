@@ -298,8 +298,8 @@ def test_every_version_that_is_found_has_its_row(checkout: Checkout) -> None:
     assert all(re.fullmatch(r"[\w.-]+==[\d.]+", line) for line in lowest)
     options = [call.partition("--editable ")[2] for call in checkout.calls if "pip install" in call]
     assert options == [
-        *[".[test] --upgrade --upgrade-strategy eager"] * 3,
-        ".[test] --constraint .venvs/3.11-lowest/lowest.txt",
+        *[".[test,terrain,cluster] --upgrade --upgrade-strategy eager"] * 3,
+        ".[test,terrain,cluster] --constraint .venvs/3.11-lowest/lowest.txt",
     ]
 
 
