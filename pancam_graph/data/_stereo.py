@@ -1,6 +1,7 @@
 """How surely the two eyes of a frame place what they see, noise of pixels apart."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -65,5 +66,10 @@ class StereoCovariance:
 
     def of(self, left: int, right: int) -> StereoNodes | None:
         """The nodes of a pair of images; None where it is not among the pairs."""
-        found = np.flatnonzero((self.left == left) & (self.right == right))
-        return StereoNodes(self.extent[found[0]], self.covariance[found[0]]) if len(found) else None
+        row = self._row.get((left, right))
+        return None if row is None else StereoNodes(self.extent[row], self.covariance[row])
+
+    @cached_property
+    def _row(self) -> dict[tuple[int, int], int]:
+        pairs = zip(self.left.tolist(), self.right.tolist(), strict=True)
+        return {pair: row for row, pair in enumerate(pairs)}

@@ -52,7 +52,7 @@ def what_differs(smoother: TraverseSmoother, traverse: Traverse, options: Smooth
     of_known, there = {stop.id for stop in known.stops}, {frame.id for frame in known.frames}
     if any(frame.stop in of_known and frame.id not in there for frame in traverse.frames):
         return "fewer frames of a stop"
-    gone, _ = _changed(smoother, traverse)
+    gone, _ = _changed(known, smoother.fate, traverse)
     if known.observations is not None and gone.sum() > _MOST_CHANGED * len(known.observations):
         return f"{int(gone.sum())} other observations"
     return None
@@ -60,7 +60,12 @@ def what_differs(smoother: TraverseSmoother, traverse: Traverse, options: Smooth
 
 def rows_in(smoother: TraverseSmoother, traverse: Traverse) -> IntArray:
     """Rows of a traverse's observations that are those of a smoother (n,); -1: it has been taken back."""
-    mine, theirs = smoother.traverse, traverse.observations
+    return _rows_in(smoother.traverse, smoother.fate, traverse)
+
+
+def _rows_in(mine: Traverse, fate: IntArray, traverse: Traverse) -> IntArray:
+    """The same of the drive of a smoother, and what became of its observations."""
+    theirs = traverse.observations
     if mine.observations is None or theirs is None:
         return np.zeros(0, dtype=np.int64)
     row_of = {image.id: row for row, image in enumerate(traverse.images)}
@@ -71,16 +76,18 @@ def rows_in(smoother: TraverseSmoother, traverse: Traverse) -> IntArray:
     place = np.searchsorted(key, of_mine, sorter=order).clip(max=max(len(key) - 1, 0))
     row = order[place] if len(key) else np.zeros(len(of_mine), dtype=np.int64)
     found = key[row] == of_mine if len(key) else np.zeros(len(of_mine), dtype=bool)
-    removed = smoother.fate == int(Fate.REMOVED)
-    return np.where(found & ~removed, row, -1)
+    return np.where(found & (fate != int(Fate.REMOVED)), row, -1)
 
 
-def _changed(smoother: TraverseSmoother, traverse: Traverse) -> tuple[BoolArray, BoolArray]:
-    """Observations of a smoother that the traverse has no more, or otherwise; those of its images to add."""
-    mine, theirs = smoother.traverse, traverse.observations
+def _changed(mine: Traverse, fate: IntArray, traverse: Traverse) -> tuple[BoolArray, BoolArray]:
+    """Observations of a smoother's drive that a traverse has no more, or otherwise; what its images see more.
+
+    `fate` (observations,) is what became of the former.
+    """
+    theirs = traverse.observations
     if mine.observations is None or theirs is None:
         return np.zeros(0, dtype=bool), np.zeros(0, dtype=bool)
-    row = rows_in(smoother, traverse)
+    row = _rows_in(mine, fate, traverse)
     there = row >= 0
     same = there.copy()
     a, b = mine.observations, theirs.select(row[there])
@@ -89,7 +96,7 @@ def _changed(smoother: TraverseSmoother, traverse: Traverse) -> tuple[BoolArray,
     if a.covariance_px2 is not None and b.covariance_px2 is not None:
         close = np.isclose(a.covariance_px2[there], b.covariance_px2, rtol=1e-9, atol=1e-15)
         same[there] &= close.all(axis=(1, 2))
-    gone = ~same & (smoother.fate != int(Fate.REMOVED))
+    gone = ~same & (fate != int(Fate.REMOVED))
     known = {image.id for image in mine.images}
     of_mine = np.array([image.id in known for image in traverse.images])[theirs.image]
     kept = np.zeros(len(theirs), dtype=bool)
@@ -102,8 +109,8 @@ def brought_up_to_date(smoother: TraverseSmoother, traverse: Traverse) -> None:
 
     For after its stops are added: what new stops see first may be seen from the old ones too.
     """
-    gone, new = _changed(smoother, traverse)
     mine, theirs = smoother.traverse, traverse.observations
+    gone, new = _changed(mine, smoother.fate, traverse)
     if gone.any() and mine.observations is not None:
         smoother.remove(mine.observations.select(gone))
     if new.any() and theirs is not None:

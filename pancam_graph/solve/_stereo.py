@@ -1,5 +1,7 @@
 """Covariances of what stereo pairs see, at nodes of direction and depth: terrain's shared errors."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from pancam_graph.base.geometry import BoolArray, FloatArray, IntArray
@@ -94,23 +96,14 @@ def _of_some(
     ray = np.concatenate([away, np.ones((*shape, 1))], axis=-1)
     R, centre = views.world_R_camera[left], views.world_t_camera[left]
     world = centre[:, None, None, None] + np.einsum("pij,pklmj->pklmi", R, ray * depth[..., None])
-    sees, uv = _projected(views, np.column_stack([left, right]), world)
+    landmarks, seen, sees = _nodes(views, left, right, world.reshape(-1, 3))
+    sees = sees.reshape(shape)
     found = np.full((*shape, 6), np.nan)
     if not sees.any():
         return _spread(found)
-    points = world[sees]
-    n = len(points)
-    pair = np.nonzero(sees)[0]
-    landmarks = Landmarks(vector=np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)), origin_m=centre[pair]).moved_to(
-        points
-    )
-    measurements = Measurements(
-        row=np.zeros(2 * n, dtype=np.int64),
-        image=np.column_stack([left[pair], right[pair]]).ravel(),
-        landmark=np.repeat(np.arange(n), 2),
-        uv_px=uv[sees].reshape(-1, 2),
-        whitening=np.tile(np.eye(2) / _SIGMA_PX, (2 * n, 1, 1)),
-    )
+    rows = np.flatnonzero(sees)
+    measurements, landmarks = seen.part(np.flatnonzero(np.repeat(sees.ravel(), 2))), landmarks.of(rows)
+    n, pair = len(rows), np.nonzero(sees)[0]
     template = problem.template
     system = LandmarkSystem(template.linkage, measurements, landmarks, SQUARED, cliques=template.cliques)
     system.linearise(template.posture(problem.values))
@@ -124,25 +117,28 @@ def _of_some(
     return _spread(found)
 
 
-def _projected(views: CameraViews, images: IntArray, world: FloatArray) -> tuple[BoolArray, FloatArray]:
-    """Whether both images (pairs, 2) see points (pairs, ..., 3), and at which pixels (pairs, ..., 2, 2)."""
-    inside = world.shape[1:-1]
-    n = int(np.prod(world.shape[:-1]))
-    each = np.broadcast_to(images[:, None, None, None, :], (*world.shape[:-1], 2)).reshape(-1)
+def _nodes(
+    views: CameraViews, left: IntArray, right: IntArray, world_m: FloatArray
+) -> tuple[Landmarks, Measurements, BoolArray]:
+    """World points (n, 3), as many of each pair in turn, where its images see them without noise.
+
+    Also whether both images see each (n,).
+    """
+    n, each = len(world_m), len(world_m) // len(left)
     landmarks = Landmarks(
         vector=np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)),
-        origin_m=np.repeat(views.world_t_camera[images[:, 0]], int(np.prod(inside)), axis=0),
-    ).moved_to(world.reshape(-1, 3))
+        origin_m=np.repeat(views.world_t_camera[left], each, axis=0),
+    ).moved_to(world_m)
     nowhere = Measurements(
         row=np.zeros(2 * n, dtype=np.int64),
-        image=each,
+        image=np.repeat(np.column_stack([left, right]), each, axis=0).ravel(),
         landmark=np.repeat(np.arange(n), 2),
         uv_px=np.zeros((2 * n, 2)),
         whitening=np.tile(np.eye(2), (2 * n, 1, 1)),
     )
     uv, in_front = residuals(landmarks, nowhere, views)
-    sees = (in_front & np.isfinite(uv).all(axis=1)).reshape(*world.shape[:-1], 2)
-    return np.asarray(sees.all(axis=-1)), uv.reshape(*world.shape[:-1], 2, 2)
+    sees = (in_front & np.isfinite(uv).all(axis=1)).reshape(n, 2).all(axis=1)
+    return landmarks, replace(nowhere, uv_px=uv).scaled(_SIGMA_PX), np.asarray(sees)
 
 
 def _spread(found: FloatArray) -> FloatArray:

@@ -19,6 +19,7 @@ from pancam_graph.results._solved_folder import read_solved
 from pancam_graph.rigs import rig_template
 from pancam_graph.simulate import SimulationOptions
 from support.rover_labels import POINTINGS, Shot, label_text, msl_mast, navcam_b_head, write
+from support.small_drives import some_stops
 
 DRIVE = SimulationOptions(
     stops=3, pans=3, sweep_rad=None, tilts_rad=(-0.3,), points_per_image=6, odometry=True
@@ -30,30 +31,11 @@ def drive() -> Traverse:
     return simulate(rig_template("mer-navcam"), DRIVE, seed=31).traverse
 
 
-def part(drive: Traverse, stops: slice) -> Traverse:
-    """Some stops of a drive, as a folder of their own has them."""
-    ids = {stop.id for stop in drive.stops[stops]}
-    frames = tuple(frame for frame in drive.frames if frame.stop in ids)
-    known = {frame.id for frame in frames}
-    rows = [row for row, image in enumerate(drive.images) if image.frame in known]
-    seen = drive.observations
-    assert seen is not None
-    seen = seen.select(np.isin(seen.image, rows))
-    return replace(
-        drive,
-        stops=drive.stops[stops],
-        frames=frames,
-        images=tuple(drive.images[row] for row in rows),
-        observations=replace(seen, image=np.searchsorted(rows, seen.image)),
-        constraints=(),
-    )
-
-
 def written(drive: Traverse, folder: Path) -> list[Path]:
     """The drive in two folders: two stops, then one."""
     folders = [folder / "sol12", folder / "sol13"]
-    write_traverse(part(drive, slice(0, 2)), folders[0])
-    write_traverse(part(drive, slice(2, 3)), folders[1])
+    write_traverse(some_stops(drive, slice(0, 2)), folders[0])
+    write_traverse(some_stops(drive, slice(2, 3)), folders[1])
     return folders
 
 

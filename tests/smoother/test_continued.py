@@ -13,6 +13,7 @@ from pancam_graph.io import write_traverse
 from pancam_graph.results import SMOOTHER_FILE
 from pancam_graph.rigs import rig_template
 from pancam_graph.smoother import continued, smoother_for, solve_incrementally
+from support.small_drives import some_stops
 
 DRIVE = SimulationOptions(
     stops=4, pans=4, sweep_rad=None, tilts_rad=(-0.25,), points_per_image=8, outliers=0.03
@@ -23,24 +24,6 @@ HELD = SolveOptions(rig="held")
 @pytest.fixture(scope="module")
 def drive() -> Traverse:
     return simulate(rig_template("mer-navcam"), DRIVE, seed=77).traverse
-
-
-def first(drive: Traverse, n: int) -> Traverse:
-    """The first stops of a drive, with what their images see."""
-    stops = {stop.id for stop in drive.stops[:n]}
-    frames = tuple(frame for frame in drive.frames if frame.stop in stops)
-    rows = np.flatnonzero(drive.image_stop < n)
-    seen = drive.observations
-    assert seen is not None
-    return replace(
-        drive,
-        stops=drive.stops[:n],
-        frames=frames,
-        images=tuple(drive.images[row] for row in rows),
-        observations=replace(
-            s := seen.select(np.isin(seen.image, rows)), image=np.searchsorted(rows, s.image)
-        ),
-    )
 
 
 def kept(drive: Traverse, path: Path, options: SolveOptions = HELD) -> Path:
@@ -54,7 +37,7 @@ def kept(drive: Traverse, path: Path, options: SolveOptions = HELD) -> Path:
 def test_stops_that_are_added_later_end_where_all_at_once_do(
     drive: Traverse, tmp_path: Path, options: SolveOptions
 ) -> None:
-    smoother, why = continued(kept(first(drive, 2), tmp_path / "s.npz", options), drive, options)
+    smoother, why = continued(kept(some_stops(drive, slice(2)), tmp_path / "s.npz", options), drive, options)
     assert smoother is not None, why
     assert smoother.stops == tuple(stop.id for stop in drive.stops[:2])
     added = list[str]()
@@ -80,9 +63,8 @@ def test_what_has_changed_of_old_stops_is_brought_up_to_date(drive: Traverse, tm
     whole = drive.observations
     assert whole is not None
     of_old = np.flatnonzero(drive.image_stop[whole.image] < 2)
-    before = first(
-        replace(drive, observations=whole.select(np.delete(np.arange(len(whole)), of_old[5::40]))), 2
-    )
+    fewer = replace(drive, observations=whole.select(np.delete(np.arange(len(whole)), of_old[5::40])))
+    before = some_stops(fewer, slice(2))
     after = replace(drive, observations=whole.select(np.delete(np.arange(len(whole)), of_old[9::50])))
     smoother, why = continued(kept(before, tmp_path / "s.npz"), after, HELD)
     assert smoother is not None, why
@@ -114,7 +96,7 @@ def other_noise(drive: Traverse) -> Traverse:
 def test_a_smoother_of_another_drive_is_refused_and_said(  # type: ignore[no-untyped-def]  # change: any lambda
     drive: Traverse, tmp_path: Path, change, options: SolveOptions, says: str
 ) -> None:
-    path = kept(first(drive, 2), tmp_path / "s.npz")
+    path = kept(some_stops(drive, slice(2)), tmp_path / "s.npz")
     if "rig" in says:
         rig = replace(
             drive.rig,
@@ -145,21 +127,8 @@ def test_the_command_adds_the_new_stops_alone(
     drive: Traverse, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     old, new, out = tmp_path / "old", tmp_path / "new", tmp_path / "out"
-    write_traverse(first(drive, 3), old)
-    seen = drive.observations
-    assert seen is not None
-    rows = np.flatnonzero(drive.image_stop == 3)
-    last = seen.select(np.isin(seen.image, rows))
-    write_traverse(
-        replace(
-            drive,
-            stops=drive.stops[3:],
-            frames=tuple(frame for frame in drive.frames if frame.stop == drive.stops[3].id),
-            images=tuple(drive.images[row] for row in rows),
-            observations=replace(last, image=np.searchsorted(rows, last.image)),
-        ),
-        new,
-    )
+    write_traverse(some_stops(drive, slice(3)), old)
+    write_traverse(some_stops(drive, slice(3, 4)), new)
     base = ["refine", str(old), "--out", str(out), "--incremental", "--rig", "held", "--no-report"]
     assert main(base) == 0
     assert (out / SMOOTHER_FILE).exists()

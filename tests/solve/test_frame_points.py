@@ -12,17 +12,8 @@ from pancam_graph.data import Constraint, FramePoint, LandmarkPosition, Solution
 from pancam_graph.simulate import Simulation
 from pancam_graph.smoother import SmootherOptions, TraverseSmoother, stops_of
 from support.parameters import slow_but_for
-from support.small_drives import HARD, SOFT, near_part, simulated
+from support.small_drives import HARD, WAYS, near_part, simulated
 from support.tied_drives import noise_free
-
-WAYS = {
-    "hard": HARD,
-    "explicit": replace(HARD, landmarks="explicit"),
-    "soft": SOFT,
-    "circle": replace(HARD, model="circle"),
-    "free": replace(HARD, model="free"),
-    "estimated": replace(HARD, rig="estimated"),
-}
 
 
 def fiducials(simulation: Simulation, *, sigma_m: float = 0.01) -> tuple[FramePoint, ...]:
